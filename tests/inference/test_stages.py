@@ -16,7 +16,7 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from tests.model.operators.differential import SPAN, prior_draws
+from tests.model.operators.slow import SPAN, drawn
 
 OPERATORS: dict[str, Operator] = {
     "bouc-wen": BoucWen(),
@@ -33,9 +33,7 @@ every = pytest.mark.parametrize("name", OPERATORS)
 
 def models(operator: Operator, seed: int) -> dict[str, FloatArray]:
     """Draw as many models as there are lanes from the default priors."""
-    column = prior_draws(operator, 200, seed)
-    holds = np.flatnonzero(np.broadcast_to(operator.holds(column), 200))[:LANES]
-    return {name: values[holds] for name, values in column.items()}
+    return drawn(operator, LANES, seed)
 
 
 def compiled(

@@ -17,7 +17,7 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.inference.test_gain_and_creep import PARTS, WAYS
 from tests.inference.test_likelihood import moving
 from tests.inference.test_stages import OPERATORS, models
-from tests.model.operators.differential import SPAN, paths
+from tests.model.operators.slow import SPAN, paths
 from tests.model.operators.test_memory import CASES
 
 # Not of one length, and one of them a sample.

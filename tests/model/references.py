@@ -7,11 +7,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import quad, solve_ivp
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["Model", "assert_close", "by_integration", "by_samples", "random_walk"]
+__all__ = ["Model", "assert_close", "by_samples", "random_walk"]
 
 
 # A rate that no travel feels; quotients of smaller ones lose their digits.
@@ -32,51 +31,6 @@ def random_walk(seed: int, turns: int = 25, samples: int = 6) -> FloatArray:
     generator = np.random.default_rng(seed)
     corners = generator.normal(0.0, 60.0, turns + 1)
     return np.interp(np.linspace(0, turns, turns * samples + 1), np.arange(turns + 1), corners)
-
-
-def integrate(parameters: Model, start: float, travel: FloatArray) -> FloatArray:
-    """Integrate the equation step by step, with a fresh start at the kink in g = 0."""
-    alpha, beta, gamma, n = parameters
-
-    def slope(_: float, g: FloatArray) -> FloatArray:
-        return np.asarray(alpha - (beta * np.sign(g) + gamma) * np.abs(g) ** n)
-
-    def solve(start: float, until: FloatArray) -> FloatArray:
-        if until.size == 0 or until[-1] == 0:
-            return np.full(until.size, start)
-        span = (0.0, float(until[-1]))
-        solution = solve_ivp(
-            slope, span, [start], "DOP853", until, rtol=1e-12, atol=1e-13 * max(1.0, abs(start))
-        )
-        return np.asarray(solution.y[0])
-
-    if start >= 0:
-        return solve(start, travel)
-    # Substituting p = t^2 takes the kink at p = 0 out of the quadrature.
-    zero, _ = quad(
-        lambda t: 2 * t / (alpha + (beta - gamma) * t ** (2 * n)),
-        0.0,
-        np.sqrt(-start),
-        epsabs=1e-14,
-        epsrel=1e-13,
-        limit=200,
-    )
-    before = travel[travel < zero]
-    after = travel[travel >= zero] - zero
-    return np.concatenate((solve(start, before), solve(0.0, after)))
-
-
-def by_integration(voltage: FloatArray, parameters: Model, initial: float) -> FloatArray:
-    """Integrate every stretch with DOP853 at a relative tolerance of 1e-12, split where h is 0."""
-    steps = np.sign(np.diff(voltage))
-    edges = [0, *(np.flatnonzero(np.diff(steps)) + 1).tolist(), voltage.size - 1]
-    h = np.full(voltage.size, initial)
-    for first, last in pairwise(edges):
-        travel = np.abs(voltage[first + 1 : last + 1] - voltage[first])
-        direction = steps[first] or 1.0
-        g = integrate(parameters, float(direction * h[first]), travel)
-        h[first + 1 : last + 1] = direction * g
-    return h
 
 
 def by_samples(voltage: FloatArray, parameters: Model, initial: float) -> FloatArray:

@@ -95,28 +95,12 @@ def test_scores_round_trip_between_bounds_in_either_tail(
     assert abs(score - NORMAL.to_normal(x, *bounds)[0]) < 1e-6
 
 
-def test_bounds_may_differ_from_model_to_model() -> None:
-    z = np.array([-1.0, 0.3, 2.0])
-    low, high = np.array([-3.0, -1.0, 4.0]), np.array([0.0, 1.0, 9.0])
-    together = NORMAL.from_normal(z, low, high)[0]
-    alone = [NORMAL.from_normal(z[[i]], low[i], high[i])[0][0] for i in range(3)]
-    np.testing.assert_allclose(alone, together, rtol=1e-12)
-
-
 def test_bounds_that_leave_nothing_have_no_probability() -> None:
     x, whole = NORMAL.from_normal(np.zeros(1), np.array([3.0]), np.array([2.0]))
     assert (3.0, 0.0) == (x[0], whole[0])
 
 
-@pytest.mark.parametrize(
-    ("wrong", "right"),
-    [
-        ("nrmal", "normal"),
-        ("log-normal", "lognormal"),
-        ("unifrom", "uniform"),
-        ("cauchi", "cauchy"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "right"), [("log-normal", "lognormal"), ("cauchi", "cauchy")])
 def test_an_unknown_name_gives_the_nearest(wrong: str, right: str) -> None:
     with pytest.raises(InputError, match=f"^{wrong}: unknown distribution; did you mean {right}"):
         Distribution(wrong, {})

@@ -23,7 +23,7 @@ from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
 from tests.control import cases
 from tests.inference.problems import decaying_sine
-from tests.model.operators.test_every_operator import drawn, every_operator, posterior
+from tests.model.operators.test_every_operator import drawn_from, every_operator, posterior
 
 SPAN = Span(-100.0, 100.0)
 
@@ -111,7 +111,7 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
     integrated = name in ("jiles-atherton", "domain-wall")
     of = posterior(name, parts=parts)
     actuator = of.likelihood.actuator
-    theta = of.only.table.actuator(drawn(of, 1 if integrated or parts else 4))
+    theta = of.only.table.actuator(drawn_from(of, 1 if integrated or parts else 4))
     if parts:
         creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
         actuator = replace(actuator, gain=PolynomialGain(reference=SPAN), creep=creep)

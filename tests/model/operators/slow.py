@@ -1,35 +1,145 @@
-"""Slow and obvious operators: plays one by one, and extrema looked for anew each time."""
+"""Slow and obvious operators: integrators, plays one by one, extrema looked for anew each time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Context, Ranges
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
 
 __all__ = [
-    "Rows",
-    "by_extrema",
-    "by_plays",
-    "history",
-    "path",
-    "rows",
-    "run",
-    "walk",
-]
+    "RANGES", "SPAN", "Rows", "by_extrema", "by_integration", "by_plays", "drawn", "path", "paths",
+    "rows", "run", "walk",
+]  # fmt: skip
+
+RANGES = Ranges(voltage=50.0, displacement=20.0, middle=5.0, time=0.5, bias=10.0)
+SPAN = Span(-100.0, 100.0)
 
 Rows = dict[str, FloatArray]
 Everett = Callable[[float, float], float]
+Slope = Callable[[float, float, float], float]
+"""The state's slope by the voltage at (u, state, direction)."""
 
 
 def rows(**columns: float | Sequence[float] | FloatArray) -> Rows:
     """Bring parameters to columns of one length."""
     size = max(np.size(values) for values in columns.values())
     return {name: np.resize(np.asarray(v, dtype=float), size) for name, v in columns.items()}
+
+
+def run(
+    operator: Operator,
+    column: Mapping[str, FloatArray],
+    voltage: FloatArray,
+    span: Span | None = SPAN,
+    cuts: Sequence[int] = (),
+) -> FloatArray:
+    """Run an operator along a record, cut in pieces; without a span it starts from rest."""
+    start = Span(0.0, 0.0) if span is None else span
+    memory = operator.begin(column, float(voltage[0]), start, from_rest=span is None)
+    parts = []
+    for piece in np.split(voltage, sorted(cuts)):
+        if piece.size:
+            part, memory = operator.advance(column, piece, memory)
+            parts.append(part)
+    return np.concatenate(parts, axis=1)
+
+
+def drawn(operator: Operator, size: int, seed: int, ranges: Ranges = RANGES) -> Rows:
+    """Draw models that hold from the default priors, cut by floors and bounds."""
+    generator = np.random.default_rng(seed)
+    known, size = Context(ranges), 3 * size + 20
+    column: Rows = {}
+    for declared in operator.parameters:
+        prior = declared.default(known)
+        if not isinstance(prior, Distribution):
+            column[declared.name] = np.full(size, prior)
+            continue
+        least, most = prior.support
+        low, high = np.full(size, max(least, declared.floor)), np.full(size, most)
+        if declared.bounds is not None:
+            below, above = declared.bounds(column)
+            low, high = np.maximum(low, below), np.minimum(high, above)
+        values, _ = prior.from_normal(generator.standard_normal(size), low, high)
+        column[declared.name] = values
+    holds = np.flatnonzero(np.broadcast_to(operator.holds(column), size))[: (size - 20) // 3]
+    return {name: values[holds] for name, values in column.items()}
+
+
+def paths() -> dict[str, FloatArray]:
+    """Voltages from a start that is not zero: turns, plateaus, huge and tiny steps."""
+    generator = np.random.default_rng(7)
+    corners = generator.normal(0.0, 60.0, 13)
+    walk = np.interp(np.linspace(0, 12, 12 * 7 + 1), np.arange(13), corners)
+    plateaus = np.repeat(walk[:30], generator.integers(1, 4, 30))
+    sizes = 10.0 ** generator.uniform(-9, 2.5, 40) * generator.choice([-1, 1], 40)
+    return {
+        "walk": walk,
+        "plateaus": plateaus,
+        "steps of all sizes": 30.0 + np.cumsum(sizes),
+        "one huge step": np.array([-3.0, 3000.0, 2999.0, -1e4]),
+        "still": np.full(4, -12.0),
+        "unipolar": 50 + 50 * np.sin(np.linspace(0.3, 9.0, 60)),
+    }
+
+
+def by_integration(
+    voltage: FloatArray, slope: Slope, initial: float, kinks: Sequence[Callable[..., float]] = ()
+) -> FloatArray:
+    """Integrate from sample to sample with DOP853 at 1e-12, anew at every kink.
+
+    ``kinks`` are functions of (u, state) that change their sign at one.
+    """
+    states = [initial]
+    for before, after in pairwise(voltage.tolist()):
+        states.append(_step(before, after, states[-1], slope, kinks))
+    return np.array(states)
+
+
+def _step(
+    u: float, end: float, state: float, slope: Slope, kinks: Sequence[Callable[..., float]]
+) -> float:
+    if u == end:
+        return state
+    s = float(np.sign(end - u))
+
+    def rate(v: float, y: FloatArray) -> list[float]:
+        return [s * slope(u + s * v, float(y[0]), s)]
+
+    def event(kink: Callable[..., float]) -> Callable[..., float]:
+        def crossed(v: float, y: FloatArray) -> float:
+            return kink(u + s * v, float(y[0]))
+
+        crossed.terminal = True  # type: ignore[attr-defined]
+        return crossed
+
+    whole = abs(end - u)
+    solved = solve_ivp(
+        rate,
+        (0.0, whole),
+        [state],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-13,
+        events=[event(kink) for kink in kinks] or None,
+    )
+    assert solved.success
+    if solved.status == 0:
+        return float(solved.y[0, -1])
+    # A little beyond the kink with Euler's rule, which is as exact as needed there.
+    least = 1e-11 * max(whole, 1.0)
+    past, got = float(solved.t[-1]) + least, float(solved.y[0, -1])
+    if past >= whole:
+        return got
+    got += least * rate(past, np.array([got]))[0]
+    return _step(u + s * past, end, got, slope, kinks)
 
 
 def walk(seed: int, turns: int = 25) -> FloatArray:
@@ -45,15 +155,13 @@ def walk(seed: int, turns: int = 25) -> FloatArray:
     return np.concatenate(parts)
 
 
-def history(initial: float, voltage: float, span: Span) -> list[float]:
-    """Return the turning points from the demagnetized state to a record's first voltage."""
-    high, low = max(span.high, voltage), min(span.low, voltage)
-    return [0.0, high, low, voltage + (initial + 1) / 2 * (high - voltage), voltage]
-
-
 def path(initial: float, voltage: FloatArray, span: Span | None) -> list[float]:
     """Return all voltages from the demagnetized state on, of which the record is the end."""
-    before = [0.0] if span is None else history(initial, float(voltage[0]), span)[:-1]
+    first = float(voltage[0])
+    before = [0.0]
+    if span is not None:
+        high, low = max(span.high, first), min(span.low, first)
+        before = [0.0, high, low, first + (initial + 1) / 2 * (high - first)]
     return before + [float(u) for u in voltage]
 
 
@@ -87,21 +195,3 @@ def by_plays(
         z = np.maximum(u - thresholds, np.minimum(u + thresholds, z))
         result.append(slope * u + float(weights @ z))
     return np.array(result)
-
-
-def run(
-    operator: Operator,
-    column: Rows,
-    voltage: FloatArray,
-    span: Span | None,
-    cuts: Sequence[int] = (),
-) -> FloatArray:
-    """Run an operator along a record, cut in pieces; without a span it starts from rest."""
-    start = Span(0.0, 0.0) if span is None else span
-    memory = operator.begin(column, float(voltage[0]), start, from_rest=span is None)
-    parts = []
-    for piece in np.split(voltage, sorted(cuts)):
-        if piece.size:
-            part, memory = operator.advance(column, piece, memory)
-            parts.append(part)
-    return np.concatenate(parts, axis=1)

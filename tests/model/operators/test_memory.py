@@ -15,8 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Span
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
@@ -266,68 +265,6 @@ def test_the_typical_slope_is_that_of_the_whole_span(case: Case) -> None:
     np.testing.assert_allclose(case.operator.gain(case.column, span), expected, rtol=1e-12)
     still = case.operator.gain(case.column, Span(3.0, 3.0))
     np.testing.assert_allclose(still, 0.7, rtol=1e-3)
-
-
-RANGES = (
-    Ranges(100.0, 60.0, 0.0, 1.0),
-    Ranges(1.6, 19.5, -95.0, 0.5, bias=1.8),
-    Ranges(1e-3, 1e3, 5.0, 10.0, bias=75.0),
-)
-
-
-def draws(operator: Operator, ranges: Ranges, count: int, seed: int) -> Rows:
-    """Draw models from the default priors."""
-    generator = np.random.default_rng(seed)
-    column: Rows = {}
-    for declaration in operator.parameters:
-        default = declaration.default(Context(ranges))
-        assert default is not None
-        if isinstance(default, Distribution):
-            column[declaration.name] = default.frozen.rvs(count, random_state=generator)
-        else:
-            column[declaration.name] = np.full(count, default)
-    return column
-
-
-@every_case
-@pytest.mark.parametrize("ranges", RANGES)
-def test_is_finite_for_a_hundred_thousand_draws_from_the_prior(case: Case, ranges: Ranges) -> None:
-    low, high = ranges.bias - ranges.voltage, ranges.bias + ranges.voltage
-    voltage = low + (high - low) * np.array([0.3, 0.3, 1.0, 0.2, 0.9, 0.91, 0.0])
-    column = draws(case.operator, ranges, 100_000, 1)
-    inside = np.broadcast_to(case.operator.holds(column), 100_000)
-    for parameter in case.operator.parameters:
-        if parameter.bounds is not None:
-            lower, upper = (np.asarray(bound) for bound in parameter.bounds(column))
-            inside = inside & (column[parameter.name] >= lower)
-            inside = inside & (column[parameter.name] <= upper)
-    assert inside.mean() > 0.5
-    column = {name: values[inside] for name, values in column.items()}
-    case.operator.check(column)
-    w = run(case.operator, column, voltage, Span(low, high))
-    assert np.isfinite(w).all()
-    # The scales are right: half of the models move by what the record moves, give or take three.
-    moved = np.ptp(w, axis=1) / (2 * ranges.displacement)
-    assert 1 / 3 < np.median(moved) < 3
-
-
-@every_case
-def test_what_cannot_be_is_refused_by_name(case: Case) -> None:
-    for declaration in case.operator.parameters:
-        bad = [math.nan, math.inf]
-        bad += [-0.1] if declaration.floor == 0 else []
-        bad += [0.0] if declaration.positive else []
-        bad += [1.1] if declaration.name == "initial" else []
-        for value in bad:
-            column = {name: values.copy() for name, values in case.column.items()}
-            column[declaration.name][3] = value
-            with pytest.raises(InputError, match=rf"^{declaration.name}: .* in model 3; must "):
-                case.operator.check(column)
-    case.operator.check(case.column)
-    assert np.all(case.operator.holds(case.column))
-    assert case.operator.parameters[-1].name == "initial"
-    assert {p.scope for p in case.operator.parameters[:-1]} == {"actuator"}
-    assert case.operator.remarks(case.column, ()) == []
 
 
 def test_springs_that_hold_back_more_than_all_are_refused() -> None:

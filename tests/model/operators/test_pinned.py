@@ -14,7 +14,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.operators import walls
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
-from tests.model.operators.differential import SPAN, by_integration, columns, paths, single, w_of
+from tests.model.operators.slow import by_integration, paths, rows, run
 
 BOTH = (JilesAtherton(), DomainWall())
 MODEL = {
@@ -97,9 +97,9 @@ def test_agrees_with_the_equation_as_published(
     name: str, model: dict[str, float], operator: Pinned
 ) -> None:
     voltage = paths()[name][:40]
-    operator.check(single(**model))
+    operator.check(rows(**model))
     expected = plain(operator, model, voltage)
-    got = w_of(operator, single(**model), voltage)[0]
+    got = run(operator, rows(**model), voltage)[0]
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.ptp(expected))
 
 
@@ -129,9 +129,9 @@ def test_the_curve_of_langevin_and_its_inverse(y: float) -> None:
 def test_without_pinning_there_is_next_to_no_loop(operator: Pinned) -> None:
     """At the weakest pinning it is the anhysteretic curve, but for k times its slope."""
     field = curve_of(operator)[1] * 80.0 / (0.62 * 0.7)
-    column = single(**{**MODEL, "pinning": 1e-3 * field, "initial": 0.0})
+    column = rows(**{**MODEL, "pinning": 1e-3 * field, "initial": 0.0})
     voltage = 60 * np.sin(np.linspace(0, 4, 30))
-    got = w_of(operator, column, voltage)[0]
+    got = run(operator, column, voltage)[0]
     curve = [float(operator.anhysteretic(column, u)[0]) for u in voltage]
     np.testing.assert_allclose(got, curve, rtol=0, atol=1e-3 * field * 0.62)
     assert np.abs(got - curve).max() > 1e-4 * field * 0.62
@@ -150,31 +150,8 @@ def test_saturation_is_crossed_in_few_steps(
 
     monkeypatch.setattr(walls, "slopes", counted)
     voltage = 60 * np.sin(np.linspace(0, 4, 30))
-    w_of(operator, single(**{**MODEL, "saturation": 5e-3, "initial": 0.0}), voltage)
+    run(operator, rows(**{**MODEL, "saturation": 5e-3, "initial": 0.0}), voltage)
     assert 20 < len(steps) / 9 < 400  # which each step asks for nine times
-
-
-@pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
-def test_the_farthest_starts_are_those_of_walls_that_lag_as_far_as_they_can(
-    operator: Pinned,
-) -> None:
-    """Without coupling the displacement lags behind by the part that is not reversible."""
-    most = 12.0 * 0.62
-    for sign in (1.0, -1.0):
-        column = single(**{**MODEL, "coupling": 0.0, "initial": sign * most})
-        operator.check(column)
-        start = w_of(operator, column, np.array([25.0, 26.0]))[0, 0]
-        expected = operator.anhysteretic(column, 25.0)[0] - 0.6 * sign * most
-        assert start == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
-def test_walls_never_lag_further_than_the_bound(operator: Pinned) -> None:
-    column = columns([{**model, "initial": 0.0} for model in (MODEL, MODELS["strong coupling"])])
-    most = column["pinning"] * column["d"] * (1 - column["coupling"])
-    for voltage in (0.0, -15.0):
-        low, high = operator.reachable(column, voltage, SPAN)
-        assert ((-most < low) & (low <= 0) & (0 <= high) & (high < most)).all()
 
 
 @pytest.mark.parametrize(
@@ -190,4 +167,4 @@ def test_walls_never_lag_further_than_the_bound(operator: Pinned) -> None:
 )
 def test_refuses_by_name(name: str, value: float, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        JilesAtherton().check(single(**{**MODEL, name: value}))
+        JilesAtherton().check(rows(**{**MODEL, name: value}))

@@ -1,0 +1,447 @@
+"""Operators given by a differential equation: as published, and the laws they keep or do not."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+from scipy.special import hyp2f1
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.operator import Span
+from bwbayes.model.operators.backlash_like import BacklashLike
+from bwbayes.model.operators.bouc_wen import BoucWen, ceiling, hysteresis
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
+from bwbayes.model.operators.scalar_memory import OneState
+from bwbayes.model.power import PowerStep
+from bwbayes.model.relaxing import phi_functions
+from tests.model.operators.slow import SPAN, by_integration, drawn, paths, rows, run
+from tests.model.references import Model, assert_close, by_samples, random_walk
+
+ALPHA = 0.3575
+PLAIN = {"d": 0.62, "alpha": ALPHA, "beta": 0.0272, "gamma": 0.0172, "initial": 2.5}
+DUHEM = {"d": 0.62, "d3": -3e-6, "alpha": 0.31, "beta": 0.033, "alpha2": 2e-5, "initial": 2.5}
+EVEN = {**DUHEM, "d2": 4e-4, "alpha1": -1e-3}
+NO_TERMS = dict.fromkeys(("b2", "b3", "b4", "b5", "b6"), 0.0)
+TERMS = (
+    {"b2": 0.1, "b3": -0.2, "b4": 0.05, "b5": 0.02, "b6": -0.06},
+    {"b2": 0.0, "b3": 0.0, "b4": 0.1, "b5": 0.2, "b6": 0.0},
+    {"b2": -0.3, "b3": 0.3, "b4": 0.1, "b5": 0.3, "b6": -0.1},
+)
+# (β, γ) for h near 10 um: the paper's, equal, opposite, γ < 0, γ > β.
+SHAPES = ((0.0272, 0.0172), (0.02, 0.02), (0.02, -0.02), (0.03, -0.01), (0.02, 0.03))
+EXPONENTS = (1.0, 1.2, 2.0, 3.0, 10.0)
+
+Values = dict[str, float]
+every_path = pytest.mark.parametrize("path", paths())
+few = settings(deadline=None, max_examples=40)
+corners = st.lists(st.floats(-100, 100).map(lambda u: round(u, 6)), min_size=2, max_size=8)
+
+
+def shaped(shape: tuple[float, float], exponent: float) -> Model:
+    """Give a shape the units of an exponent, such that h stays near 10 um."""
+    beta, gamma = (rate * 10.0 ** (1 - exponent) for rate in shape)
+    return Model(ALPHA, beta, gamma, exponent)
+
+
+def top_of(model: Model) -> float:
+    return float(ceiling(*np.array([*model])[:, np.newaxis])[0])
+
+
+def integrated(voltage: FloatArray, model: Model, start: float) -> FloatArray:
+    """Return h by the equation as it is written."""
+    alpha, beta, gamma, n = model
+
+    def slope(_: float, h: float, s: float) -> float:
+        return float(alpha - (s * beta * math.copysign(1.0, h) + gamma) * abs(h) ** n)
+
+    return by_integration(voltage, slope, start, (lambda _, h: h,))
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize("number", range(len(SHAPES)))
+def test_bouc_wen_agrees_with_an_integrator(number: int, exponent: float) -> None:
+    """Inside the ceiling on both sides, and beyond it where that is allowed; a path for each."""
+    model = shaped(SHAPES[number], exponent)
+    top = min(top_of(model), 10.0)
+    beyond = exponent == 1 and model.gamma <= model.beta
+    walks = list(paths().values())
+    for place, part in enumerate((0.0, 0.7, -0.7, *((2.0, -2.0) if beyond else ()))):
+        voltage = walks[(number + place) % len(walks)]
+        got = hysteresis(voltage, *model, initial=part * top)[0]
+        assert_close(integrated(voltage, model, part * top), got, 1e-9)
+
+
+@given(
+    beta=st.floats(0.0, 0.2),
+    fraction=st.floats(-1.0, 1.0),
+    start=st.integers(-3000, 3000).map(lambda h: h / 100),
+    voltages=st.lists(st.integers(-10_000, 10_000).map(lambda u: u / 100), min_size=1, max_size=20),
+)
+@settings(deadline=None, max_examples=150)
+def test_any_passive_linear_model_agrees_with_the_scalar_closed_form(
+    beta: float, fraction: float, start: float, voltages: list[float]
+) -> None:
+    model, voltage = Model(ALPHA, beta, fraction * beta), np.array(voltages)
+    got = hysteresis(voltage, *model, initial=start)[0]
+    assert_close(by_samples(voltage, model, start), got, 1e-12)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1 + 1e-9, 1.05, 1.7, 3.3, 10.0, 50.0])
+def test_any_exponent_inverts_the_hypergeometric_travel(exponent: float) -> None:
+    """v(g) = (g/alpha) 2F1(1, 1/n; 1 + 1/n; (lambda/alpha) g^n), here with G = 1."""
+    height = np.concatenate((np.geomspace(1e-8, 0.5, 40), np.linspace(0.51, 0.98, 48)))
+    travel = height * hyp2f1(1.0, 1 / exponent, 1 + 1 / exponent, height**exponent) / 0.36
+    d, alpha, *rest = np.array([[0.0, 0.36, 0.6 * 0.36, 0.4 * 0.36, exponent]]).T
+    _, got = PowerStep(d, alpha, *rest).along(0.0, np.zeros(1), travel)
+    np.testing.assert_allclose(got[0], height, rtol=1e-11)
+
+
+@pytest.mark.parametrize("exponent", EXPONENTS)
+@pytest.mark.parametrize("limit", [(0.02, 0.02), (0.02, -0.02)])
+def test_equal_and_opposite_rates_are_limits_and_not_exceptions(
+    limit: tuple[float, float], exponent: float
+) -> None:
+    voltage = 0.3 * random_walk(4)
+    expected = hysteresis(voltage, *shaped(limit, exponent), initial=-3.0)[0]
+    for off in (1e-9, 1e-12, 1e-15):
+        near = shaped((limit[0] * (1 + off), limit[1]), exponent)
+        assert_close(expected, hysteresis(voltage, *near, initial=-3.0)[0], 100 * off + 1e-9)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0])
+def test_saturation_without_beta_stays_finite_and_below_the_ceiling(fraction: float) -> None:
+    """There the ceiling is a state of unstable rest: rounding must not push h through it."""
+    voltage = 1000 * np.sin(np.linspace(0, 30, 400))
+    for beta in (0.0, 1e-18, 1e-9):
+        h = hysteresis(voltage, ALPHA, beta, ALPHA, initial=fraction * ALPHA / (beta + ALPHA))
+        assert np.isfinite(h).all()
+        assert np.abs(h).max() <= 1 + 1e-12
+
+
+@pytest.mark.parametrize("exponents", [(1.0,), (1.0, 1.5, 2.0, 5.0, 10.0)])
+def test_finite_for_parameters_over_many_decades(exponents: tuple[float, ...]) -> None:
+    generator = np.random.default_rng(14)
+    voltage = np.concatenate([np.zeros(2), random_walk(14, turns=8, samples=5)])
+    for _ in range(5):
+        alpha = 10 ** generator.uniform(-6, 6, 1000)
+        beta = 10 ** generator.uniform(-8, 4, 1000)
+        gamma = beta * generator.choice([-1, 1, 0, *generator.uniform(-1, 3, 20)], 1000)
+        beta[gamma > 0] *= generator.choice([0, 1, 1, 1], (gamma > 0).sum())
+        exponent = generator.choice(exponents, 1000)
+        highest = np.minimum(ceiling(alpha, beta, gamma, exponent), 1e6)
+        beyond = 10 ** generator.uniform(-3, 3, 1000)
+        inside = np.where((gamma > beta) | (exponent > 1), 1.0, beyond)
+        initial = highest * inside * generator.uniform(-1, 1, 1000)
+        assert np.isfinite(hysteresis(voltage, alpha, beta, gamma, exponent, initial)).all()
+
+
+def of(top: float, ratio: float, exponent: float, alpha: float) -> Model:
+    """Return the model with this ceiling (um) and ratio of β − γ to β + γ."""
+    rate = alpha / top**exponent
+    return Model(alpha, (1 + ratio) / 2 * rate, (1 - ratio) / 2 * rate, exponent)
+
+
+# From β = 0 (−1) through β = γ (0) and γ = 0 (1) to γ near −β.
+any_model = st.builds(
+    of,
+    st.floats(0.1, 100),
+    st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 20)),
+    st.sampled_from([1.0, 1.3, 2.0, 5.0]),
+    st.floats(0.01, 10),
+)
+
+
+def growth(model: Model, path: list[float]) -> float:
+    """Return what a rounding error can grow to, for paths on which it stays small.
+
+    With γ > β the flow drives starts apart, at most with the rate n (γ − β) h^(n−1) at the ceiling.
+    """
+    n, top = model.exponent, top_of(model)
+    rate = max(model.gamma - model.beta, 0) * n * top ** (n - 1)
+    exponent = rate * float(np.abs(np.diff(path)).sum())
+    assume(exponent <= 12)
+    return float(np.exp(exponent))
+
+
+@few
+@given(model=any_model, share=st.floats(-1, 1), path=corners, pieces=st.integers(1, 9))
+@example(model=of(1.0, -1.0, 1.0, 1.0), share=1.0, path=[0.0, 0.0], pieces=1)
+def test_bouc_wen_stays_below_its_ceiling_however_fine_the_path(
+    model: Model, share: float, path: list[float], pieces: int
+) -> None:
+    """And its mirror image mirrors; in volts and um as in mV and nm."""
+    top, voltage, n = top_of(model), np.array(path), model.exponent
+    h = hysteresis(voltage, *model, initial=share * top)[0]
+    assert np.abs(h).max() <= top * (1 + 1e-11)
+    np.testing.assert_array_equal(hysteresis(-voltage, *model, initial=-share * top)[0], -h)
+    close = 1e-10 * growth(model, path) * top
+    samples = np.linspace(0, voltage.size - 1, (voltage.size - 1) * pieces + 1)
+    fine = np.interp(samples, np.arange(voltage.size), voltage)
+    got = hysteresis(fine, *model, initial=share * top)[0][::pieces]
+    np.testing.assert_allclose(got, h, rtol=0, atol=close)
+    rate = 1e3 ** (1 - n) / 1e3
+    other = Model(model.alpha, model.beta * rate, model.gamma * rate, n)
+    got = hysteresis(1e3 * voltage, *other, initial=1e3 * share * top)[0] / 1e3
+    np.testing.assert_allclose(got, h, rtol=0, atol=close)
+
+
+# What passes for an energy, h²/(2 α), never grows by more than is supplied.
+signs = st.floats(-0.6, 0.6)
+
+
+@few
+@given(
+    beta=st.floats(0.005, 0.1),
+    ratio=st.floats(-1, 1),
+    terms=st.tuples(signs, signs, signs, signs, signs),
+    bent=st.tuples(st.floats(0, 1), st.floats(-1, 1)),
+    voltages=st.lists(st.integers(-100, 100).map(float), min_size=2, max_size=6),
+)
+def test_no_path_draws_energy_within_the_constraints(
+    beta: float,
+    ratio: float,
+    terms: tuple[float, ...],
+    bent: tuple[float, float],
+    voltages: list[float],
+) -> None:
+    """Bouc-Wen, asymmetric, and Duhem: ∫ h du − Δ(h²)/(2 α(u)), on a fine path."""
+    path = np.interp(np.linspace(0, len(voltages) - 1, 4001), np.arange(len(voltages)), voltages)
+    alpha2 = bent[0] * 4 * ALPHA * beta**2
+    alpha1 = bent[1] * np.sqrt(max(alpha2 * (4 * ALPHA - alpha2 / beta**2), 0.0))
+    common = {"d": 0.62, "alpha": ALPHA, "beta": beta, "initial": 2.5}
+    shape = {**common, "gamma": ratio * beta}
+    strength = {"d2": 0.0, "d3": 0.0, "alpha1": alpha1, "alpha2": alpha2}
+    models: tuple[tuple[OneState, Values], ...] = (
+        (BoucWen(), {**shape, "exponent": 1.0}),
+        (BoucWenAsymmetric(), {**shape, **dict(zip(NO_TERMS, terms, strict=True))}),
+        (Duhem(odd=False), {**common, **strength}),
+    )
+    for operator, model in models:
+        column = rows(**model)
+        if not operator.holds(column).all():
+            continue
+        operator.check(column)
+        h = 0.62 * path - run(operator, column, path)[0]
+        supplied = np.diff(path) * (h[1:] + h[:-1]) / 2
+        alpha = ALPHA + model.get("alpha1", 0.0) * path + model.get("alpha2", 0.0) * path**2
+        lost = supplied - np.diff(h**2 / (2 * alpha))
+        # The rule's own error is a twelfth of the step's cube times the curvature.
+        step = np.abs(np.diff(path)).max()
+        curvature = np.abs(np.diff(h, 2)).max(initial=0.0) / step if step > 0 else 0.0
+        assert lost.min() >= -(step**2) * (curvature + 0.02 * step) - 1e-9
+
+
+def test_beyond_the_constraints_a_path_gives_energy() -> None:
+    """γ > β, b₅ near −1, and twenty times the largest α₂."""
+    path = np.linspace(0.0, 10.0, 2001)
+    h = hysteresis(path, ALPHA, 0.01, 0.03, initial=-7.0)[0]
+    assert np.sum(np.diff(path) * (h[1:] + h[:-1]) / 2) - np.ptp(h**2 / (2 * ALPHA)) < -2.0
+    model = rows(**{**PLAIN, **NO_TERMS, "b5": -0.9})
+    assert not BoucWenAsymmetric().holds(model).any()
+    with pytest.raises(InputError, match=r"gamma: .* must be passive"):
+        BoucWenAsymmetric().check(model)
+    alpha2 = 80 * 0.31 * 0.01**2
+    model = rows(d=0.62, d3=0.0, alpha=0.31, beta=0.01, alpha2=alpha2, initial=5.0)
+    assert not Duhem().holds(model).any()
+    with pytest.raises(InputError, match=r"alpha2: .* 4 alpha beta"):
+        Duhem().check(model)
+    path = np.linspace(20.0, 10.0, 2001)
+    h = 0.62 * path - run(Duhem(), model, path)[0]
+    supplied = np.sum(np.diff(path) * (h[1:] + h[:-1]) / 2)
+    assert supplied - np.diff((h**2 / (2 * (0.31 + alpha2 * path**2)))[[0, -1]])[0] < -1.0
+
+
+@pytest.mark.parametrize("start", [2.5, -6.0])
+@pytest.mark.parametrize("terms", TERMS)
+@every_path
+def test_asymmetric_loops_agree_with_their_equation(path: str, terms: Values, start: float) -> None:
+    voltage, model = paths()[path], {**PLAIN, **terms, "gamma": 0.005, "initial": start}
+
+    def slope(u: float, h: float, s: float) -> float:
+        x, z = np.sign(u), np.sign(h)
+        signed = s * z + model["b2"] * x * s + model["b3"] * x * z
+        signed += model["b4"] * s + model["b5"] * z + model["b6"] * x
+        return float(model["alpha"] - abs(h) * (model["gamma"] + model["beta"] * signed))
+
+    BoucWenAsymmetric().check(rows(**model))
+    h = by_integration(voltage, slope, start, (lambda u, _: u, lambda _, h: h))
+    got = model["d"] * voltage - run(BoucWenAsymmetric(), rows(**model), voltage)[0]
+    assert_close(h, got, 1e-9)
+
+
+@pytest.mark.parametrize("rate", [1e-9, 1e-3, 0.033, 1.0, 40.0])
+@pytest.mark.parametrize("model", [DUHEM, EVEN], ids=["odd", "even"])
+@pytest.mark.parametrize("path", ["walk", "steps of all sizes", "unipolar"])
+def test_duhem_agrees_with_the_equation_as_published(path: str, model: Values, rate: float) -> None:
+    """That is dy = β |du| (f(u) − y) + g(u) du."""
+    voltage, model = paths()[path][: 12 if rate > 10 else None], {**model, "beta": rate}
+    d, d2, d3 = model["d"], model.get("d2", 0.0), model["d3"]
+
+    def f(u: float) -> float:
+        return d * u + d2 * u**2 + d3 * u**3
+
+    def slope(u: float, y: float, s: float) -> float:
+        strength = model["alpha"] + model.get("alpha1", 0.0) * u + model["alpha2"] * u**2
+        return s * rate * (f(u) - y) + d + 2 * d2 * u + 3 * d3 * u**2 - strength
+
+    expected = by_integration(voltage, slope, f(voltage[0]) - model["initial"])
+    got = run(Duhem(odd="d2" not in model), rows(**model), voltage)[0]
+    assert_close(expected, got, 1e-9)
+
+
+@every_path
+def test_simpler_loops_are_bouc_wen(path: str) -> None:
+    """Asymmetric ones without terms, and backlash-like ones: dw = a |du| (c u − w) + b du."""
+    voltage, (d, alpha, beta, gamma, initial) = paths()[path], PLAIN.values()
+    expected = d * voltage - hysteresis(voltage, alpha, beta, gamma, initial=initial)
+    none = run(BoucWenAsymmetric(terms=()), rows(**PLAIN), voltage)
+    assert_close(expected, none, 1e-14)
+    zeros = run(BoucWenAsymmetric(), rows(**PLAIN, **NO_TERMS), voltage)
+    np.testing.assert_array_equal(none, zeros)
+    a, b, c = beta, d - alpha, d
+    start = c * voltage[0] - initial
+    expected = by_integration(voltage, lambda u, w, s: s * a * (c * u - w) + b, start)
+    column = rows(**{name: value for name, value in PLAIN.items() if name != "gamma"})
+    assert_close(expected, run(BacklashLike(), column, voltage)[0], 1e-9)
+
+
+@pytest.mark.parametrize("z", [0.0, 1e-9, 1e-3, 0.5, 1.0, 1.0000001, 1.5, 9.0, 30.0, 700.0, 1e9])
+def test_phi_functions_to_rounding(z: float) -> None:
+    """Against their series in exact fractions, or what is left of them where exp(−z) is nothing."""
+    if z < 40:
+        x, factorial = Fraction(z), [Fraction(math.factorial(order)) for order in range(204)]
+        exact = [
+            float(sum(((-x) ** j / factorial[j + k] for j in range(200)), start=Fraction(0)))
+            for k in (1, 2, 3)
+        ]
+    else:
+        exact = [1 / z, (1 - 1 / z) / z, (0.5 - (1 - 1 / z) / z) / z]
+    got = [float(value[0]) for value in phi_functions(np.array([z]))]
+    np.testing.assert_allclose(got, exact, rtol=2e-15)
+
+
+def test_asymmetric_bounds_leave_out_nothing_that_holds() -> None:
+    operator, generator = BoucWenAsymmetric(), np.random.default_rng(5)
+    column = drawn(operator, 20_000, 3)
+    size = column["d"].size
+    column |= {name: generator.uniform(-1, 1, size) for name in NO_TERMS}
+    holding = operator.holds(column)
+    assert holding.sum() > 100
+    for declared in operator.parameters[3:-1]:
+        assert declared.bounds is not None
+        low, high = (np.broadcast_to(b, size)[holding] for b in declared.bounds(column))
+        values = column[declared.name][holding]
+        slack = 1e-9 * (np.abs(values) + 1)
+        assert ((low <= values + slack) & (values <= high + slack)).all()
+
+
+GOOD = {"voltage": [0.0, 1.0], "alpha": ALPHA, "beta": 0.02, "gamma": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("argument", "wrong"),
+    [
+        ("alpha", {"alpha": [ALPHA, -1.0]}),
+        ("alpha", {"alpha": [[ALPHA]]}),
+        ("alpha", {"alpha": []}),
+        ("alpha", {"alpha": [1.0, 1.0], "beta": [0.02, 0.02, 0.02]}),
+        ("beta", {"beta": -0.01, "gamma": 0.02}),
+        ("gamma", {"gamma": -0.03}),
+        ("initial", {"gamma": 0.03, "initial": 8.0}),
+        ("initial", {"exponent": 2.0, "initial": -4.0}),
+        ("exponent", {"exponent": 0.99}),
+        ("voltage", {"voltage": []}),
+        ("voltage", {"voltage": [[0.0, 1.0]]}),
+        ("voltage", {"voltage": [0.0, math.nan]}),
+    ],
+)
+def test_outside_the_domain_one_line_names_the_argument(
+    argument: str, wrong: dict[str, object]
+) -> None:
+    with pytest.raises(InputError, match=f"^{argument}: [^\n]*$"):
+        hysteresis(**{**GOOD, **wrong})  # type: ignore[arg-type]
+
+
+def test_the_edges_of_the_domain_are_inside() -> None:
+    for beta, gamma, initial in ((0.0, 0.0, 5.0), (0.0, 0.1, ALPHA / 0.1), (0.1, -0.1, -50.0)):
+        for exponent in (1.0, 2.5):
+            start = initial if exponent == 1 else np.sign(initial)
+            h = hysteresis([0, 10, -10], ALPHA, beta, gamma, exponent, start)
+            assert np.isfinite(h).all()
+
+
+OPERATORS: dict[str, OneState] = {
+    "bouc-wen": BoucWen(),
+    "backlash-like": BacklashLike(),
+    "duhem": Duhem(),
+    "duhem with even terms": Duhem(odd=False),
+    "bouc-wen-asymmetric": BoucWenAsymmetric(),
+    "bouc-wen-asymmetric by the voltage": BoucWenAsymmetric(("b2", "b3")),
+    "jiles-atherton": JilesAtherton(),
+    "domain-wall": DomainWall(),
+}
+NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
+
+
+def models(name: str, size: int, seed: int) -> dict[str, FloatArray]:
+    """Draw models; fewer where there is an integrator to run."""
+    pinned = isinstance(OPERATORS[name], Pinned)
+    return drawn(OPERATORS[name], min(size, 2 if size < 20 else 50) if pinned else size, seed)
+
+
+@pytest.mark.parametrize("name", sorted({*OPERATORS} - {*NOT_ODD}))
+@settings(deadline=None, max_examples=10)
+@given(path=corners, seed=st.integers(0, 9))
+def test_the_mirrored_drive_and_start_give_the_mirrored_displacement(
+    name: str, path: list[float], seed: int
+) -> None:
+    column, voltage = models(name, 3, seed), np.array(path)
+    mirrored = {**column, "initial": -column["initial"]}
+    expected = -run(OPERATORS[name], column, voltage)
+    np.testing.assert_array_equal(run(OPERATORS[name], mirrored, -voltage), expected)
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_minor_loop_is_not_forgotten_and_not_congruent(name: str) -> None:
+    """What a Preisach model would do, none of these does: neither wiping out nor congruency."""
+    operator, column = OPERATORS[name], models(name, 100, 5)
+    column["initial"] = np.zeros_like(column["initial"])
+    straight = run(operator, column, np.array([0.0, 40.0, 60.0]))
+    detour = run(operator, column, np.array([0.0, 40.0, 0.0, 40.0, 60.0]))
+    missed = np.abs(detour[:, -1] - straight[:, -1]) / np.ptp(straight, axis=1)
+    assert np.median(missed) > 1e-4
+    after_less = run(operator, column, np.array([0.0, 40.0, 0.0, 40.0]))
+    after_more = run(operator, column, np.array([0.0, 60.0, 0.0, 40.0, 0.0, 40.0]))
+    heights = [np.diff(w[:, -2:], axis=1)[:, 0] for w in (after_less, after_more)]
+    assert np.median(np.abs(heights[0] - heights[1]) / np.abs(heights[0])) > 1e-4
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_sweeps_reach_what_they_say(name: str) -> None:
+    operator, column = OPERATORS[name], models(name, 200, 7)
+    low, high = operator.reachable(column, 20.0, Span(-30.0, 70.0))
+    assert (low < high).all()
+    column["initial"] = np.zeros_like(column["initial"])
+    start = operator.begin(column, 0.0, SPAN, from_rest=True)
+    _, end = operator.advance(column, np.array([70.0, -30.0, 70.0, -30.0, 20.0]), start)
+    # The state need not be what the parameter is, and may grow as that falls.
+    ends = [
+        operator.begin({**column, "initial": initial}, 20.0, SPAN, from_rest=False).state
+        for initial in (low, high)
+    ]
+    slack = 1e-6 * np.max(np.abs(ends), axis=0)
+    assert (end.state >= np.min(ends, axis=0) - slack).all()
+    assert (end.state <= np.max(ends, axis=0) + slack).all()
+
+
+def test_unknown_terms_are_refused_by_name() -> None:
+    with pytest.raises(InputError, match="terms: 'b7' is unknown"):
+        BoucWenAsymmetric(terms=("b7",))
