@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -42,39 +43,41 @@ def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[
         A record that continues none of the others, itself, one that another continues too, or one
         that it cannot follow: of another interval or hold, cut at its end, with time in between.
     """
-    after = _after(config)
-    if not after:
+    following = _following(config)
+    if not following:
         return config, dict(records)
     wholes: dict[str, Record] = {}
     tables: dict[str, RecordConfig] = {}
+    # The whole that each record belongs to, and how much later it is on the clock of that, s.
     roots: dict[str, str] = {}
-    shifts: dict[str, float] = {}  # how much later a record is on the clock of its whole, s
+    shifts: dict[str, float] = {}
     for root in records:
         if config.records[root].continues is not None:
             continue
-        wholes[root], last = records[root], root
-        roots[root], shifts[root] = root, 0.0
-        while (name := after.get(last)) is not None:
-            _require_next(config, last, name, records)
-            roots[name] = root
-            shifts[name] = wholes[root].start + wholes[root].duration - records[name].start
-            wholes[root] = _put_together(wholes[root], records[name])
-            last = name
-        parts = {name: shifts[name] for name in roots if roots[name] == root}
-        tables[root] = _table(config, parts, records)
+        names = [root]
+        while names[-1] in following:
+            names.append(following[names[-1]])
+        joint = records[root]
+        shifts[root] = 0.0
+        for before, name in pairwise(names):
+            _require_next(config, before, name, records)
+            shifts[name] = joint.start + joint.duration - records[name].start
+            joint = _put_together(joint, records[name])
+        roots |= dict.fromkeys(names, root)
+        wholes[root] = joint
+        tables[root] = _table(config, {name: shifts[name] for name in names}, records)
     circle = [name for name in records if name not in roots]
     if circle:
-        names = ", ".join([*circle, circle[0]])
-        raise InputError(f"{place_of(circle[0])}.continues: a circle ({names}); one is the first")
-    validation = {
-        name: _moved(held_out, roots, shifts) for name, held_out in config.validation.items()
-    }
+        names_of_it = ", ".join([*circle, circle[0]])
+        place = place_of(circle[0])
+        raise InputError(f"{place}.continues: a circle ({names_of_it}); one is the first")
+    validation = {name: _moved(v, roots, shifts) for name, v in config.validation.items()}
     return config.model_copy(update={"record": tables, "validation": validation}), wholes
 
 
-def _after(config: Config) -> dict[str, str]:
+def _following(config: Config) -> dict[str, str]:
     """Return which record comes after which, by the name of the one before."""
-    after: dict[str, str] = {}
+    following: dict[str, str] = {}
     for name, source in config.records.items():
         before = source.continues
         if before is None:
@@ -84,13 +87,13 @@ def _after(config: Config) -> dict[str, str]:
         wrong = {
             "the record itself; name the one measured before it": before == name,
             f"no other record {before!r}; {hint}": before not in others,
-            f"{after.get(before)} continues {before} too; one record can": before in after,
+            f"{following.get(before)} continues {before} too; one record can": before in following,
             f"it starts where {before} ends; remove its from_rest": source.from_rest,
             "the stand starts every signal at rest; give files": source.file is None,
         }
         _refuse(name, wrong)
-        after[before] = name
-    return after
+        following[before] = name
+    return following
 
 
 def _refuse(name: str, wrong: Mapping[str, bool]) -> None:
@@ -154,9 +157,9 @@ def _moved(
     validation: ValidationConfig, roots: Mapping[str, str], shifts: Mapping[str, float]
 ) -> ValidationConfig:
     """Return a validation of the whole for one of a part."""
-    if validation.of is None:
+    of, window = validation.of, validation.window
+    if of is None:
         return validation
-    window = validation.window
     if window is not None and not validation.another:
-        window = [[edge + shifts[validation.of] for edge in edges] for edges in window]
-    return validation.model_copy(update={"of": roots[validation.of], "window": window})
+        window = [[edge + shifts[of] for edge in edges] for edges in window]
+    return validation.model_copy(update={"of": roots[of], "window": window})

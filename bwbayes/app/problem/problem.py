@@ -28,11 +28,10 @@ from bwbayes.app.problem.parameters import (
     readings_of,
 )
 from bwbayes.app.problem.records import (
-    Windows,
+    Slices,
     findings_of,
     generator,
     other_record,
-    require_different,
     sampled_waveform,
     set_aside,
     start_of,
@@ -164,11 +163,9 @@ class Problem:
         self, changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
     ) -> Posterior:
         """Return the posterior of the record with other values of keys of [model]."""
-        windows = {
-            dataset.name: Windows(dataset.training, {}) for dataset in self.posterior.datasets
-        }
+        training = {dataset.name: dataset.training for dataset in self.posterior.datasets}
         config = self.changed(self.config, changes, parameters)
-        return _posterior(config, self.records, windows)[0]
+        return _posterior(config, self.records, training)[0]
 
     def changed(
         self,
@@ -219,13 +216,12 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     InputError
         Anything in the config or the records that cannot be used.
     """
+    in_memory = records or {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        in_memory = records or {}
         fitted, stand = training_records(config, folder, in_memory)
         config, fitted = joined(config, fitted)
-        windows = {name: windows_of(config, name, record) for name, record in fitted.items()}
-        require_different(fitted, windows)
+        training, held_out = windows_of(config, fitted)
         others = {
             name: other_record(config, name, folder, fitted, in_memory.get(name))
             for name, validation in config.validation.items()
@@ -235,32 +231,25 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     remarks += [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     aside = {name: source.outliers for name, source in config.records.items()}
     if config.model.outliers:
-        aside |= _outliers(config, fitted, windows, [n for n, t in aside.items() if t is None])
-    posterior, defaults = _posterior(config, fitted, windows)
+        aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
+    posterior, defaults = _posterior(config, fitted, training)
     validations = {}
     for name, v in config.validation.items():
-        of = v.of or next(iter(windows))
+        of = v.of or next(iter(fitted))
         if v.another:
             judged = None if v.window is None else (v.window[0][0], v.window[0][1])
             validations[name] = Validation((), others[name], start_of(config, name), judged, of)
         else:
-            validations[name] = Validation(windows[of].held_out[name], of=of)
-    truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
+            validations[name] = Validation(held_out[name], of=of)
     plan = _plan(config, posterior)
-    explicit = _explicit(config, posterior, aside, list(dict.fromkeys(remarks)))
-    sampling = {"walkers": plan.walkers, "engine": posterior.engine}
+    truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth |= config.truth
-    known = {p.name: truth.get(p.name, truth.get(p.plain)) for p in posterior.prior.parameters}
-    changes = {
-        "sampling": config.sampling.model_copy(update=sampling),
-        "truth": {name: value for name, value in known.items() if value is not None},
-    }
-    explicit = explicit.model_copy(update=changes)
+    explicit = _explicit(config, posterior, plan, truth, aside, list(dict.fromkeys(remarks)))
     return Problem(explicit, fitted, posterior, plan, validations, defaults)
 
 
 def _outliers(
-    config: Config, records: dict[str, Record], windows: Mapping[str, Windows], names: list[str]
+    config: Config, records: dict[str, Record], training: Mapping[str, Slices], names: list[str]
 ) -> dict[str, list[float]]:
     """Leave isolated outliers out of the ``records`` of these names; return their times, s.
 
@@ -270,7 +259,7 @@ def _outliers(
 
     def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
         records.update({n: complete[n].without(rows[n]) for n in names if n in rows})
-        return _posterior(config, records, windows)[0]
+        return _posterior(config, records, training)[0]
 
     rows = outliers(
         posterior_without,
@@ -282,7 +271,7 @@ def _outliers(
 
 
 def _posterior(
-    config: Config, records: Mapping[str, Record], windows: Mapping[str, Windows]
+    config: Config, records: Mapping[str, Record], training: Mapping[str, Slices]
 ) -> tuple[Posterior, dict[str, Distribution]]:
     """Put the posterior together; return it with the default priors by name."""
     datasets = []
@@ -292,7 +281,7 @@ def _posterior(
             Dataset(
                 record.voltage,
                 readings_of(record),
-                windows[name].training,
+                training[name],
                 actuator,
                 noise_model(config.model.noise_until_chosen, record.interval),
                 config.records[name].from_rest,
@@ -301,7 +290,6 @@ def _posterior(
         )
     chosen = tuple(config.model.per_record), tuple(config.model.shared)
     table = JointTable(datasets[0].table, tuple(records), *chosen)
-    training = {name: window.training for name, window in windows.items()}
     contexts = contexts_of(config, records, training)
     parameters = parameters_of(config, table, contexts)
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
@@ -345,10 +333,13 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
 def _explicit(
     config: Config,
     posterior: Posterior,
+    plan: SamplingPlan,
+    truth: Mapping[str, float],
     outliers: Mapping[str, list[float] | None],
     remarks: list[str],
 ) -> Config:
-    """Return the config with records, model and parameters made explicit, and files beside it."""
+    """Return the config in explicit numbers and words, with records as files beside it."""
+    first, parameters = next(iter(config.records)), posterior.prior.parameters
     records = {
         name: RecordConfig(
             file=f"records/{name}.h5",
@@ -356,7 +347,7 @@ def _explicit(
             from_rest=source.from_rest,
             outliers=outliers[name],
             # Said while all were read: the first has them.
-            remarks=remarks or None if name == next(iter(config.records)) else None,
+            remarks=remarks or None if name == first else None,
         )
         for name, source in config.records.items()
     }
@@ -365,11 +356,15 @@ def _explicit(
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()
     }
+    true = {p.name: truth.get(p.name, truth.get(p.plain)) for p in parameters}
+    sampling = {"walkers": plan.walkers, "engine": posterior.engine}
     return config.model_copy(
         update={
             "record": records[ALONE] if isinstance(config.record, RecordConfig) else records,
             "model": explicit_model(config.model, posterior.datasets[0].actuator),
-            "parameters": {p.name: as_config(p) for p in posterior.prior.parameters},
+            "sampling": config.sampling.model_copy(update=sampling),
+            "parameters": {p.name: as_config(p) for p in parameters},
+            "truth": {name: value for name, value in true.items() if value is not None},
             "validation": validation,
         }
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -29,11 +29,10 @@ from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
 
 __all__ = [
-    "Windows",
+    "Slices",
     "findings_of",
     "generator",
     "other_record",
-    "require_different",
     "sampled_waveform",
     "set_aside",
     "start_of",
@@ -44,12 +43,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class Windows:
-    """The windows of one training record, as slices: to fit, and held out by name."""
-
-    training: tuple[slice, ...]
-    held_out: Mapping[str, tuple[slice, ...]]
+type Slices = tuple[slice, ...]
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
@@ -86,11 +80,12 @@ def training_records(
             signals[name] = source.signal
             rate = config.stand.sample_rate
             records[name] = planned(sampled_waveform(source.signal), rate, source.stop)
-    stand = stand_of(config, list(records.values())) if signals else None
-    for name, drive in signals.items():
-        assert stand is not None
-        purpose = "record" if name == ALONE else f"record {name}"
-        records[name] = _measured(stand, drive, generator(config.seed, purpose))
+    stand = None
+    if signals:
+        stand = stand_of(config, list(records.values()))
+        for name, drive in signals.items():
+            purpose = "record" if name == ALONE else f"record {name}"
+            records[name] = _measured(stand, drive, generator(config.seed, purpose))
     for name, source in config.records.items():
         records[name] = _cut(source, records[name], place_of(name))
         require_readable(records[name], place_of(name))
@@ -156,15 +151,14 @@ def other_record(
     if source.file is None or in_memory is not None:
         require_readable(record, table)
     # Said now: it would be a pity after the sampling.
+    key = "lead_in: "
     try:
         start_of(config, name).window(record)
-    except InputError as error:
-        raise InputError(f"{table}.lead_in: {error}") from None
-    try:
+        key = ""
         for start, stop in source.window or ():
             record.window_slice(start, stop)
     except InputError as error:
-        raise InputError(f"{table}.{error}") from None
+        raise InputError(f"{table}.{key}{error}") from None
     return record
 
 
@@ -186,14 +180,36 @@ def whole(record: Record) -> Window:
     return float(record.time[first]), float(record.time[last]) + record.interval
 
 
-def windows_of(config: Config, name: str, record: Record) -> Windows:
-    """Return the windows of a training record.
+def windows_of(
+    config: Config, records: Mapping[str, Record]
+) -> tuple[dict[str, Slices], dict[str, Slices]]:
+    """Return the windows of training records, as slices: to fit by record, held out by validation.
 
     Raises
     ------
     InputError
-        A window outside of the record, windows that overlap, or one without a reading.
+        A window outside of its record, windows that overlap, or one without a reading; a
+        measurement under two names that is fitted twice, in windows that overlap.
     """
+    training: dict[str, Slices] = {}
+    held_out: dict[str, Slices] = {}
+    for name, record in records.items():
+        training[name], own = _windows_of(config, name, record)
+        held_out |= own
+    for name, other in combinations(records, 2):
+        overlap = any(
+            a.start < b.stop and b.start < a.stop for a in training[name] for b in training[other]
+        )
+        if overlap and records[name].sha256 == records[other].sha256:
+            raise InputError(
+                f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
+                "would count twice; remove one, or give them other windows"
+            )
+    return training, held_out
+
+
+def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict[str, Slices]]:
+    """Return the windows of one training record."""
     train, table = config.records[name].train, place_of(name)
     windows = {f"{table}.train": [whole(record)] if train is None else [(a, b) for a, b in train]}
     names = []
@@ -221,28 +237,7 @@ def windows_of(config: Config, name: str, record: Record) -> Windows:
                     f"choose another window, or see start, exclude and decimate in [{table}]"
                 )
     _, *held = slices.values()
-    return Windows(split.training, dict(zip(names, held, strict=True)))
-
-
-def require_different(records: Mapping[str, Record], windows: Mapping[str, Windows]) -> None:
-    """Refuse readings that would count twice: one record under two names.
-
-    Raises
-    ------
-    InputError
-        The same measurement is fitted twice, in windows that overlap.
-    """
-    for name, other in combinations(records, 2):
-        overlap = any(
-            a.start < b.stop and b.start < a.stop
-            for a in windows[name].training
-            for b in windows[other].training
-        )
-        if overlap and records[name].sha256 == records[other].sha256:
-            raise InputError(
-                f"{place_of(other)}: the same measurement as {place_of(name)}, whose readings "
-                "would count twice; remove one, or give them other windows"
-            )
+    return split.training, dict(zip(names, held, strict=True))
 
 
 def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
