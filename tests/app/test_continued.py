@@ -133,12 +133,9 @@ def test_a_continued_record_beside_another(tmp_path: Path) -> None:
 
 def test_python_fits_a_record_in_two_parts() -> None:
     first, second = parts(whole(), 170)
-    keys: Any = {"dynamics": "none", "hysteresis": "linear", "ess": 100, "workers": 1}
-    # So few readings validate nothing, which is said; that a drift explains them better may be.
-    with pytest.warns(InputWarning) as warned:
+    keys: Any = {"dynamics": "none", "hysteresis": "linear", "block": 25, "steps": 25, "workers": 1}
+    with pytest.warns(InputWarning, match="NOT CONVERGED: budget of 25 steps"):
         made = bw.fit(chained({"first": first, "second": second}), progress=False, **keys)
-    assert any("Validation inconclusive: training" in str(said.message) for said in warned)
-    assert made.converged
     assert made.problem.record.samples == SAMPLES
     assert "offset" in made.problem.posterior.names
 

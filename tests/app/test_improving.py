@@ -24,6 +24,14 @@ def config_of(kind: str, folder: Path, seed: int = 1) -> Config:
     return Config(record=RecordConfig(file="record.h5", from_rest=True, train=[[0.0, 6.0]]))
 
 
+def test_a_quadratic_gain_is_added(tmp_path: Path) -> None:
+    improved = improve_model(config_of("quadratic", tmp_path), tmp_path, QUIET)
+    assert "quadratic" in improved.model.gain
+    (note,) = improved.records["record"].remarks or [""]
+    assert re.match(r"model improved: quadratic.* nats, RMSE .* um\); set gain", note)
+
+
+@pytest.mark.slow
 def test_a_quadratic_gain_is_added_and_the_run_says_what_it_is_worth() -> None:
     record = plant("quadratic", (8, 1), 8.0)
     with warnings.catch_warnings(record=True) as caught:

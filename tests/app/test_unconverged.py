@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.ending import finish
 from bwbayes.app.config.config import load
@@ -119,16 +118,3 @@ def test_likelihood_that_is_nan_everywhere_is_said(
     with pytest.raises(InputError, match="no draw has a finite posterior density"):
         finish(folder.path, workers=1, quiet=True)
     assert not folder.summary.exists()
-
-
-def test_python_refuses_it_too(cut_short: tuple[RunFolder, int], tmp_path: Path) -> None:
-    fit = bw.open_run(cut_short[0].path)
-    for call in (
-        fit.track,
-        lambda: fit.export(tmp_path / "out"),
-        lambda: fit.compensate("sine", amplitude=20, frequency=1),
-        lambda: fit.design("d"),
-    ):
-        with pytest.raises(bw.NotConvergedError, match=r"budget of .* steps used up"):
-            call()
-    assert not any(tmp_path.iterdir())
