@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from bwbayes.record.io.formats import read_record, write_record
-from bwbayes.record.record import Record, Split
+from bwbayes.record.record import Record
 
-__all__ = ["Record", "Split", "read_record", "write_record"]
+__all__ = ["Record", "read_record", "write_record"]

@@ -24,22 +24,10 @@ from bwbayes.record.io.grid import VoltageIs, clock, record_fields, require_volt
 from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.shown import brief
 
-__all__ = ["Record", "Split", "Window"]
+__all__ = ["Record", "Window"]
 
 Window = tuple[float, float]
 """A stretch of time in s: start <= time < stop."""
-
-
-@dataclass(frozen=True)
-class Split:
-    """Training and held-out windows of one record, as slices of its samples.
-
-    The slices belong to the whole record, so that one simulation from its first sample serves
-    every window.
-    """
-
-    training: tuple[slice, ...]
-    held_out: tuple[slice, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +121,11 @@ class Record:
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
             ``"-nm"`` turns the sign.
-        voltage_is, origin
-            As of the record itself.
 
         Raises
         ------
         InputError
-            What cannot be used, as of a file: too few samples, times that are not uniform, a
-            voltage that does not move; neither interval nor time, or both.
+            All that a file is refused for; neither interval nor time, or both.
 
         Warns
         -----
@@ -194,20 +179,8 @@ class Record:
             Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
         fs : float, Hz
             The sampling rate, in place of a time column.
-        voltage_is, origin
-            As of the record itself.
 
-        Raises
-        ------
-        InputError
-            A column that is missing or without a unit, times that are not uniform, and all else
-            that a file is refused for.
-
-        Warns
-        -----
-        InputWarning
-            If a column is recognized by nothing but its unit, or samples are missing in which a
-            commanded voltage was held.
+        Raises and warns as :func:`read_record` does.
         """
         names = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in names.items() if name is not None}
@@ -342,32 +315,6 @@ class Record:
         left_out = np.ones(self.samples, dtype=np.bool_)
         left_out[readings] = False
         return self.without(left_out)
-
-    def split(self, training: Sequence[Window], held_out: Sequence[Window] = ()) -> Split:
-        """Return training windows, in order of time, and held-out ones as slices of this record.
-
-        Parameters
-        ----------
-        training, held_out : sequences of (start, stop), s
-
-        Raises
-        ------
-        InputError
-            If a window is empty or outside the record, if a training window overlaps a held-out
-            one (nothing would be held out) or another training window (samples would count twice).
-        """
-        trained = [(window, self.window_slice(*window)) for window in sorted(training)]
-        held = [(window, self.window_slice(*window)) for window in held_out]
-        for index, (window, samples) in enumerate(trained):
-            for kind, others in (("training", trained[:index]), ("held-out", held)):
-                for other, other_slice in others:
-                    if samples.start < other_slice.stop and other_slice.start < samples.stop:
-                        raise InputError(
-                            f"training window {self.clock(window[0])} to {self.clock(window[1])} "
-                            f"s: overlaps the {kind} window {self.clock(other[0])} to "
-                            f"{self.clock(other[1])} s; move one (record.train)"
-                        )
-        return Split(tuple(cut for _, cut in trained), tuple(cut for _, cut in held))
 
     def _part(self, samples: slice) -> Record:
         return replace(

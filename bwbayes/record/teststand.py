@@ -23,7 +23,7 @@ import scipy
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Recursion, first_order_lag
+from bwbayes.model.linear import first_order_lag
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.record.record import Record
 from bwbayes.record.true_values import true_values
@@ -32,15 +32,9 @@ from bwbayes.shown import brief
 
 __all__ = ["Amplifier", "LaserSensor", "RingBender", "VirtualTestStand", "creep"]
 
-# The discrepancies are part of the stand and not adjustable.
+# Of the discrepancy process; like the others it is part of the stand and not adjustable.
 PROCESS_SD = 1.5  # um
 PROCESS_TIME = 0.5  # s
-CREEP_PER_DECADE = 0.01
-QUADRATIC_AT_100_V = 1.0  # um
-DRIFT = 0.5  # um over the record
-
-# Two lags per decade of time make the creep's slope even to 0.3 %.
-CREEP_LAGS = tuple(10.0 ** (half / 2) for half in range(-4, 9))  # 0.01 s to 10,000 s
 
 
 @dataclass(frozen=True)
@@ -101,22 +95,11 @@ class Amplifier:
         return self.current / self.capacitance
 
     def output(self, command: FloatArray, interval: float) -> FloatArray:
-        """Voltage at the electrode, held from each sample to the next.
+        """Voltage at the electrode, (samples,), V, held from each sample to the next, s.
 
-        The level follows the quantized and limited command by at most slew x interval per sample;
-        the ramp inside a sample is not resolved. It starts settled at the first command.
-
-        Parameters
-        ----------
-        command : (samples,) array
-            Commanded voltage at the electrode, V.
-        interval : float
-            Sampling interval, s.
-
-        Returns
-        -------
-        (samples,) array
-            V.
+        The level follows the quantized and limited command, (samples,), V, by at most slew x
+        interval per sample; the ramp inside a sample is not resolved. It starts settled at the
+        first command.
         """
         levels = np.clip(_quantize(command, self.step, self.dac_bits), -self.limit, self.limit)
         reach = self.slew * interval
@@ -250,8 +233,8 @@ class VirtualTestStand:
         Returns
         -------
         Record
-            Its voltage is the command, before DAC and amplifier; its truth is the actuator's
-            displacement with the discrepancy, which a perfect sensor would read.
+            Its voltage is the command, before DAC and amplifier; its truth is what a perfect
+            sensor would read.
 
         Raises
         ------
@@ -318,64 +301,35 @@ class VirtualTestStand:
     def _discrepancy(
         self, output: FloatArray, displacement: FloatArray, generator: np.random.Generator
     ) -> FloatArray:
-        interval = 1 / self.sample_rate
-        match self.discrepancy:
-            case "process":
-                return _ornstein_uhlenbeck(displacement.size, interval, generator)
-            case "structural":
-                drift = np.linspace(0.0, DRIFT, displacement.size)
-                return creep(displacement, interval) + self._even_term(output, interval) + drift
-            case "none":
-                return np.zeros_like(displacement)
-
-    def _even_term(self, output: FloatArray, interval: float) -> FloatArray:
-        strain = QUADRATIC_AT_100_V * (output / 100.0) ** 2
+        samples, interval = displacement.size, 1 / self.sample_rate
+        if self.discrepancy == "none":
+            return np.zeros(samples)
+        if self.discrepancy == "process":  # drawn from its stationary distribution, exactly
+            decay = math.exp(-interval / PROCESS_TIME)
+            shocks = PROCESS_SD * generator.standard_normal(samples)
+            shocks[1:] *= math.sqrt(-math.expm1(-2 * interval / PROCESS_TIME))
+            return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
+        strain = 1.0 * (output / 100.0) ** 2  # um
         column = {name: np.array([value]) for name, value in self._values.items()}
         dynamics = self.actuator.filter.recursion(column, 1, interval, "zero")
-        moved: FloatArray = strain[0] + _from_rest(dynamics, strain[np.newaxis] - strain[0])[0]
-        return moved
+        (even,) = dynamics.run(strain[np.newaxis] - strain[0], dynamics.at_rest())
+        drift = np.linspace(0.0, 0.5, samples)  # um
+        return np.asarray(creep(displacement, interval) + (strain[0] + even) + drift)
 
 
 def creep(displacement: FloatArray, interval: float) -> FloatArray:
-    """Creep of 1 % of the displacement per decade of time, by Kelvin-Voigt elements.
+    """Creep, (samples,), um, of 1 % of a displacement, (samples,), um, per decade of time.
 
-    Each element i is a lag, ``tau_i c_i' + c_i = 0.005 x``, and the creep is their sum. The times
-    tau_i are two per decade from 0.01 s to 10,000 s, so that after a step the creep rises by 1 %
-    of it per decade within a hundredth of that, from 0.1 s to 100 s after the step. The elements
-    are at rest for zero displacement before the first sample, and the displacement is taken as
-    linear between samples.
-
-    Parameters
-    ----------
-    displacement : (samples,) array
-        x, um.
-    interval : float
-        Sampling interval, s.
-
-    Returns
-    -------
-    (samples,) array
-        um.
+    By Kelvin-Voigt elements: each is a lag, ``tau_i c_i' + c_i = 0.005 x``, at rest at zero before
+    the first sample, and the creep is their sum. The times tau_i are two per decade from 0.01 s to
+    10,000 s, so that after a step the creep rises by 1 % of it per decade within a hundredth of
+    that (their ripple is 0.3 %), from 0.1 s to 100 s after the step. The displacement is taken as
+    linear between samples, an interval, s, apart.
     """
-    elements = first_order_lag(np.array(CREEP_LAGS), interval, "first")
-    driven = np.tile(displacement, (len(CREEP_LAGS), 1))
-    crept: FloatArray = CREEP_PER_DECADE / 2 * _from_rest(elements, driven).sum(axis=0)
-    return crept
-
-
-def _from_rest(dynamics: Recursion, drive: FloatArray) -> FloatArray:
-    """Response (models, samples) of dynamics that are at rest at zero before the first sample."""
-    return dynamics.run(drive, dynamics.at_rest())
-
-
-def _ornstein_uhlenbeck(
-    samples: int, interval: float, generator: np.random.Generator
-) -> FloatArray:
-    """Draw the process (samples,) in um from its stationary distribution, exact at any interval."""
-    decay = math.exp(-interval / PROCESS_TIME)
-    shocks = PROCESS_SD * generator.standard_normal(samples)
-    shocks[1:] *= math.sqrt(-math.expm1(-2 * interval / PROCESS_TIME))
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decay], shocks), dtype=np.float64)
+    times = 10.0 ** np.arange(-2.0, 4.5, 0.5)  # s
+    elements = first_order_lag(times, interval, "first")
+    response = elements.run(np.tile(displacement, (times.size, 1)), elements.at_rest())
+    return np.asarray(0.01 / 2 * response.sum(axis=0))
 
 
 def _quantize(values: FloatArray, step: float, bits: int) -> FloatArray:

@@ -31,8 +31,6 @@ __all__ = [
     "signal_names",
 ]
 
-MOST_SAMPLES = 10**7
-
 
 def _require(where: str, value: float, kind: Literal["finite", "positive", "not negative"]) -> None:
     """Refuse a number that is not finite, or has the wrong sign."""
@@ -228,17 +226,8 @@ class Waveform:
     def sample(self, rate: float) -> tuple[FloatArray, FloatArray]:
         """Sample the waveform at ``t_k = k / rate`` over its duration, the end left out.
 
-        Parameters
-        ----------
-        rate : float
-            Sampling rate, Hz, more than twice the carrier's highest frequency.
-
-        Returns
-        -------
-        time : (samples,) array
-            s.
-        voltage : (samples,) array
-            V.
+        The rate, Hz, is more than twice the carrier's highest frequency. Returns times, s, and
+        voltages, V, (samples,) each.
 
         Raises :class:`InputError` if the rate is not above zero or too low for the carrier, or the
         duration holds fewer than two samples or more than ten million.
@@ -250,9 +239,10 @@ class Waveform:
                 f"sampling: rate: {rate:g} Hz cannot resolve {lowest / 2:g} Hz; "
                 f"sample faster than {lowest:g} Hz"
             )
-        samples = round(min(self.duration * rate, MOST_SAMPLES + 1))
-        if not 2 <= samples <= MOST_SAMPLES:
-            bound = "fewer than two" if samples < 2 else f"more than {MOST_SAMPLES:,}"
+        limit = 10**7
+        samples = round(min(self.duration * rate, limit + 1))
+        if not 2 <= samples <= limit:
+            bound = "fewer than two" if samples < 2 else f"more than {limit:,}"
             where = f"sampling: {self.duration:g} s at {rate:g} Hz is {bound} samples"
             raise InputError(f"{where}; give another rate or duration")
         time = np.arange(samples) / rate

@@ -125,23 +125,3 @@ def test_a_record_needs_one_reading_and_all_missing_ones_are_alike() -> None:
 def test_decimate_refuses_what_is_no_number_of_samples(factor: int) -> None:
     with pytest.raises(InputError, match="decimate"):
         ramp().decimate(factor)
-
-
-def test_split_gives_slices_of_the_whole_record() -> None:
-    split = ramp(100, 0.01).split([(0.5, 1.0)], [(0.0, 0.2), (0.1, 0.5)])
-    assert (slice(50, 100),) == split.training
-    assert (slice(0, 20), slice(10, 50)) == split.held_out
-
-
-@pytest.mark.parametrize(
-    ("training", "held_out", "kind"),
-    [
-        ([(0.5, 1.0)], [(0.0, 0.2), (0.4, 0.52)], "held-out window 0.4 to 0.52"),
-        ([(0.0, 0.5), (0.4, 1.0)], [], "training window 0 to 0.5"),
-    ],
-)
-def test_split_refuses_windows_that_overlap_training(
-    training: list[tuple[float, float]], held_out: list[tuple[float, float]], kind: str
-) -> None:
-    with pytest.raises(InputError, match=f"overlaps the {kind}"):
-        ramp(100, 0.01).split(training, held_out)

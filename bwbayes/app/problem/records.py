@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -211,7 +211,8 @@ def windows_of(
 def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict[str, Slices]]:
     """Return the windows of one training record."""
     train, table = config.records[name].train, place_of(name)
-    windows = {f"{table}.train": [whole(record)] if train is None else [(a, b) for a, b in train]}
+    pairs = [whole(record)] if train is None else sorted((a, b) for a, b in train)
+    windows = {f"{table}.train": pairs}
     names = []
     for other, validation in config.validation.items():
         if validation.window and not validation.another and validation.of in (name, None):
@@ -223,11 +224,7 @@ def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict
             slices[where] = tuple(record.window_slice(*pair) for pair in pairs)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-    trained, *held_out = windows.values()
-    try:
-        split = record.split(trained, [pair for pairs in held_out for pair in pairs])
-    except InputError as error:
-        raise InputError(str(error).replace("record.train", f"{table}.train")) from None
+    _require_apart(record, slices, table)
     for where, cuts in slices.items():
         for cut in cuts:
             if not record.has_reading[cut].any():
@@ -236,8 +233,28 @@ def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict
                     f"{where}: no readings from {record.clock(start)} to {record.clock(stop)} s; "
                     f"choose another window, or see start, exclude and decimate in [{table}]"
                 )
-    _, *held = slices.values()
-    return split.training, dict(zip(names, held, strict=True))
+    training, *held = slices.values()
+    return training, dict(zip(names, held, strict=True))
+
+
+def _require_apart(record: Record, slices: Mapping[str, Slices], table: str) -> None:
+    """Refuse training windows that overlap another one, or one that is held out."""
+    training, *held = slices.values()
+    pairs = [("training", later, earlier) for earlier, later in combinations(training, 2)]
+    pairs += [("held-out", *pair) for pair in product(training, (w for v in held for w in v))]
+    for kind, window, other in pairs:
+        if window.start < other.stop and other.start < window.stop:
+            first, second = (
+                " to ".join(
+                    record.clock(record.start + record.interval * edge)
+                    for edge in (cut.start, cut.stop)
+                )
+                for cut in (window, other)
+            )
+            raise InputError(
+                f"training window {first} s: overlaps the {kind} window {second} s; move one "
+                f"({table}.train)"
+            )
 
 
 def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
