@@ -74,7 +74,7 @@ def made(common: Experiment, count: int, seed: int = SEED) -> list[Replicate]:
 
 
 def judged(outcome: list[Replicate]) -> Calibration:
-    return judge([one.entry() for one in outcome], np.random.default_rng(SEED))
+    return judge([one.entry for one in outcome], np.random.default_rng(SEED))
 
 
 # The sound calibration, and defects that are planted on its draws

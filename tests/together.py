@@ -58,11 +58,12 @@ def whitened_positions(result: Replicate, prior: JointPrior, plant: Plant) -> Fl
     """
     free = prior.dimensions
     draws = plant(prior.unconstrain(result.draws[:, :free]))
-    both = np.concatenate([prior.unconstrain(result.truth[np.newaxis, :free]), draws])
+    truth = np.array([[*result.entry["truth"].values()][:free]])
+    both = np.concatenate([prior.unconstrain(truth), draws])
     both = (both - np.mean(both, axis=0)) / np.std(both, axis=0)
     variances, axes = linalg.eigh(np.atleast_2d(np.corrcoef(both.T)))
     white = both @ (axes / np.sqrt(variances)) @ axes.T
-    jitter = np.random.default_rng([SEED, result.number]).uniform(size=free)
+    jitter = np.random.default_rng([SEED, result.entry["number"]]).uniform(size=free)
     positions: FloatArray = (np.sum(white[1:] < white[0], axis=0) + jitter) / len(both)
     return positions
 
@@ -84,10 +85,10 @@ def together_test(result: list[Replicate], prior: JointPrior, plant: Plant = not
 
 def errors_off(results: list[Replicate]) -> dict[str, float]:
     """How far each band's mean coverage is off, in standard errors between replicates."""
-    ranked = [replicate for replicate in results if replicate.covered]
+    bands = [result.entry["covered"] for result in results if result.entry["covered"]]
     off = {}
-    for name in ranked[0].covered:
-        covered = np.array([replicate.covered[name] for replicate in ranked])
+    for name in bands[0]:
+        covered = np.array([covered[name] for covered in bands])
         error = np.std(covered, ddof=1) / np.sqrt(covered.size)
         off[name] = float((np.mean(covered) - int(name.split()[-1]) / 100) / error)
     return off

@@ -2,14 +2,13 @@
 
 Where a posterior is right, the truth's rank among its draws is even over replicates
 (:mod:`bwbayes.calibration.replicates`). Ranks that heap up at both ends tell of posteriors that are
-too narrow, in the middle of ones too wide, at one end of a bias. Two tests look at each statistic.
-The smooth test looks for just these shapes and is by far the more powerful; that of Kolmogorov and
-Smirnov sees any other. Both together raise a false alarm in one sound calibration of a hundred.
-Bands on held-out samples must cover what they promise within three standard errors. Single
-coverages are far from normal, so this is asked of 500 replicates or more, of which at most one
-sound calibration in forty fails it by chance (one in 28 would with 150, one in 17 with 100). These
-rates are those of one look: who goes on until a calibration passes has others. What did not
-converge is counted, and ranked with the rest if it has draws at all.
+too narrow, in the middle of ones too wide, at one end of a bias. The smooth test looks for just
+these shapes and is by far the more powerful; that of Kolmogorov and Smirnov sees any other. Both
+together raise a false alarm in one sound calibration of a hundred. Bands on held-out samples must
+cover what they promise within three standard errors. Single coverages are far from normal, so this
+is asked of 500 replicates or more, of which one sound calibration in forty fails it by chance (one
+in 17 with 100). These rates are those of one look. What did not converge is counted, and ranked
+with the rest if it has draws at all.
 """
 
 from __future__ import annotations
@@ -185,25 +184,28 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
     level = FAMILY_LEVEL / 2 / len(names)
     p = smooth_test(positions)
     ecdf_limit = float(scipy.stats.kstwo.isf(level, count))
+    # Between the distribution function's steps and the straight line.
+    ordered, steps = np.sort(positions, axis=0).T, np.arange(count + 1) / count
+    distances = np.maximum(steps[1:] - ordered, ordered - steps[:-1]).max(axis=1)
     statistics = {
         name: Uniformity(
             float(p[i]),
             float(adjusted),
-            bool(scipy.stats.kstest(column, "uniform").statistic > ecdf_limit),
+            bool(distances[i] > ecdf_limit),
             {level: float(np.mean(np.abs(column - 0.5) < level / 200)) for level in LEVELS},
         )
         for i, (name, adjusted, column) in enumerate(zip(names, holm(p), positions.T, strict=True))
     }
-    unconverged = tuple(entry["number"] for entry in entries if not entry["converged"])
     bands = {}
     for name in ranked[0]["covered"]:
         covered = np.array([entry["covered"][name] for entry in ranked])
         error = np.std(covered, ddof=1) / np.sqrt(count) if count > 1 else np.nan
         bands[name] = Coverage(float(np.mean(covered)), float(error))
     intervals = {level: scipy.stats.binom.interval(0.99, count, level / 100) for level in LEVELS}
+    enough = count >= JUDGED_FROM
     return Calibration(
         replicates=len(entries),
-        unconverged=unconverged,
+        unconverged=tuple(entry["number"] for entry in entries if not entry["converged"]),
         positions=positions,
         statistics=statistics,
         ecdf_limit=ecdf_limit,
@@ -215,11 +217,7 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
             "20 % too small": smooth_power(count, level, 0.8),
             "10 % too small": smooth_power(count, level, 0.9),
         },
-        shortcomings=(
-            *_unconverged_shortcoming(len(unconverged), len(entries)),
-            *_rank_shortcomings(statistics),
-            *(_band_shortcomings(bands) if count >= JUDGED_FROM else ()),
-        ),
+        shortcomings=tuple(_shortcomings(entries, statistics, bands if enough else {})),
     )
 
 
@@ -276,20 +274,18 @@ def _legendre(u: FloatArray) -> FloatArray:
     return np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u * (u - 1) + 1)])
 
 
-def _unconverged_shortcoming(unconverged: int, replicates: int) -> Iterator[str]:
-    if unconverged > 0.01 * replicates:
-        yield f"{unconverged} of {replicates} replicates did not converge, more than 1%"
-
-
-def _rank_shortcomings(statistics: Mapping[str, Uniformity]) -> Iterator[str]:
+def _shortcomings(
+    entries: Sequence[Entry], statistics: Mapping[str, Uniformity], bands: Mapping[str, Coverage]
+) -> Iterator[str]:
+    """Yield why a calibration has failed."""
+    unconverged = sum(not entry["converged"] for entry in entries)
+    if unconverged > 0.01 * len(entries):
+        yield f"{unconverged} of {len(entries)} replicates did not converge, more than 1%"
     for name, statistic in statistics.items():
         if statistic.adjusted < FAMILY_LEVEL / 2:
             yield f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})"
         if statistic.outside:
             yield f"{name}: the distribution of ranks leaves its band"
-
-
-def _band_shortcomings(bands: Mapping[str, Coverage]) -> Iterator[str]:
     for name, coverage in bands.items():
         *record, kind, level = name.split(" ")
         # Written so that nan fails.

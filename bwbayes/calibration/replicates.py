@@ -16,11 +16,11 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.calibration.records import OtherRecord, Simulated, covered
 from bwbayes.errors import InputError, one_line
 from bwbayes.inference import map_estimate as pointfit
@@ -30,7 +30,6 @@ from bwbayes.prediction.loops import at_level, crossings
 from bwbayes.prediction.prediction import predict_windows, thinned
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
-from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.shown import brief
@@ -54,7 +53,13 @@ EXTRA = ("log_likelihood", "opening", "range")
 
 
 class Entry(TypedDict):
-    """A replicate as it is stored: ranks by statistic, coverage by band ("sensor 95")."""
+    """A replicate as it is stored.
+
+    ``steps`` are those of the sampling that count, ``spacing`` those between two draws of one
+    walker, at least one autocorrelation time if it has converged. ``truth`` and ``ranks`` (how many
+    draws lie below it, from 0 to ``RANKED``) are by statistic, ``covered`` (the part of the samples
+    inside) by band ("sensor 95").
+    """
 
     number: int
     converged: bool
@@ -77,18 +82,15 @@ class Experiment:
         used.
     plan
         How to sample.
-    held_out
+    held_out, belongs
         Windows (slices of a record's voltage) for which bands are predicted and held against the
-        simulated record, by name.
-    belongs
-        The record that a held-out window is of, by the window's name; by default the first.
+        simulated record, by name; and the record that each is of, by default the first.
     others
         Other records, by name: made with the same truth, but with a start and an offset of their
         own, and predicted with the parameters from the posterior.
     source
-        Where truths and records come from, if not from ``posterior``; its parameters must include
-        those of ``posterior``. A calibration then must fail: it says how an analysis fares on
-        records that it is wrong about.
+        Where truths and records come from, if not from ``posterior``, whose parameters it must
+        include. A calibration then must fail: on records that the analysis is wrong about.
 
     Raises
     ------
@@ -124,14 +126,10 @@ class Experiment:
 
     @property
     def bands(self) -> tuple[str, ...]:
-        """Names of the bands that are held against samples that were not fitted.
-
-        Those of the held-out windows together ("sensor 95"), and of each other record
-        ("NAME sensor 95").
-        """
+        """Names of the bands: "sensor 95" of held-out windows, "NAME sensor 95" of others."""
         names = [f"{kind} {level}" for kind in KINDS for level in LEVELS]
-        fitted_names = names if self.held_out else []
-        return (*fitted_names, *(f"{other} {name}" for other in self.others for name in names))
+        others = [f"{other} {name}" for other in self.others for name in names]
+        return (*(names if self.held_out else []), *others)
 
     @cached_property
     def looped(self) -> tuple[str, FloatArray] | None:
@@ -165,60 +163,14 @@ class Experiment:
         return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Replicate:
-    """One record, made and fitted.
+class Replicate(NamedTuple):
+    """One record, made and fitted: what is stored, and (RANKED, statistics) posterior draws.
 
-    Parameters
-    ----------
-    number
-        Which replicate.
-    converged, stop_reason, steps
-        How the sampling ended, and its steps that count.
-    spacing
-        Steps between two draws of one walker, at least one autocorrelation time if the sampling has
-        converged. The draws below are a random choice of all that are left.
-    names
-        Names of the statistics.
-    truth
-        (statistics,) their true values.
-    draws
-        (RANKED, statistics) their posterior draws; empty if there are not so many.
-    covered
-        Part of the samples inside each of the experiment's bands, by name; empty without draws.
+    The draws are empty, and nothing is ranked or covered, if there are not so many.
     """
 
-    __repr__ = brief
-
-    number: int
-    converged: bool
-    stop_reason: str
-    steps: int
-    spacing: int
-    names: tuple[str, ...]
-    truth: FloatArray
+    entry: Entry
     draws: FloatArray
-    covered: Mapping[str, float]
-
-    @property
-    def ranks(self) -> IntArray:
-        """How many draws lie below the truth, (statistics,), from 0 to ``RANKED``."""
-        return np.asarray(np.sum(self.draws < self.truth, axis=0), dtype=np.int64)
-
-    def entry(self) -> Entry:
-        """Return what is stored of it."""
-        has_draws = len(self.draws) > 0
-        truth, ranks = self.truth.tolist(), self.ranks.tolist() if has_draws else []
-        return Entry(
-            number=self.number,
-            converged=self.converged,
-            stop_reason=self.stop_reason,
-            steps=self.steps,
-            spacing=self.spacing,
-            truth=dict(zip(self.names, truth, strict=True)),
-            ranks=dict(zip(self.names, ranks, strict=True)) if has_draws else {},
-            covered=dict(self.covered),
-        )
 
 
 def replicates(
@@ -271,24 +223,40 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     posterior = experiment.posterior.with_readings(readings)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     names, truth = experiment.statistics, _statistics(experiment, posterior, true)[0]
-    covered_parts: dict[str, float] = {}
-    unranked = names, truth, np.empty((0, len(names))), covered_parts
+    entry = Entry(
+        number=number,
+        converged=False,
+        stop_reason="",
+        steps=0,
+        spacing=0,
+        truth=dict(zip(names, truth.tolist(), strict=True)),
+        ranks={},
+        covered={},
+    )
     # InputError, and what linear algebra raises: one record must not end the whole calibration.
     try:
-        outcome, chained = _sampled(posterior, experiment.plan, fitting, sampling)
+        chain = first_chain(posterior, pointfit.fit(posterior, fitting), experiment.plan, sampling)
+        with ThreadPoolExecutor(1) as executor:
+            outcome = sample(posterior, experiment.plan, chain, executor)
     except ValueError as error:
-        return Replicate(number, False, one_line(str(error)), 0, 0, *unranked)
+        entry["stop_reason"] = one_line(str(error))
+        return Replicate(entry, np.empty((0, len(names))))
+    chained = draws(posterior, chain)
     time = float(np.max(outcome.check.autocorrelation))
-    spacing, free = _independent(chained, time, choosing)
-    ended = number, outcome.converged, outcome.stop_reason, outcome.check.steps, spacing
+    entry["spacing"], free = _independent(chained, time, choosing)
+    entry["converged"], entry["stop_reason"] = outcome.converged, outcome.stop_reason
+    entry["steps"] = outcome.check.steps
     if len(free) < RANKED:
-        return Replicate(*ended, *unranked)
+        return Replicate(entry, np.empty((0, len(names))))
+    drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
+    entry["ranks"] = dict(zip(names, np.sum(drawn < truth, axis=0).tolist(), strict=True))
     # Fewer draws than a run's, to save time.
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
-    drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
-    inside = _held_out(experiment, posterior, flat, simulated, predicting)
-    inside |= _others(experiment, posterior, flat, theta, readings, others)
-    return Replicate(*ended, names, truth, drawn, inside)
+    entry["covered"] = {
+        **_held_out(experiment, posterior, flat, simulated, predicting),
+        **_others(experiment, posterior, flat, theta, readings, others),
+    }
+    return Replicate(entry, drawn)
 
 
 def _simulated(
@@ -320,20 +288,6 @@ def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray)
     """Free parameters and measures of models θ, (models, statistics)."""
     free = [posterior.prior.names.index(name) for name in posterior.names]
     return np.concatenate([theta[:, free], experiment.measures(posterior, theta)], axis=1)
-
-
-def _sampled(
-    posterior: Posterior,
-    plan: SamplingPlan,
-    fitting: np.random.Generator,
-    sampling: np.random.Generator,
-) -> tuple[Outcome, FloatArray]:
-    """Fit and sample by the path of a run; the draws are (steps, ensembles, walkers, free)."""
-    point = pointfit.fit(posterior, fitting)
-    chain = first_chain(posterior, point, plan, sampling)
-    with ThreadPoolExecutor(1) as executor:
-        outcome = sample(posterior, plan, chain, executor)
-    return outcome, draws(posterior, chain)
 
 
 def _independent(

@@ -231,10 +231,10 @@ def test_replicates_make_all_records_anew() -> None:
     assert common.looped is not None
     assert common.looped[0] == "loops"
     assert {"later": "loops"} == common.belongs
-    made = replicate(common, 1, 0)
-    assert made.converged
-    assert {"offset[loops]", "offset[step]", "opening", "d"} <= {*made.names}
-    assert {"sensor 95", "sine sensor 95"} <= made.covered.keys()
+    entry = replicate(common, 1, 0).entry
+    assert entry["converged"]
+    assert {"offset[loops]", "offset[step]", "opening", "d"} <= entry["truth"].keys()
+    assert {"sensor 95", "sine sensor 95"} <= entry["covered"].keys()
 
 
 def measured(seed: int, gain: float = 0.6) -> Record:

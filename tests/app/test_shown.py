@@ -85,7 +85,7 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         measure_step(posterior, draws, Step(10.0, 1.0)),
         experiment,
         replicate,
-        judge([replicate.entry()], rng),
+        judge([replicate.entry], rng),
         many,
         bw.Campaign(CampaignFolder(folder), rows, many),
         fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),

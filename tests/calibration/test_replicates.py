@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,14 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.calibration import replicates as module
 from bwbayes.calibration.records import OtherRecord, Simulated, covered
-from bwbayes.calibration.replicates import RANKED, Experiment, replicate, replicates
+from bwbayes.calibration.replicates import (
+    RANKED,
+    Experiment,
+    Replicate,
+    as_done,
+    replicate,
+    replicates,
+)
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -44,23 +49,29 @@ def small(**changes: object) -> Experiment:
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:
     with ThreadPoolExecutor(2) as executor:
-        made = {one.number: one.entry() for one in replicates(small(), 1, [0, 1], executor, 2)}
+        made = {
+            one.entry["number"]: one.entry for one in replicates(small(), 1, [0, 1], executor, 2)
+        }
     both = [made[0], made[1]]
-    assert both[1] == replicate(small(), 1, 1).entry()
+    assert both[1] == replicate(small(), 1, 1).entry
     assert both[1]["truth"] != both[0]["truth"]
-    assert both[1]["truth"] != replicate(small(), 2, 1).entry()["truth"]
+    assert both[1]["truth"] != replicate(small(), 2, 1).entry["truth"]
 
 
-def test_entry_is_plain_and_complete() -> None:
-    made = replicate(small(), 1, 3)
-    entry = made.entry()
+@pytest.fixture(scope="module")
+def third() -> Replicate:
+    return replicate(small(), 1, 3)
+
+
+def test_entry_is_plain_and_complete(third: Replicate) -> None:
+    entry = third.entry
     assert entry == json.loads(json.dumps(entry))
     names = ["d", "alpha", "sensor_sd", "log_likelihood", "opening", "range"]
     assert names == list(entry["ranks"]) == list(entry["truth"])
     assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
     assert (3, True) == (entry["number"], entry["converged"])
-    assert (RANKED, len(names)) == made.draws.shape
-    for name, true, draws in zip(names, made.truth, made.draws.T, strict=True):
+    assert (RANKED, len(names)) == third.draws.shape
+    for name, true, draws in zip(names, entry["truth"].values(), third.draws.T, strict=True):
         assert sum(draw < true for draw in draws) == entry["ranks"][name]
 
 
@@ -69,7 +80,7 @@ def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch
         raise np.linalg.LinAlgError("priors: no draw has a finite posterior density")
 
     monkeypatch.setattr("bwbayes.inference.map_estimate.fit", refuse)
-    entry = replicate(small(), 1, 0).entry()
+    entry = replicate(small(), 1, 0).entry
     assert (False, {}, {}) == (entry["converged"], entry["ranks"], entry["covered"])
     assert "finite posterior density" in entry["stop_reason"]
     assert 6 == len(entry["truth"])
@@ -93,27 +104,19 @@ def test_each_band_is_held_against_what_it_is_for() -> None:
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     """Among fewer than others it would have other ranks."""
     plan = replace(PLAN, walkers=6, block=5, most_steps=5)
-    made = replicate(small(plan=plan), 1, 0)
-    assert (5, False, {}, {}) == (made.steps, made.converged, made.entry()["ranks"], made.covered)
+    entry = replicate(small(plan=plan), 1, 0).entry
+    assert (5, False) == (entry["steps"], entry["converged"])
+    assert {} == entry["ranks"] == entry["covered"]
 
 
 def test_only_so_many_are_under_way_together() -> None:
     """Who stops after the first has to wait for no more than those."""
-    begun: list[Any] = []
-
-    class Watched(ThreadPoolExecutor):
-        def submit[**P, T](
-            self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
-        ) -> Future[T]:
-            begun.append(args[-1])
-            return super().submit(fn, *args, **kwargs)
-
-    with Watched(1) as executor:
-        made = replicates(small(), 1, range(100), executor, 2)
-        next(made)
-        assert [0, 1] == begun
-        next(made)
-        assert 3 >= len(begun)
+    waiting = ((number,) for number in range(100))
+    with ThreadPoolExecutor(4) as executor:
+        done = as_done(executor, 2, abs, waiting)
+        results = {next(done)}
+        assert (2,) == next(waiting)
+        assert {0, 1, *range(3, 100)} == results | set(done)
 
 
 def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
@@ -140,13 +143,13 @@ def another(**changes: object) -> OtherRecord:
     return replace(other, **changes)  # type: ignore[arg-type]
 
 
-def test_bands_of_other_records_are_held_against_them() -> None:
+def test_bands_of_other_records_are_held_against_them(third: Replicate) -> None:
     common = small(others={"one": another(), "part": another(window=(0.5, 1.0))})
-    entry = replicate(common, 1, 3).entry()
+    entry = replicate(common, 1, 3).entry
     assert list(common.bands) == list(entry["covered"])
     assert entry["covered"]["one sensor 50"] != entry["covered"]["part sensor 50"]
     # It does not matter to the rest whether there are others.
-    alone = replicate(small(), 1, 3).entry()
+    alone = third.entry
     assert alone["ranks"] == entry["ranks"]
     assert alone["covered"] == {name: entry["covered"][name] for name in alone["covered"]}
 
@@ -237,9 +240,5 @@ def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None
     posterior = small().posterior.altered(voltage=voltage)
     expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
     assert expected == Experiment(posterior, PLAN).level
-
-
-def test_voltage_without_a_loop_is_refused() -> None:
-    posterior = small().posterior.altered(voltage=np.linspace(0.0, 100.0, 80))
     with pytest.raises(InputError, match="does not go back and forth"):
-        Experiment(posterior, PLAN)
+        Experiment(posterior.altered(voltage=np.linspace(0.0, 100.0, 80)), PLAN)

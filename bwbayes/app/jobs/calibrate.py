@@ -188,10 +188,10 @@ def _make(
         ) as progress,
     ):
         together = side_by_side(pool, workers, len(missing))
-        for replicate in run_replicates(common, seed, missing, pool, together):
-            entry = entries[replicate.number] = replicate.entry()
+        for entry, _ in run_replicates(common, seed, missing, pool, together):
+            entries[entry["number"]] = entry
             _append(folder, json.dumps(entry).encode() + b"\n")
-            progress("" if replicate.converged else "not converged")
+            progress("" if entry["converged"] else "not converged")
 
 
 def _append(folder: CalibrationFolder, line: bytes) -> None:
