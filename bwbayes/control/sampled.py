@@ -19,7 +19,6 @@ from scipy.linalg import block_diag
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.gain import DriveStep
 from bwbayes.model.operator import Span
 from bwbayes.model.step import Gone, HysteresisStep
 from bwbayes.shown import brief
@@ -201,12 +200,21 @@ class SampledModel:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
         smallest, largest = self.step.slopes(limits)
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
-        added = self._drive_step.added_slope(np.linspace(*limits, 1001)[:, np.newaxis])
+        _, added = self._added(np.linspace(*limits, 1001)[:, np.newaxis])
         return smallest + added.min(axis=0), largest + added.max(axis=0)
 
     def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
         """Return hysteresis and gain, um, once the voltages (models,) have gone there."""
-        return self._drive_step.go(memory, voltage)
+        gone, (level, slope) = self.step.go(memory, voltage), self._added(voltage)
+        return Gone(gone.w + level, gone.slope + slope, gone.memory)
+
+    def _added(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the gain adds at voltages (models,) or (any, 1), um, and its slope, um/V."""
+        if self.actuator.gain is None:
+            return np.zeros_like(voltage), np.zeros_like(voltage)
+        level, first, second, third = self.actuator.gain.powers(self.column)
+        added = level + voltage * (first + voltage * (second + voltage * third))
+        return added, first + voltage * (2 * second + voltage * 3 * third)
 
     def frequency_response(self, angles: FloatArray) -> FloatArray:
         """Return the complex response (models, frequencies) of dynamics and creep together.
@@ -246,10 +254,6 @@ class SampledModel:
         return scipy.signal.StateSpace(
             block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
         )
-
-    @property
-    def _drive_step(self) -> DriveStep:
-        return DriveStep(self.step, self.actuator.gain, self.column)
 
     def _section_drives(self, w: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return what drives each section, (models, sections), um."""

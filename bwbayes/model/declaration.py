@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,7 @@ __all__ = [
     "check",
     "lognormal",
     "normal",
+    "positive",
     "refuse",
     "rounded",
 ]
@@ -142,6 +143,24 @@ class Declaration:
     def unit_in(self, stated: Mapping[str, float | Distribution]) -> str:
         """Return its unit, given what is stated of other parameters by name."""
         return self.unit if self.unit_given is None else self.unit_given(stated)
+
+
+def positive(
+    name: str,
+    unit: str,
+    label: str,
+    description: str,
+    median: Callable[[Ranges], float],
+    sigma: float = 1.0,
+    **others: Any,
+) -> Declaration:
+    """Declare a parameter of the loop above zero, with a lognormal default prior."""
+
+    def default(context: Context) -> Distribution:
+        return lognormal(median(context.ranges), sigma)
+
+    declared = Declaration(name, unit, label, description, default, floor=0.0, loop=True)
+    return replace(declared, **others)
 
 
 def check(

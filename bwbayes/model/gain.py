@@ -18,7 +18,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.operator import UNIT, Span
-from bwbayes.model.step import Gone, HysteresisStep
 
 __all__ = ["PolynomialGain"]
 
@@ -108,37 +107,3 @@ class PolynomialGain:
                     np.asarray((x**power).coef, np.float64), column[name]
                 )
         return coefficients
-
-
-@dataclass(frozen=True)
-class DriveStep:
-    """Hysteresis and polynomial gain together, each model with a voltage of its own.
-
-    Parameters
-    ----------
-    step
-        The hysteresis.
-    gain
-        What is added to it, or None.
-    column
-        The gain's coefficients (models,), um, by name.
-    """
-
-    step: HysteresisStep
-    gain: PolynomialGain | None
-    column: Values
-
-    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return the drive, its slope and the memory once voltages (models,) have gone there."""
-        w, slope, after = self.step.go(memory, voltage)
-        if self.gain is not None:
-            level, *slopes = self.gain.powers(self.column)
-            w = w + level + voltage * (slopes[0] + voltage * (slopes[1] + voltage * slopes[2]))
-        return Gone(w, slope + self.added_slope(voltage), after)
-
-    def added_slope(self, voltage: FloatArray) -> FloatArray:
-        """Return the gain's own slope, um/V, at voltages (models,) or (any, 1)."""
-        if self.gain is None:
-            return np.zeros_like(voltage)
-        _, first, second, third = self.gain.powers(self.column)
-        return np.asarray(first + voltage * (2 * second + voltage * 3 * third))

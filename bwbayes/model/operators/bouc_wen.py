@@ -35,7 +35,9 @@ from bwbayes.model.operators.scalar_memory import (
     HIGHEST_CEILING,
     OneState,
     alpha,
+    beta,
     d,
+    gamma,
     initial,
 )
 from bwbayes.model.power import PowerStep
@@ -80,31 +82,13 @@ class BoucWen(OneState):
         """d, α, β, γ, n and the initial h."""
         advice = "this actuator may need a gamma beyond it: give passive = false under [model]"
         pressed = dict.fromkeys(("lower", "upper"), advice) if self.passive else {}
+        stated = "|gamma| <= beta" if self.passive else "beta + gamma >= 0"
         return (
             d(),
             alpha(),
-            Declaration(
-                "beta",
-                "1/V",
-                r"\beta",
-                "hysteresis loop shape",
-                _beta,
-                floor=0.0,
-                bounds=self._beta_bounds,
-                loop=True,
-                unit_given=_rate_unit,
-            ),
-            Declaration(
-                "gamma",
-                "1/V",
-                r"\gamma",
-                "hysteresis loop shape, loading against unloading",
-                _gamma,
-                bounds=self._gamma_bounds,
-                stated_bounds="|gamma| <= beta" if self.passive else "beta + gamma >= 0",
-                pressed=pressed,
-                loop=True,
-                unit_given=_rate_unit,
+            replace(beta(bounds=self._beta_bounds), default=_beta, unit_given=_rate_unit),
+            replace(
+                gamma(_gamma, self._gamma_bounds, stated), pressed=pressed, unit_given=_rate_unit
             ),
             Declaration(
                 "exponent",

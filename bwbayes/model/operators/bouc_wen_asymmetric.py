@@ -24,6 +24,7 @@ from bwbayes.model.operators.scalar_memory import (
     alpha,
     beta,
     d,
+    gamma,
     initial_anywhere,
 )
 from bwbayes.model.relaxing import RelaxingStep
@@ -92,23 +93,18 @@ class BoucWenAsymmetric(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, α, β, γ, the terms and the initial h."""
-        gamma = Declaration(
-            "gamma",
-            "1/V",
-            r"\gamma",
-            "hysteresis loop shape, loading against unloading",
+        tilt = gamma(
             lambda context: normal(0.0, 4.0 / context.ranges.voltage),
-            bounds=lambda earlier: (
+            lambda earlier: (
                 np.negative(earlier.get("beta", np.inf)),
                 earlier.get("beta", np.inf),
             ),
-            stated_bounds="|gamma| <= beta",
-            loop=True,
+            "|gamma| <= beta",
         )
         start = replace(initial_anywhere(), bounds=_initial_bounds)
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
         shape = beta(0.15, lambda earlier: (np.abs(earlier.get("gamma", np.zeros(1))), np.inf))
-        return d(), alpha(), shape, gamma, *self._asymmetry(), start
+        return d(), alpha(), shape, tilt, *self._asymmetry(), start
 
     def _asymmetry(self) -> list[Declaration]:
         return [
@@ -172,8 +168,8 @@ def _passive(column: Values) -> BoolArray:
     inside = np.full(column["beta"].shape, fill_value=True)
     for signs in product(SIGNS, SIGNS):
         slow, fast = _rates(column, *signs)
-        gamma = np.abs(column["gamma"] + column["beta"] * fast)
-        inside &= gamma <= column["beta"] * (slow + SLACK)
+        tilt = np.abs(column["gamma"] + column["beta"] * fast)
+        inside &= tilt <= column["beta"] * (slow + SLACK)
     return inside
 
 

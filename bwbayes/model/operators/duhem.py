@@ -30,7 +30,7 @@ from bwbayes.model.operators.scalar_memory import (
     initial_anywhere,
 )
 from bwbayes.model.relaxing import RelaxingStep
-from bwbayes.model.step import Gone, HysteresisStep
+from bwbayes.model.step import HysteresisStep
 
 __all__ = ["Duhem"]
 
@@ -145,28 +145,21 @@ class DuhemStep(RelaxingStep):
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return f′ − α(u) ∓ β h, with h on the loop over all of the limits: none is larger."""
-        low, high = limits
-        beta = np.maximum(self.ahead[0, 0], 1e-6 / (high - low))  # a rate may be zero
-        rate = np.broadcast_to(beta, self.ahead.shape)
-        symmetric = replace(self, against=rate, ahead=rate)
-        decay = np.exp(-beta * (high - low))
-
-        def swept(start: float, end: float, h: FloatArray) -> Gone:
-            return symmetric.go(np.stack([np.full_like(h, start), h], 1), np.full_like(h, end))
-
-        nothing = np.zeros_like(beta)
-        rise, fall = (swept(*ends, nothing).memory[:, 1] for ends in ((low, high), (high, low)))
-        at_high = (decay * fall + rise) / (1 - decay**2)
-        at_low = decay * at_high + fall
-        lowest, highest = np.full_like(beta, np.inf), np.full_like(beta, -np.inf)
-        for u in np.linspace(low, high, 1001):
-            up, down = swept(low, u, at_low), swept(high, u, at_high)
-            h = np.maximum(up.memory[:, 1], -down.memory[:, 1])
-            # Without any h it is f′ − α.
-            slope = swept(u, u, nothing).slope
-            lowest = np.minimum(lowest, slope - self.ahead[0, 0] * h)
-            highest = np.maximum(highest, slope + self.ahead[0, 0] * h)
-        return lowest, highest
+        rate = self.ahead[0, 0]
+        beta = np.maximum(rate, 1e-6 / (limits.high - limits.low))  # a rate may be zero
+        rates = np.broadcast_to(beta, self.ahead.shape)
+        loop, nothing = replace(self, against=rates, ahead=rates), np.zeros_like(beta)
+        rising = np.linspace(*limits, 1001)
+        _, rise = loop.along(limits.low, nothing, rising[-1:])
+        _, fall = loop.along(limits.high, nothing, rising[:1])
+        decay = np.exp(-beta * (limits.high - limits.low))
+        at_high = (decay * fall[:, 0] + rise[:, 0]) / (1 - decay**2)
+        _, up = loop.along(limits.low, decay * at_high + fall[:, 0], rising)
+        _, down = loop.along(limits.high, at_high, rising[::-1])
+        farthest = rate[:, np.newaxis] * np.maximum(up, -down[:, ::-1])
+        d, d2, d3, alpha, alpha1, alpha2 = self.parameters.T[:6, :, np.newaxis]
+        slope = d - alpha + rising * (2 * d2 - alpha1 + rising * (3 * d3 - alpha2))
+        return (slope - farthest).min(axis=1), (slope + farthest).max(axis=1)
 
 
 def _coefficient(name: str, power: int, label: str, description: str, scale: float) -> Declaration:

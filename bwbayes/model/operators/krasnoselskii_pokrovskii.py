@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal, refuse
+from bwbayes.model.declaration import Declaration, Values, positive, refuse
 from bwbayes.model.elementwise import select
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
@@ -63,17 +63,15 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, the density's α_R and u_s, the ramps' width a, and the start."""
-        width = Declaration(
-            name="width",
-            unit="V",
-            label="a",
-            description="rise of the voltage along which a relay switches",
-            default=lambda context: lognormal(0.2 * context.ranges.voltage, 1.0),
-            floor=0.0,
+        width = positive(
+            "width",
+            "V",
+            "a",
+            "rise of the voltage along which a relay switches",
+            lambda ranges: 0.2 * ranges.voltage,
             reaches_floor=True,
             bounds=lambda earlier: (0.0, WIDEST * earlier.get("saturation", np.array(np.inf))),
             stated_bounds=f"width <= {WIDEST:g} saturation",
-            loop=True,
         )
         rayleigh, saturation = DENSITY
         # Of a width that is fixed.

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.model.declaration import Declaration, Values, refuse
+from bwbayes.model.declaration import Declaration, Values, positive, refuse
 from bwbayes.model.operators.extremum_memory import INITIAL
-from bwbayes.model.operators.prandtl_ishlinskii import InParallel, of_gain
+from bwbayes.model.operators.prandtl_ishlinskii import InParallel
 
 __all__ = ["MaxwellSlip"]
 
@@ -54,16 +54,15 @@ class MaxwellSlip(InParallel):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, the α_j, the largest threshold if it is not given, and the start."""
-        slope = Declaration(
-            name="d",
-            unit="um/V",
-            label="d",
-            description="displacement per volt of long sweeps, when all elements slip",
-            default=of_gain(1.4, 0.5),
-            floor=0.0,
+        slope = positive(
+            "d",
+            "um/V",
+            "d",
+            "displacement per volt of long sweeps, when all elements slip",
+            lambda ranges: 1.4 * ranges.gain,
+            0.5,
             bounds=lambda earlier: (_held(earlier), np.inf),
             stated_bounds="the sum of all alpha <= d",
-            loop=True,
         )
         return (slope, *(_below_d(element) for element in self.elements()), INITIAL)
 

@@ -34,12 +34,7 @@ class NoHysteresis(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, and a placeholder for the initial state."""
-        slope = replace(
-            d(),
-            label="d",
-            default=lambda context: lognormal(context.ranges.gain, 0.6),
-            bounds=None,
-        )
+        slope = replace(d(), default=lambda c: lognormal(c.ranges.gain, 0.6), bounds=None)
         return slope, replace(initial_anywhere(), default=lambda _: 0.0)
 
     def trace(

@@ -18,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.model.declaration import Declaration, Values, check, lognormal, refuse
+from bwbayes.model.declaration import Declaration, Values, check, positive, refuse
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.rosenbrock import STAGES
@@ -70,60 +70,31 @@ class Pinned(OneState):
     def parameters(self) -> tuple[Declaration, ...]:
         """d, the saturation, the coupling, the pinning, the reversible part, and the start."""
         return (
-            Declaration(
+            positive(
                 "d",
                 "um/V",
                 r"d",
                 "slope of the displacement without hysteresis, at zero volts",
-                lambda context: lognormal(1.2 * context.ranges.gain, 0.6),
-                floor=0.0,
-                loop=True,
+                lambda ranges: 1.2 * ranges.gain,
+                0.6,
                 aliases=("gain", "d33"),
             ),
-            Declaration(
-                "saturation",
-                "um",
-                r"P_s",
-                "displacement at saturation",
-                lambda context: lognormal(4.0 * context.ranges.reach, 1.0),
-                floor=0.0,
-                loop=True,
+            positive(
+                "saturation", "um", r"P_s", "displacement at saturation", lambda r: 4.0 * r.reach
             ),
-            Declaration(
-                "coupling",
-                "-",
-                r"\eta",
-                "share of the slope that the coupling of the walls makes",
-                lambda _: Distribution("beta", {"a": 1.0, "b": 3.0}),
-                floor=0.0,
-                reaches_floor=True,
-                bounds=lambda _: (0.0, STRONGEST),
-                stated_bounds=f"0 <= coupling <= {STRONGEST:g}",
-                loop=True,
+            _fraction(
+                "coupling", r"\eta", "share of the slope that the walls' coupling makes", 1.0, 3.0
             ),
-            Declaration(
+            positive(
                 "pinning",
                 "V",
                 r"k",
                 "voltage by which pinned walls lag behind",
-                lambda context: lognormal(0.25 * context.ranges.voltage, 1.0),
-                floor=0.0,
+                lambda ranges: 0.25 * ranges.voltage,
                 bounds=self._pinning_bounds,
                 stated_bounds=f"at least {WEAKEST:g} of the field's scale",
-                loop=True,
             ),
-            Declaration(
-                "reversible",
-                "-",
-                r"c",
-                "part of the walls' motion that is reversible",
-                lambda _: Distribution("beta", {"a": 2.0, "b": 2.0}),
-                floor=0.0,
-                reaches_floor=True,
-                bounds=lambda _: (0.0, STRONGEST),
-                stated_bounds=f"0 <= reversible <= {STRONGEST:g}",
-                loop=True,
-            ),
+            _fraction("reversible", "c", "part of the walls' motion that is reversible", 2.0, 2.0),
             replace(
                 initial(),
                 description="how far the walls lag behind at the first sample",
@@ -250,6 +221,22 @@ class Pinned(OneState):
             return 0.0, np.inf
         bare = earlier["d"] * (1 - earlier["coupling"])
         return WEAKEST * self._slope_at_zero * earlier["saturation"] / bare, np.inf
+
+
+def _fraction(name: str, label: str, description: str, a: float, b: float) -> Declaration:
+    """Declare a number from zero to nearly one, with a beta distribution for its prior."""
+    return Declaration(
+        name,
+        "-",
+        label,
+        description,
+        lambda _: Distribution("beta", {"a": a, "b": b}),
+        floor=0.0,
+        reaches_floor=True,
+        bounds=lambda _: (0.0, STRONGEST),
+        stated_bounds=f"0 <= {name} <= {STRONGEST:g}",
+        loop=True,
+    )
 
 
 def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -9,7 +9,6 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -18,8 +17,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Context, Declaration, Values, lognormal, rounded
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Declaration, Values, positive, rounded
 from bwbayes.model.elementwise import anywhere, gone, select
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
@@ -31,23 +29,16 @@ __all__ = [
     "Plays",
     "PlaysStep",
     "PrandtlIshlinskii",
-    "of_gain",
 ]
 
 
-def of_gain(scale: float, sigma: float) -> Callable[[Context], Distribution]:
-    """Return a lognormal default prior whose median is a part of Y/U."""
-    return lambda context: lognormal(scale * context.ranges.gain, sigma)
-
-
-SLOPE = Declaration(
-    name="d",
-    unit="um/V",
-    label="d",
-    description="displacement per volt just after a turn",
-    default=of_gain(0.7, 0.6),
-    floor=0.0,
-    loop=True,
+SLOPE = positive(
+    "d",
+    "um/V",
+    "d",
+    "displacement per volt just after a turn",
+    lambda ranges: 0.7 * ranges.gain,
+    0.6,
 )
 
 
@@ -76,24 +67,20 @@ class PrandtlIshlinskii(RemembersExtrema):
         """d, α, the scale r₀ of the thresholds, and the start."""
         return (
             SLOPE,
-            Declaration(
-                name="alpha",
-                unit="um/V",
-                label=r"\alpha",
-                description="displacement per volt that long sweeps add",
-                default=of_gain(0.7, 1.0),
-                floor=0.0,
+            positive(
+                "alpha",
+                "um/V",
+                r"\alpha",
+                "displacement per volt that long sweeps add",
+                lambda ranges: 0.7 * ranges.gain,
                 reaches_floor=True,
-                loop=True,
             ),
-            Declaration(
-                name="threshold",
-                unit="V",
-                label="r_0",
-                description="scale of the plays' thresholds",
-                default=lambda context: lognormal(0.6 * context.ranges.voltage, 1.0),
-                floor=0.0,
-                loop=True,
+            positive(
+                "threshold",
+                "V",
+                "r_0",
+                "scale of the plays' thresholds",
+                lambda ranges: 0.6 * ranges.voltage,
             ),
             INITIAL,
         )
@@ -148,15 +135,13 @@ class InParallel(RemembersExtrema):
         """
         name, symbol, element = self.weight
         weights = tuple(
-            Declaration(
-                name=f"{name}_{j}",
-                unit="um/V",
-                label=rf"{symbol}_{{{j}}}",
-                description=f"weight of {element} {j}",
-                default=of_gain(0.4 / self.count, 1.0),
-                floor=0.0,
+            positive(
+                f"{name}_{j}",
+                "um/V",
+                rf"{symbol}_{{{j}}}",
+                f"weight of {element} {j}",
+                lambda ranges: 0.4 / self.count * ranges.gain,
                 reaches_floor=True,
-                loop=True,
             )
             for j in range(1, self.count + 1)
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.declaration import Declaration, Values, positive
 from bwbayes.model.elementwise import gone
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
@@ -26,26 +26,20 @@ SATURATED = 40.0
 
 
 DENSITY = (
-    Declaration(
-        name="rayleigh",
-        unit="um/V^2",
-        label=r"\alpha_R",
-        description="growth of the slope with the length of a branch, about zero volts",
-        default=lambda context: lognormal(0.4 * context.ranges.gain / context.ranges.voltage, 1.0),
-        floor=0.0,
+    positive(
+        "rayleigh",
+        "um/V^2",
+        r"\alpha_R",
+        "growth of the slope with the length of a branch, about zero volts",
+        lambda ranges: 0.4 * ranges.gain / ranges.voltage,
         reaches_floor=True,
-        loop=True,
     ),
-    Declaration(
-        name="saturation",
-        unit="V",
-        label="u_s",
-        description="voltage beyond which relays become rare",
-        default=lambda context: lognormal(
-            2 * (context.ranges.voltage + abs(context.ranges.bias)), 1.0
-        ),
-        floor=0.0,
-        loop=True,
+    positive(
+        "saturation",
+        "V",
+        "u_s",
+        "voltage beyond which relays become rare",
+        lambda ranges: 2 * (ranges.voltage + abs(ranges.bias)),
     ),
 )
 

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values, check, lognormal, normal
+from bwbayes.model.declaration import Context, Declaration, Values, check, normal, positive
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.step import OneStateStep
 
@@ -27,6 +28,7 @@ __all__ = [
     "below_ceiling",
     "beta",
     "d",
+    "gamma",
     "initial",
     "initial_anywhere",
 ]
@@ -124,50 +126,61 @@ class OneState(Operator):
 
 def d() -> Declaration:
     """Declare d, the slope behind the hysteresis."""
-    return Declaration(
+    return positive(
         "d",
         "um/V",
         r"d",
         "piezoelectric coefficient",
         # A drive that is small for the loop shows d - α, which may be half of d.
-        lambda context: lognormal(1.6 * context.ranges.gain, 0.6),
-        floor=0.0,
+        lambda ranges: 1.6 * ranges.gain,
+        0.6,
         bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
-        loop=True,
         aliases=("gain", "d33"),
     )
 
 
 def alpha() -> Declaration:
     """Declare α, below d."""
-    return Declaration(
+    return positive(
         "alpha",
         "um/V",
         r"\alpha",
         "hysteretic displacement per volt at h = 0",
-        lambda context: lognormal(0.7 * context.ranges.gain, 1.0),
-        floor=0.0,
+        lambda ranges: 0.7 * ranges.gain,
         bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
         stated_bounds="0 < alpha < d",
         pressed={
             "upper": "the model's slope is zero there; check the displacement's sign and unit, or "
             "fix alpha"
         },
-        loop=True,
         aliases=("a",),
     )
 
 
 def beta(scale: float = 1.0, bounds: Bounds | None = None) -> Declaration:
     """Declare β, near 1/U or a ``scale`` of it, where other parameters' bounds favor a large β."""
-    return Declaration(
+    description = "hysteresis loop shape"
+    return positive(
         "beta",
         "1/V",
         r"\beta",
-        "hysteresis loop shape",
-        lambda context: lognormal(scale / context.ranges.voltage, 2.3),
-        floor=0.0,
+        description,
+        lambda ranges: scale / ranges.voltage,
+        2.3,
         bounds=bounds,
+    )
+
+
+def gamma(default: Callable[[Context], Distribution], bounds: Bounds, stated: str) -> Declaration:
+    """Declare γ."""
+    return Declaration(
+        "gamma",
+        "1/V",
+        r"\gamma",
+        "hysteresis loop shape, loading against unloading",
+        default,
+        bounds=bounds,
+        stated_bounds=stated,
         loop=True,
     )
 
