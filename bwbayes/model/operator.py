@@ -139,11 +139,6 @@ class Operator(ABC):
         del column
         return np.True_
 
-    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
-        """Say what the draws (columns) of the ``free`` parameters tell that a user must know."""
-        del column, free
-        return []
-
     def opening(self, column: Values, half_range: float) -> FloatArray | None:
         """Return how far (models,) a drive of half a range (V) opens the loop; one closes it.
 

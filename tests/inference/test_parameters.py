@@ -14,7 +14,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.operators.bouc_wen import BoucWen, ceiling
+from bwbayes.model.operators.bouc_wen import ceiling
 from tests.declared import declared, joint, parameter
 from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
 
@@ -50,12 +50,6 @@ def passive(prior: JointPrior) -> bool:
     """Whether a prior has that constraint."""
     (gamma,) = (p.declared for p in prior.parameters if p.name == "gamma")
     return gamma is not None and gamma.stated_bounds == "|gamma| <= beta"
-
-
-def passive_remark(prior: JointPrior, draws: FloatArray) -> str | None:
-    theta = prior.theta(draws.reshape(-1, prior.dimensions))
-    column = dict(zip(prior.names, theta.T, strict=True))
-    return next(iter(BoucWen(passive(prior)).remarks(column, prior.free_names)), None)
 
 
 PRIORS = {
@@ -158,17 +152,6 @@ def test_gamma_beyond_beta_is_outside_unless_the_model_need_not_be_passive() -> 
     published[0, 3] = -0.0186
     assert -np.inf == free.log_density(published)[0]
     assert np.mean(free.draw(np.random.default_rng(13), 2000)[:, 3] > 0.02) > 0.1
-
-
-@pytest.mark.parametrize("ratio", [0.9, 0.99, 1.0])
-def test_a_posterior_that_presses_against_the_passive_bound_says_so(ratio: float) -> None:
-    prior = cut_prior(exponent=1.0)
-    draws = np.tile([0.7, 0.36, 0.027, 0.027 * ratio, 0.5], (2, 3, 4, 1))
-    remark = passive_remark(prior, draws)
-    assert (ratio > 0.95) == (remark is not None)
-    assert remark is None or "[model] passive = false" in remark
-    assert passive_remark(active(prior), draws) is None
-    assert passive_remark(cut_prior(gamma=0.01), draws) is None
 
 
 def test_far_coordinates_have_no_density() -> None:

@@ -53,15 +53,12 @@ def assemble(
     artist = artist or Artist()
     result = _drawn(problem, chain, outcome)
     flat = result.flat_draws
-    _, alone, first_draws = next(posterior.each(flat))
-    columns = alone.table.columns(alone.prior.theta(first_draws))
     remarks = [
         *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
         *map(str, conflict.conflicts(posterior.prior, flat, problem.defaults)),
         *map(str, identifiability.undetermined(posterior, chain.point)),
-        *map(str, alone.only.actuator.hysteresis.remarks(columns, alone.names)),
     ]
     result = replace(result, remarks=tuple(remarks))
     artist.draw(result)

@@ -121,19 +121,6 @@ class BoucWen(OneState):
             return inside
         return inside & (_anywhere(column) | (np.abs(column["initial"]) <= _top(column)))
 
-    def remarks(self, column: Values, free: tuple[str, ...]) -> list[str]:
-        """Say that a posterior presses against γ ≤ β, if it does."""
-        if not self.passive or "gamma" not in free:
-            return []
-        share = float(np.mean(column["gamma"] > 0.95 * column["beta"]))
-        if not share > 0.25:
-            return []
-        return [
-            f"the posterior presses against |gamma| <= beta ({share:.0%} of the draws have gamma "
-            f"within 5% of beta); if the actuator need not be passive, set "
-            "[model] passive = false"
-        ]
-
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1, or of any exponent."""
         d, alpha, beta, gamma = (column[name] for name in ("d", *SHAPE[:3]))

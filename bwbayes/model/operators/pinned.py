@@ -119,10 +119,6 @@ class Pinned(OneState):
         """Return U/k."""
         return half_range / column["pinning"]
 
-    def anhysteretic(self, column: Values, voltage: float) -> FloatArray:
-        """Return the displacement (models,) without hysteresis at a voltage, um."""
-        return self._fixed(column, voltage, np.zeros_like(column["d"]))
-
     def begin(
         self,
         column: Values,

@@ -183,7 +183,6 @@ def test_parameters_outside_their_domain_are_refused_by_name(name: str) -> None:
     """The last is the state before the record, and draws of the priors are inside."""
     operator, column = models(name, 20, 8)
     operator.check(column)
-    assert operator.remarks(column, ()) == []
     *others, last = operator.parameters
     assert (last.name, last.scope) == ("initial", "record")
     assert {declared.scope for declared in others} == {"actuator"}
@@ -237,11 +236,9 @@ def test_remarks_of_a_point_can_be_made_with_every_operator(name: str) -> None:
     mode = of.prior.unconstrain(draws[:1])[0]
     identity = np.eye(mode.size)
     point = PointFit(mode, identity, 0.0, mode[np.newaxis], identity)
-    column = of.table.columns(of.prior.theta(draws))
     findings = [
         *identifiability.undetermined(of, point),
         *conflicts(of.prior, draws, {}),
-        *of.only.actuator.hysteresis.remarks(column, of.names),
     ]
     assert all(str(finding) for finding in findings)
 
