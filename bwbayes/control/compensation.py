@@ -85,7 +85,7 @@ class _Plan:
                 unrest=states.unrest[rows],
                 offset_sd=states.offset_sd[rows],
             )
-            yield rows, subset.advance(voltage)[0]
+            yield rows, subset.displacement(voltage)
 
     def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
         """Return the expected rms error to the smoothed reference, um, and the weighted mean."""

@@ -10,9 +10,8 @@ model at all is tested.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -24,29 +23,16 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.actuator import Actuator, State
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.discrepancy_state import Carried, carried
-from bwbayes.prediction.histories import Histories, States, chosen, uniform
+from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 
-if TYPE_CHECKING:
-    from bwbayes.inference.compiled.walk import Walk
-
 __all__ = ["Start", "Started", "fitted", "going_on", "started"]
-
-# Slow departures of a lead-in that are looked for, as polynomials of the time up to this degree, if
-# there are so many readings; and draws for which they are.
-SLOW = 3
-MANY = 20
-TESTED = 100
-
-# The default lead-in: a part of the record, so many correlation times of the discrepancy at most,
-# or so many samples where it forgets at once.
-PART, MEMORIES, AT_LEAST = 0.25, 10.0, 100
 
 
 @dataclass(frozen=True)
@@ -112,8 +98,8 @@ class Start:
         begin = record.start if self.lead_in_from is None else self.lead_in_from
         first = round((begin - record.start) / record.interval)
         # White noise forgets at once: then a hundred readings tell the offset.
-        longest = max(MEMORIES * memory, AT_LEAST * record.interval)
-        length = self.lead_in or min(PART * (record.samples - first) * record.interval, longest)
+        longest = max(10 * memory, 100 * record.interval)
+        length = self.lead_in or min(0.25 * (record.samples - first) * record.interval, longest)
         last = first + round(length / record.interval)
         lead_in = f"a lead-in of {length:g} s from {record.clock(begin)} s on"
         if not (0 <= first < last < record.samples):
@@ -152,62 +138,49 @@ class Started:
     carried: Carried | None = None
     engine: Engine = "numpy"
 
+    def displacement(self, voltage: FloatArray) -> FloatArray:
+        """Displacement (draws, samples) along a voltage, um."""
+        return next(self.pieces(voltage, voltage.size))
+
     def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
         """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
-        walks = self._walks(voltage)
-        states: Sequence[State | None] = ()
+        groups = [np.flatnonzero(self.which == number) for number in range(len(self.actuators))]
+        walks = [
+            (rows, self._walk(actuator, rows, voltage))
+            for rows, actuator in zip(groups, self.actuators, strict=True)
+            if rows.size
+        ]
         for first in range(0, voltage.size, size):
-            piece = voltage[first : first + size]
-            if walks is None:
-                simulated, states = self.advance(piece, states)
-            elif len(walks) == 1:
-                simulated = walks[0][1].to(first + piece.size)
-            else:
-                simulated = np.empty((len(self.model), piece.size))
-                for rows, walk in walks:
-                    simulated[rows] = walk.to(first + piece.size)
+            last = min(first + size, voltage.size)
+            parts = [(rows, walk(last)) for rows, walk in walks]
+            if len(parts) == 1:
+                yield parts[0][1]
+                continue
+            simulated = np.empty((len(self.model), last - first))
+            for rows, displacement in parts:
+                simulated[rows] = displacement
             yield simulated
 
-    def _walks(self, voltage: FloatArray) -> list[tuple[IntArray, Walk]] | None:
-        """Put the draws of each history to the start on the compiled engine, if that can do it."""
-        if self.engine != "numba":
-            return None
-        # Here, because it is slow to load.
-        from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
+    def _walk(
+        self, actuator: Actuator, rows: IntArray, voltage: FloatArray
+    ) -> Callable[[int], FloatArray]:
+        """Put draws to the start; what is returned walks them on to a sample."""
+        model, unrest, state, now = self.model[rows], self.unrest[rows], None, 0
+        if self.engine == "numba":
+            # Here, because it is slow to load.
+            from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
 
-        walks = []
-        for number, actuator in enumerate(self.actuators):
-            rows = np.flatnonzero(self.which == number)
-            if not rows.size:
-                continue
-            walked = walk(
-                actuator, self.model[rows], voltage, self.unrest[rows], from_rest=self.from_rest
-            )
-            if walked is None:
-                return None
-            walks.append((rows, walked))
-        return walks
+            compiled = walk(actuator, model, voltage, unrest, from_rest=self.from_rest)
+            if compiled is not None:
+                return compiled.to
 
-    def advance(
-        self, voltage: FloatArray, states: Sequence[State | None] = ()
-    ) -> tuple[FloatArray, Sequence[State | None]]:
-        """Displacement (draws, samples) along the next piece, um, and all histories' states then.
+        def onwards(last: int) -> FloatArray:
+            nonlocal state, now
+            piece, now = voltage[now:last], last
+            moved, state = actuator.advance(model, piece, state, unrest, from_rest=self.from_rest)
+            return moved
 
-        Without states the record starts here.
-        """
-        result = np.empty((len(self.model), voltage.size))
-        after: list[State | None] = list(states) or [None] * len(self.actuators)
-        for number, actuator in enumerate(self.actuators):
-            rows = np.flatnonzero(self.which == number)
-            if rows.size:
-                result[rows], after[number] = actuator.advance(
-                    self.model[rows],
-                    voltage,
-                    after[number],
-                    self.unrest[rows],
-                    from_rest=self.from_rest,
-                )
-        return result, after
+        return onwards
 
 
 def started(
@@ -224,23 +197,40 @@ def started(
     InputError
         A lead-in that does not fit into the record.
     """
+    training = posterior.only
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
-    span = _voltages(posterior, record)
-    actuator = replace(posterior.only.actuator, interval=record.interval, hold=hold, span=span)
-    memory = posterior.only.noise.correlation_time(posterior.only.table.noise(theta))
+    low, high = training.span
+    span = Span(min(float(np.min(record.voltage)), low), max(float(np.max(record.voltage)), high))
+    actuator = replace(training.actuator, interval=record.interval, hold=hold, span=span)
+    memory = training.noise.correlation_time(training.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
-    whole = _likelihood(posterior, actuator, record, start, window)
+    own_offset = start.own_offset and window is not None
+    readings = Readings.of(np.zeros(1), [slice(0, 1)])
+    if window is not None:
+        assert record.displacement is not None
+        readings = Readings.of(record.displacement, [window])
+    whole = Likelihood(
+        record.voltage,
+        readings,
+        actuator,
+        training.noise,
+        posterior.engine,
+        start.from_rest,
+        (span.high - span.low) / 2,
+        # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
+        training.extent if own_offset else 0.0,
+    )
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
     if window is None:
         return _unseen(likelihoods, theta, generator, settled=start.settled)
-    if start.own_offset:
+    if own_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
-    histories, begun = chosen(likelihoods, theta, generator)
-    told = _informed(histories, begun, record, window, generator)
-    return going_on(told, likelihoods[0], theta, generator) if start.after else told
+    histories, begun = choose_histories(likelihoods, theta, generator)
+    informed = _informed(histories, begun, record, window, generator)
+    return going_on(informed, whole, theta, generator) if start.after else informed
 
 
 def going_on(
@@ -256,7 +246,7 @@ def going_on(
         model[:, column] += start.offset_sd * ndtri(uniform(generator, len(model)))
     begun = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
-    simulated = begun.advance(likelihood.voltage[: likelihood.readings.samples])[0][:, rows]
+    simulated = begun.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
     return replace(begun, carried=carried(likelihood, theta, simulated))
 
 
@@ -271,34 +261,6 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     return Started(actuators, which, model, unrest, none, from_rest, engine=posterior.engine)
 
 
-def _voltages(posterior: Posterior, record: Record) -> Span:
-    """Return the least and the largest voltage of this record and of those that were fitted, V."""
-    low, high = posterior.only.span
-    return Span(min(float(np.min(record.voltage)), low), max(float(np.max(record.voltage)), high))
-
-
-def _likelihood(
-    posterior: Posterior, actuator: Actuator, record: Record, start: Start, window: slice | None
-) -> Likelihood:
-    low, high = _voltages(posterior, record)
-    readings = Readings.of(np.zeros(1), [slice(0, 1)])
-    if window is not None:
-        assert record.displacement is not None
-        readings = Readings.of(record.displacement, [window])
-    own = start.own_offset and window is not None
-    return Likelihood(
-        record.voltage,
-        readings,
-        actuator,
-        posterior.only.noise,
-        posterior.engine,
-        start.from_rest,
-        (high - low) / 2,
-        # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
-        posterior.only.extent if own else 0.0,
-    )
-
-
 def _unseen(
     likelihoods: tuple[Likelihood, ...],
     theta: FloatArray,
@@ -308,28 +270,21 @@ def _unseen(
 ) -> Started:
     """Draw the start from what is known of it beforehand: all histories are equally probable."""
     draws, first = len(theta), likelihoods[0]
-    alone = len(likelihoods) == 1
     which = np.zeros(draws, dtype=np.int64)
-    if not alone:
+    if len(likelihoods) > 1:
         which = (len(likelihoods) * uniform(generator, draws)).astype(np.int64)
     histories = Histories(likelihoods, which)
     (sd,) = histories.each(theta, lambda likelihood, rows: (likelihood.start_sd(rows),))
     if settled:
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    below = uniform(generator, draws)
-    (begun,) = histories.each(
-        np.column_stack([theta, below]),
-        lambda likelihood, rows: (
-            States(likelihood, rows[:, :-1], alone=alone).drawn(rows[:, -1]),
-        ),
-    )
+    begun = histories.with_states(theta, uniform(generator, draws))
     model, none = first.table.actuator(begun), np.zeros(draws)
     actuators = tuple(likelihood.actuator for likelihood in likelihoods)
     start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
     if settled:
         offset = first.actuator.parameters.index("offset")
-        model[:, offset] -= start.advance(first.voltage[:1])[0][:, 0]
+        model[:, offset] -= start.displacement(first.voltage[:1])[:, 0]
     return start
 
 
@@ -364,8 +319,8 @@ def _informed(
     model = likelihood.table.actuator(begun)
     actuators = tuple(likelihood.actuator for likelihood in histories.likelihoods)
     from_rest, which = likelihood.from_rest, histories.which
-    known = which, model, unrest, sd, from_rest, lead_in, window.stop
-    return Started(actuators, *known, engine=likelihood.engine)
+    start = which, model, unrest, sd, from_rest, lead_in, window.stop
+    return Started(actuators, *start, engine=likelihood.engine)
 
 
 def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:
@@ -376,16 +331,16 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
     """
     readings = histories.likelihoods[0].readings.rows
     p = scipy.stats.chi2.sf(squares, readings.size)
-    if readings.size > MANY:
-        few = slice(None, None, -(-len(theta) // TESTED))
+    if readings.size > 20:
+        # As polynomials of the time up to the third degree, of a hundred draws.
+        few = slice(None, None, -(-len(theta) // 100))
         relative_time = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
-        shapes = np.polynomial.legendre.legvander(relative_time, SLOW).T[1:]
+        shapes = np.polynomial.legendre.legvander(relative_time, 3).T[1:]
         tested = replace(histories, which=histories.which[few])
         (taken,) = tested.each(
             theta[few], lambda likelihood, rows: (likelihood.score(rows, shapes).together,)
         )
-        slow = scipy.stats.chi2.sf(taken, SLOW)
-        p = np.minimum(2 * np.minimum(p[few], slow), 1.0)
+        p = np.minimum(2 * np.minimum(p[few], scipy.stats.chi2.sf(taken, 3)), 1.0)
     return float(np.mean(p))
 
 

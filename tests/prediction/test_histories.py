@@ -14,8 +14,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import Span
-from bwbayes.prediction import histories as histories_module
-from bwbayes.prediction.histories import Histories, States, chosen, edged
+from bwbayes.prediction.histories import Histories, _by_grids, choose_histories
 from bwbayes.prediction.initial_state import started
 from bwbayes.prediction.prediction import Start
 from bwbayes.record.record import Record
@@ -69,10 +68,9 @@ def test_every_draw_is_simulated_with_its_own_history() -> None:
     """In pieces as at once, and as one draw alone."""
     planned = replace(record_after(30.0), displacement=None)
     begun = started(POSTERIOR, DRAWS, planned, Start(), np.random.default_rng(3))
-    whole = begun.advance(planned.voltage)[0]
-    first, states = begun.advance(planned.voltage[:77])
-    second, _ = begun.advance(planned.voltage[77:], states)
-    np.testing.assert_allclose(np.hstack([first, second]), whole, atol=1e-9)
+    whole = begun.displacement(planned.voltage)
+    pieces = np.hstack([*begun.pieces(planned.voltage, 77)])
+    np.testing.assert_allclose(pieces, whole, atol=1e-9)
     for row in (0, 7, 39):
         one = begun.actuators[begun.which[row]].advance(
             begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]]
@@ -116,39 +114,20 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
         )
         for s in spans
     )
-    parts = edged(np.linspace(0, 1, 4001))
+    # The lowest and the highest state are a quarter each, and half lie evenly between.
+    states = np.clip(4 * np.linspace(0, 1, 4001) - 2, -1, 1)
     logs = []
     for one in every:
-        theta = np.repeat(draws[:1], parts.size, axis=0)
-        logs.append(one.log_density(one.table.replaced(theta, "initial", 2 * parts - 1)))
+        theta = np.repeat(draws[:1], states.size, axis=0)
+        logs.append(one.log_density(one.table.replaced(theta, "initial", states)))
     weight = np.mean(np.exp(np.array(logs) - np.max(logs)), axis=1)
     expected = weight / np.sum(weight)
-    histories, _ = chosen(every, draws, np.random.default_rng(5))
+    histories, _ = choose_histories(every, draws, np.random.default_rng(5))
     got = np.bincount(histories.which, minlength=3) / len(draws)
     error = np.sqrt(expected * (1 - expected) / len(draws)) + 1e-3
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
     assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
-
-
-def test_what_part_of_the_states_lies_below_is_a_distribution_even_of_a_single_state() -> None:
-    """Of several it rises from 0 to 1 and undoes what draws them; of one, all places are it."""
-    posterior = posterior_of_case(Case(hysteresis="backlash-like"))
-    actuator = replace(posterior.only.actuator, span=Span(-95.0, 95.0))
-    likelihood = replace(posterior.likelihood, from_rest=False, actuator=actuator)
-    theta = np.repeat(posterior.prior.theta(np.empty((1, 0))), 2, axis=0)
-    states = States(likelihood, theta, alone=True)
-    column = posterior.prior.names.index("initial")
-    low, high = states.ordered[0, 0], states.ordered[-1, 0]
-    for part in (0.0, 0.3, 0.99, 1.0):
-        h = states.drawn(np.full(2, part))[:, column]
-        place = (h - low) / (high - low)
-        np.testing.assert_allclose(states.below(place[np.newaxis])[0], part, atol=1e-12)
-    states.ordered[:, 0] = 2.0
-    places = np.linspace([0.0, 0.0], [1.0, 1.0], 9)
-    below = states.below(places)
-    np.testing.assert_array_equal(below[:, 0], places[:, 0])
-    assert (np.diff(below[:, 1]) > 0).all()
 
 
 def test_many_draws_choose_by_importance_what_they_would_choose_on_grids() -> None:
@@ -173,9 +152,9 @@ def test_many_draws_choose_by_importance_what_they_would_choose_on_grids() -> No
     table, generator = several[0].table, np.random.default_rng(6)
     offset = np.random.default_rng(5).standard_normal(400)
     theta = table.replaced(draws, "offset", offset)
-    which, place, _ = histories_module._by_grids(several, theta, generator)
-    by_grids = histories_module._begun(Histories(several, which), theta, place)
-    histories, by_importance = chosen(several, theta, generator)
+    which, place, _ = _by_grids(several, theta, generator)
+    by_grids = Histories(several, which).with_states(theta, place)
+    histories, by_importance = choose_histories(several, theta, generator)
 
     def apart(first: FloatArray, second: FloatArray) -> float:
         """Distance of the means of what two sets of draws say, in standard errors."""
