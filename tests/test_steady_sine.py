@@ -15,11 +15,11 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.arrays import FloatArray
 from bwbayes.model.actuator import Actuator
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
+from tests.prediction.process import process
 from tests.sampled import sampled
 
 RATE = 250.0
@@ -43,23 +43,14 @@ PHYSICAL = ("d", "alpha", "beta", "gamma", "initial", "lag", "offset", "sensor_s
 RECORDS = 40
 
 
-def discrepancy(samples: int, source: np.random.Generator) -> FloatArray:
-    """Draw an Ornstein-Uhlenbeck process (samples,), um."""
-    kept = np.exp(-1 / RATE / TRUTH["discrepancy_time"])
-    state = source.standard_normal(samples)
-    state[1:] *= np.sqrt(1 - kept**2)
-    for sample_ in range(1, samples):
-        state[sample_] += kept * state[sample_ - 1]
-    return TRUTH["discrepancy_sd"] * state
-
-
 def steady_sine(seed: int, folder: Path, periods: int = 3) -> Problem:
     """Simulate a record and put the default config's problem together."""
     source = np.random.default_rng([7, seed])
     voltage = 150 * np.sin(2 * np.pi * np.arange(periods * RATE) / RATE)
     actuator = Actuator("lag", "first", 1 / RATE)
     theta = np.array([[TRUTH[name] for name in actuator.parameters]])
-    displacement = actuator.displacement(theta, voltage)[0] + discrepancy(voltage.size, source)
+    slow = process(voltage.size, 1 / RATE / TRUTH["discrepancy_time"], source)
+    displacement = actuator.displacement(theta, voltage)[0] + TRUTH["discrepancy_sd"] * slow
     displacement += TRUTH["sensor_sd"] * source.standard_normal(voltage.size)
     path = folder / f"sine_{seed}.csv"
     write_record(Record(voltage, displacement, 1 / RATE), path)

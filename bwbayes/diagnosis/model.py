@@ -72,7 +72,9 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         posterior = scene.rebuilt(changes)
         if posterior is None or type(posterior.only.actuator.hysteresis) is present:
             continue
-        fit = scene.climbed(posterior, pointfit.fit(posterior, scene.generator).optima)
+        fit = scene.extended(
+            posterior=posterior, places=pointfit.fit(posterior, scene.generator).optima
+        )
         text = f"another operator, {name}"
         yield scene.explained(f"operator {name}", text, _lines(changes), fit, changes=changes)
 
@@ -99,7 +101,7 @@ def _changed(
     for coordinates, start in product(scene.places, starts):
         values = {**dict(zip(scene.posterior.names, coordinates, strict=True)), **start}
         places.append([values.get(name, 0.0) for name in posterior.names])
-    fit = scene.climbed(posterior, np.array(places))
+    fit = scene.extended(posterior=posterior, places=np.array(places))
     fix = _lines(changes)
     if parameters:
         fix += f", with what is known of {', '.join(parameters)} in [parameters]"

@@ -11,7 +11,8 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.laplace import Effect, LocalFit, climb
+from bwbayes.diagnosis.innovations import innovations
+from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
@@ -185,21 +186,12 @@ class Scene:
     @property
     def innovations(self) -> FloatArray:
         """Innovations of the fit (readings,), in sds."""
-        record, readings = self.posterior.only, self.posterior.only.readings
-        residual = readings.values - self.posterior.simulate(self.fit.theta, readings.rows)[0]
-        noise = record.table.noise(self.fit.theta)
-        series = residual[np.newaxis, np.newaxis]
-        white: FloatArray = self.posterior.likelihood.whiten(noise, series)[0][0, 0]
-        return white
+        return innovations(self.posterior, self.fit.free).white
 
     def clock(self, time: float) -> str:
         """Write a time since the first reading as one of the record, s."""
         first = self.begin + self.interval * float(self.posterior.only.readings.rows[0])
         return clock(first + time, self.interval)
-
-    def extended(self, effect: Effect) -> LocalFit:
-        """Fit the model with an effect."""
-        return self.climbed(self.posterior, self.places, effect)
 
     def rebuilt(
         self,
@@ -212,13 +204,18 @@ class Scene:
         posterior = self.reconfigure(changes, parameters)
         return posterior.altered(displacement=self.posterior.only.displacement)
 
-    def climbed(
-        self, posterior: Posterior, places: FloatArray, effect: Effect | None = None
+    def extended(
+        self,
+        effect: Effect = NONE,
+        posterior: Posterior | None = None,
+        places: FloatArray | None = None,
     ) -> LocalFit:
-        """Fit another model, as long as it may become more probable than that without extension.
+        """Fit the model with an effect, or another model from places of its own.
 
-        A gain of less than a nat pays for no parameter.
+        As long as it may become more probable than the fit by a nat: less pays for no parameter.
         """
+        posterior = self.posterior if posterior is None else posterior
+        places = self.places if places is None else places
         return climb(posterior, places, effect, self.fit.log_density + 1.0)
 
     def explained(
@@ -241,11 +238,11 @@ class Scene:
             nats=fit.log_evidence - self.fit.log_evidence - cost,
             rmse=(self.fit.rmse, fit.rmse),
             held_out=(self.fit.error(self.held_out), fit.error(self.held_out)),
-            shift=self.shift(fit) if fit.posterior is self.posterior else 0.0,
+            shift=self._shift(fit) if fit.posterior is self.posterior else 0.0,
             **facts,
         )
 
-    def shift(self, fit: LocalFit) -> float:
+    def _shift(self, fit: LocalFit) -> float:
         """Return the largest shift of the actuator's parameters, in sds of both fits together."""
         table = self.posterior.only.table
         mine = [

@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record
+from tests.prediction.process import process
 
 __all__ = ["CAUSES", "Plant", "plant"]
 
@@ -212,12 +213,8 @@ def added(
 
 def noise(kind: str, part: Plant, voltage: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return discrepancy and noise along a voltage (samples,), um."""
-    kept = np.exp(-1 / RATE / part.memory)
-    shocks = (
-        np.r_[1.0, np.full(voltage.size - 1, np.sqrt(1 - kept**2))]
-        * rng.normal(size=voltage.size + 1)[:-1]
-    )
-    slow = lfilter([1.0], [1.0, -kept], shocks)
+    slow = process(voltage.size, 1 / RATE / part.memory, rng)
+    rng.normal()  # as the plants were drawn whose causes are on record
     white = rng.normal(size=voltage.size)
     speed = np.abs(np.gradient(voltage))
     match kind:

@@ -6,8 +6,6 @@ approximation around the point fit. Power: each kind of planted mistake is said,
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -129,7 +127,7 @@ def piled_up(bound: float, width: float) -> FloatArray:
     return draws
 
 
-def test_gamma_on_beta_is_said_with_the_switch() -> None:
+def test_a_bound_that_others_set_is_said_with_its_switch() -> None:
     prior = joint_prior(NAMES, RANGES, {})
     beta = np.random.default_rng(3).normal(0.02, 1e-3, 2000)
     (remark,) = said(prior, beta=beta, gamma=beta - piled_up(0, 2e-4))
@@ -137,6 +135,9 @@ def test_gamma_on_beta_is_said_with_the_switch() -> None:
     assert "passive = false" in remark
     (remark,) = said(prior, beta=beta, gamma=-beta + piled_up(0, 2e-4))
     assert remark.startswith("gamma: lies on its lower bound of |gamma| <= beta")
+    d = np.full(2000, 0.7)
+    (remark,) = said(prior, d=d, alpha=d - piled_up(0, 1e-3))
+    assert remark.startswith("alpha: lies on its upper bound of 0 < alpha < d")
 
 
 def test_gamma_anywhere_between_its_bounds_is_not_said() -> None:
@@ -145,13 +146,6 @@ def test_gamma_anywhere_between_its_bounds_is_not_said() -> None:
     share = np.random.default_rng(3).uniform(-1, 1, 2000)
     assert [] == said(prior, beta=np.full(2000, 0.02), gamma=0.02 * share)
     assert [] == said(prior, gamma=np.random.default_rng(4).normal(0.03, 0.003, 2000))
-
-
-def test_alpha_on_d_is_said() -> None:
-    prior = joint_prior(NAMES, RANGES, {})
-    d = np.full(2000, 0.7)
-    (remark,) = said(prior, d=d, alpha=d - piled_up(0, 1e-3))
-    assert remark.startswith("alpha: lies on its upper bound of 0 < alpha < d")
 
 
 def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:
@@ -199,16 +193,6 @@ def test_forty_good_records_raise_no_remark() -> None:
         ranges = ranges_of(posterior.only.voltage, posterior.only.displacement, INTERVAL)
         alarms += judged(posterior, ranges)
     assert [] == alarms
-
-
-def test_displacement_in_another_unit_contradicts_an_informed_prior() -> None:
-    """A record in nm that is taken for um, and a user who knows the actuator's d."""
-    good = short_posterior("white", 200, priors={"d": normal(0.7, 0.07)})
-    wrong = good.altered(displacement=4 * good.only.displacement)
-    ranges = ranges_of(wrong.only.voltage, wrong.only.displacement, INTERVAL)
-    known = joint_prior(good.prior.names, ranges, {"initial": 0.0}, {"d": normal(0.7, 0.07)})
-    remarks = judged(replace(wrong, prior=known), ranges)
-    assert any(remark.startswith("d: ") for remark in remarks), remarks
 
 
 def test_effective_quantiles_are_those_of_the_cut_prior() -> None:

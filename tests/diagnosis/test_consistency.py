@@ -65,19 +65,6 @@ def test_a_record_with_another_noise_is_named_and_no_other() -> None:
     )
 
 
-def test_one_record_alone_has_nothing_to_agree_with() -> None:
-    posterior = joint(pair(1).datasets[0])
-    assert {} == compared(posterior)
-
-
-@pytest.mark.parametrize("seed", [61, 91])
-def test_a_record_whose_posterior_is_bent_agrees(seed: int) -> None:
-    """Of two hundred sound records these have the largest distances between means, 25 and 40."""
-    every = compared(pair(seed))
-    assert [] == [*disagreements(every)]
-    assert all(one.p_value > 1e-3 for one in every.values())
-
-
 def test_what_a_record_costs_is_the_quadratic_form_where_all_is_normal() -> None:
     """A linear model: D = δᵀ A δ, with the precision that the record adds to its prior's."""
     posterior = linear_posterior(("d", "offset"), "white")

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import effects, model, noise
 from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
-from bwbayes.diagnosis.laplace import climb
+from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import write_record
@@ -60,7 +60,7 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
     covariance = 0.25 * np.exp(-lag / 0.2) + 0.09 * np.eye(readings.size)
     covariance += 0.09 * np.outer(problem.record.voltage, problem.record.voltage) + 25.0
     center = posterior.simulate(posterior.prior.theta(np.array([[0.7, 0.0]])))[0]
-    for effect, added in ((None, 0.0), (trend, 16 * np.outer(along, along))):
+    for effect, added in ((NONE, 0.0), (trend, 16 * np.outer(along, along))):
         exact = multivariate_normal.logpdf(readings, center, covariance + added)
         fitted = climb(posterior, np.zeros((1, 2)), effect)
         np.testing.assert_allclose(fitted.log_evidence, exact, rtol=1e-6)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.identifiability import percent, spectrum, undetermined
+from bwbayes.diagnosis.identifiability import spectrum, undetermined
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
@@ -29,11 +29,6 @@ from tests.inference.problems import (
 FIXED = {"mass": 0.00134, "stiffness": 4.1e5, "initial": 0.0}
 
 Discrepancy = Literal["none", "process", "structural"]
-
-
-def combinations(posterior: Posterior, point: PointFit) -> list[str]:
-    """Name the combinations that a record does not determine."""
-    return [finding.text.split(":")[0] for finding in undetermined(posterior, point)]
 
 
 def measured(
@@ -85,12 +80,7 @@ def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
 @pytest.mark.parametrize("discrepancy", ["none", "structural"])
 def test_decaying_amplitudes_leave_nothing_open(discrepancy: Discrepancy) -> None:
     posterior = measured(signal("identification"), discrepancy)
-    assert [] == combinations(posterior, at_truth(posterior))
-
-
-def test_no_more_than_all_of_a_prior_is_left() -> None:
-    """A posterior that is wider than its prior has all of it, and not 101 %."""
-    assert ["34%", "99%", "all", "all"] == [percent(part) for part in (0.34, 0.99, 0.996, 1.25)]
+    assert [] == [*undetermined(posterior, at_truth(posterior))]
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.03])
@@ -150,17 +140,3 @@ def test_a_constant_voltage_tells_nothing_about_the_loop() -> None:
     posterior = at_rest(short_posterior(samples=200))
     assert ("d", "alpha", "beta", "gamma") == posterior.names[:4]
     np.testing.assert_allclose(1, left(posterior), atol=1e-6)
-
-
-def test_a_known_loop_has_nothing_open() -> None:
-    """Whatever else is free."""
-    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0}
-    posterior = short_posterior(samples=60, fixed=known)
-    assert "offset" in posterior.names
-    assert [] == combinations(posterior, at_truth(posterior))
-
-
-def test_a_loop_with_one_free_parameter_is_named_after_it() -> None:
-    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "initial": 0.0}
-    usual = short_posterior(samples=60, fixed=known)
-    assert ["gamma"] == combinations(at_rest(usual), at_truth(usual))

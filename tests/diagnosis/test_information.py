@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -77,9 +75,3 @@ def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(posterior: Pos
     assert offset.prior_decides
     assert str(made.findings[0]).startswith("offset: the prior decides")
     assert not made.parameters["d"].prior_decides
-
-
-def test_the_numbers_are_json(posterior: Posterior) -> None:
-    said = json.loads(json.dumps(of(posterior, exact(posterior)).numbers, allow_nan=False))
-    assert set(said["parameters"]) == set(posterior.names)
-    assert len(said["findings"])

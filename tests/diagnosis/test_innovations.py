@@ -9,7 +9,6 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.innovations import Innovations, departures, innovations
-from bwbayes.inference.noise import DiscrepancyNoise
 from tests.inference import problems
 
 
@@ -81,22 +80,3 @@ def test_the_density_of_white_noise_is_flat(share: float) -> None:
     frequency, density = series.residual_density()
     assert np.sqrt(np.mean(density**2)) == pytest.approx(0.5 * np.sqrt(0.004), rel=0.06)
     assert frequency[-1] == pytest.approx(250.0, abs=0.1)
-
-
-@pytest.mark.parametrize("theta", [(0.5, 1.4, 0.3), (0.02, 3.0, 40.0), (0.7, 1e-9, 0.01)])
-def test_density_of_the_noise_model_is_that_of_its_covariance(
-    theta: tuple[float, float, float],
-) -> None:
-    """Against the sum over all lags: 2 Δ Σ cov(k Δ) cos(2π f k Δ)."""
-    (sensor, sd, time), interval, lags = theta, 0.01, np.arange(1, 400_000)
-    covariance = sd**2 * np.exp(-interval * lags / time)
-    frequency = np.array([0.3, 2.0, 17.0, 50.0])
-    angles = 2 * np.pi * interval * frequency
-    sums = [sensor**2 + sd**2 + 2 * np.sum(covariance * np.cos(a * lags)) for a in angles]
-    empty = np.empty(0)
-    series = Innovations(
-        empty, empty, empty, empty, empty, interval, DiscrepancyNoise(interval), np.array(theta)
-    )
-    density = series.noise_density(frequency)
-    assert density is not None
-    np.testing.assert_allclose(density, np.sqrt(2 * interval * np.array(sums)), rtol=1e-6)

@@ -6,8 +6,6 @@ less here, since the posterior has seen the record.
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -72,9 +70,3 @@ def test_readings_that_are_missing_are_missing_in_all() -> None:
     made = looked_at(posterior.altered(displacement=displacement))
     assert all(np.isfinite(one.observed) for one in made.statistics.values())
     assert not made.statistics["residual_sd_um"].odd
-
-
-def test_the_numbers_are_json() -> None:
-    said = json.loads(json.dumps(looked_at(short_posterior(samples=SAMPLES)).numbers))
-    assert said["records"] == 200
-    assert set(said["statistics"]["range_um"]) == {"observed", "lower_95", "upper_95", "p", "odd"}

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.frozen import clipped
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.diagnosis.series_patterns import spikes
 from bwbayes.record import Record, read_record
@@ -42,17 +41,6 @@ def test_a_displacement_cut_off_at_its_limit_is_clipping(
     assert abs(limited[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
     assert abs(limited[[first - 1, last + 1]]).max() < 0.8
     assert "use a wider range" == finding.fix
-
-
-@pytest.mark.parametrize("part", [0.015, 0.05, 0.15])
-def test_every_reading_of_a_noisy_tip_that_is_cut_off_counts(part: float) -> None:
-    """The noise breaks the flat top into pieces, most of them shorter than five readings."""
-    noisy = SINE + 0.05 * np.random.default_rng(1).standard_normal(SINE.size)
-    limited = np.minimum(noisy, np.quantile(noisy, 1 - part))
-    some = clipped(limited, SINE)
-    assert some is not None
-    assert np.count_nonzero(limited == limited.max()) == some.samples
-    assert clipped(noisy, SINE) is None
 
 
 TRAPEZOID = np.clip(SINE, -0.7, 0.7)
@@ -131,6 +119,7 @@ def test_a_fix_removes_its_finding() -> None:
     assert () == inspect(transient.upto(end, first_reading=finding.stop))
 
 
+@settings(max_examples=25, deadline=None)
 @given(
     start=st.sampled_from([0.0, -86_400.0, 0.125, 9e5]) | st.floats(-1e6, 1e6),
     rate=st.sampled_from([1.0, 173.0, 1e5]) | st.floats(1.0, 1e5),
@@ -173,14 +162,6 @@ def test_a_planned_voltage_is_looked_at_too() -> None:
     assert ["wrong units", "one amplitude"] == kinds
 
 
-def test_a_finding_is_one_line() -> None:
-    for kind in SPOILT:
-        for finding in inspect(SPOILT[kind](looping(0), np.random.default_rng(0))):
-            assert str(finding).isprintable()
-            assert len(str(finding)) < 300
-            assert finding.start < finding.stop
-
-
 def test_spikes_are_neither_edges_nor_turns() -> None:
     noise = 0.01 * np.random.default_rng(1).standard_normal(400)
     triangle = np.abs(np.arange(400) % 80 - 40) / 10
@@ -191,7 +172,7 @@ def test_spikes_are_neither_edges_nor_turns() -> None:
     assert [200] == spikes(triangle + noise + 2.0 * (np.arange(400) == 200), triangle).tolist()
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("pairs", [False, True])
 def test_every_spike_counts_once_and_its_neighbors_do_not(seed: int, pairs: bool) -> None:
     """On a steep drive with little noise too, where a spike moves the medians beside it."""

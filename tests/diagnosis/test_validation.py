@@ -110,11 +110,12 @@ SPOILT: dict[str, Spoil] = {
 }
 
 
+@pytest.mark.parametrize("records", [15, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", SPOILT)
-def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
-    """None of 50 is missed, and the cause is right or tied in at least 45."""
+def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) -> None:
+    """None is missed, and the cause is right or tied in at least nine of ten."""
     causes = []
-    for number in range(50):
+    for number in range(records):
         generator = np.random.default_rng([7, number])
         memory = float(np.exp(generator.uniform(np.log(0.05), np.log(0.5))))
         discrepancy = one_of(generator, 0.3, 1.0, 1.5)
@@ -134,7 +135,7 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str) -> None:
         assert verdict.cause is not None
         assert verdict.cause.fix in verdict.line
         causes.append(kind in verdict.cause.kind.split(" or "))
-    assert sum(causes) >= 45
+    assert sum(causes) >= 0.9 * records
 
 
 def test_readings_that_go_the_other_way_do_not_hold_even_if_a_strange_fit_follows() -> None:

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
@@ -26,6 +25,7 @@ from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from bwbayes.record.true_values import true_values
 from tests.inference.problems import posterior_of
+from tests.prediction.process import process
 
 __all__ = [
     "Case",
@@ -109,10 +109,8 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
         column = dict(zip(actuator.parameters, theta.T, strict=True))
         free = actuator.sections(column).free_responses(displacement.size)[0]
         displacement = displacement + KNOCK * free[0]
-    kept = np.exp(-1 / RATE / TRUE["discrepancy_time"])
-    shocks = generator.standard_normal(displacement.size)
-    shocks[1:] *= np.sqrt(1 - kept**2)
-    truth = displacement + case.discrepancy * lfilter([1.0], [1.0, -kept], shocks)
+    step = 1 / RATE / TRUE["discrepancy_time"]
+    truth = displacement + case.discrepancy * process(displacement.size, step, generator)
     truth = truth + generator.normal(0, 30)
     reading = truth + TRUE["sensor_sd"] * generator.standard_normal(truth.size)
     return Record(voltage[cut:], reading, 1 / RATE, truth=truth, origin="cut")

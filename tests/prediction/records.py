@@ -1,6 +1,6 @@
 """Bands whose error is known, and records that spoil them: to test verdicts without sampling.
 
-A record is a loop of the model; its bands have an error of the parameters (an offset and a gain,
+A record is a loop; its bands have an error of the parameters (an offset and a gain,
 drawn once a record), an Ornstein-Uhlenbeck discrepancy and white sensor noise, of just the sizes
 that the bands say.
 """
@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from tests.prediction.process import process
 
-__all__ = ["Made", "bands_of", "made", "process"]
+__all__ = ["Made", "bands_of", "made"]
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,6 @@ class Made:
     sensor: float
 
 
-def process(
-    generator: np.random.Generator, samples: int, interval: float, memory: float
-) -> FloatArray:
-    """Return a stationary process (samples,) of unit variance that forgets by exp(-t/memory)."""
-    kept = np.exp(-interval / memory)
-    shocks = generator.normal(size=samples) * np.sqrt(1 - kept**2)
-    shocks[0] /= np.sqrt(1 - kept**2)
-    values: FloatArray = lfilter([1.0], [1.0, -kept], shocks)
-    return values
-
-
 def made(
     generator: np.random.Generator,
     length: float = 20.0,
@@ -57,11 +45,11 @@ def made(
     time = interval * np.arange(round(length / interval), dtype=np.float64)
     frequency = generator.uniform(0.3, 2.0)
     voltage = 100 * np.sin(2 * np.pi * frequency * time) * np.exp(-0.03 * time)
-    mean = 0.7 * voltage - hysteresis(voltage, alpha=0.3575, beta=0.0272, gamma=0.0172)[0]
+    mean = 0.55 * voltage - 6 * np.cos(2 * np.pi * frequency * time) * np.exp(-0.03 * time)
     about = (mean - mean.mean()) / np.std(mean)
     shifts = generator.normal(size=2) * parameters / np.sqrt(2)
     error = shifts[0] + shifts[1] * about
-    error = error + discrepancy * process(generator, time.size, interval, memory)
+    error = error + discrepancy * process(time.size, interval / memory, generator)
     error = error + sensor * generator.normal(size=time.size)
     own = parameters * np.sqrt((1 + about**2) / 2)
     slow = np.sqrt(own**2 + discrepancy**2)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
-from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, generator, resolve
@@ -36,6 +35,7 @@ from bwbayes.report.result import Result
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
+from tests.prediction.process import process
 
 __all__ = [
     "CONVERGED",
@@ -43,7 +43,6 @@ __all__ = [
     "Stand",
     "covered",
     "judge",
-    "noise",
     "posterior_draws",
     "problem_of",
     "run",
@@ -59,14 +58,6 @@ PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250
 
 # No draw of the pilot weighs more than so many times the mean.
 HEAVIEST = 10.0
-
-
-def noise(samples: int, kept: float, generator: np.random.Generator) -> FloatArray:
-    """Draw a process of unit variance that keeps the part ``kept`` of itself each sample."""
-    shocks = generator.standard_normal(samples)
-    shocks[1:] *= np.sqrt(1 - kept**2)
-    drawn: FloatArray = lfilter([1.0], [1.0, -kept], shocks)
-    return drawn
 
 
 @dataclass(frozen=True)
@@ -94,8 +85,8 @@ class Stand:
         known |= {"exponent": 1.0, "initial": 0.0, "lag": self.lag, "offset": offset}
         theta = np.array([[known[name] for name in actuator.parameters]])
         displacement = actuator.displacement(theta, voltage)[0]
-        kept = float(np.exp(-1 / self.rate / self.memory))
-        displacement += self.discrepancy * noise(voltage.size, kept, generator)
+        step = 1 / self.rate / self.memory
+        displacement += self.discrepancy * process(voltage.size, step, generator)
         displacement += self.sensor * generator.standard_normal(voltage.size)
         return Record(voltage[cut:], displacement[cut:], 1 / self.rate, origin="stand")
 

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.discrepancy_state import Carried, carried
+from bwbayes.prediction.discrepancy_state import carried
 from bwbayes.prediction.prediction import Start, forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, TRUE_NOISE, decaying_sine, short_posterior, truth
@@ -75,44 +74,6 @@ def free_truth(posterior: Posterior) -> FloatArray:
     """Return the true free parameters, (1, free)."""
     theta = truth(posterior)
     return theta[:, [posterior.prior.names.index(name) for name in posterior.names]]
-
-
-def inside(records: int) -> FloatArray:
-    """Tell which readings after the record lie in the forecast's 95 % band, (records, samples)."""
-    hits = []
-    for seed in range(records):
-        posterior, record, (voltage, reading) = whole(seed)
-        generator = np.random.default_rng(1)
-        bands = forecast(posterior, free_truth(posterior), record, voltage, generator)
-        low, high = (edges["sensor", 95] for edges in (bands.lower, bands.upper))
-        hits.append((low <= reading) & (reading <= high))
-    return np.array(hits)
-
-
-# Samples after the record at which coverage is looked at: at once, in between, and late.
-AT = (0, 2, 10, 30, LATER - 1)
-RECORDS = 100
-
-
-def off(hits: FloatArray) -> float:
-    """Return the smallest two-sided binomial p-value over the samples looked at."""
-    counts = hits[:, AT].sum(axis=0)
-    return min(stats.binomtest(int(n), len(hits), 0.95).pvalue for n in counts)
-
-
-@pytest.mark.slow
-def test_forecasts_cover_what_they_promise_at_every_distance() -> None:
-    """Of 100 records; fails by chance once in 2,000. It sees a coverage of 80 % in 9 of 10."""
-    assert off(inside(RECORDS)) > 1e-4
-
-
-@pytest.mark.slow
-def test_a_forecast_that_takes_the_discrepancy_for_known_fails(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The twin: where nothing of its variance is left the bands are too narrow soon."""
-    monkeypatch.setattr(Carried, "less", lambda self, *_: self.gained[:, np.newaxis])
-    assert off(inside(RECORDS)) < 1e-4
 
 
 def test_a_forecast_is_narrower_at_first_and_as_wide_as_ever_later() -> None:

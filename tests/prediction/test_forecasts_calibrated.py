@@ -18,22 +18,17 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.prediction import forecast
 from bwbayes.record.record import Record
-from bwbayes.sampling.diagnostics import smoothed_weights
-from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior
 from tests.measured import keep
+from tests.prediction.runs import posterior_draws
 
 # Samples of a record, of what follows, and those after it that are looked at.
 LEAD, LATER = 80, 120
 AT = (0, 2, 10, 30, LATER - 1)
-
-# Places that a posterior is weighted at, and draws that are kept of it.
-PLACES, KEPT = 3000, 400
 
 PRIORS = {
     "d": Distribution("normal", {"mean": 0.7, "sd": 0.05}),
@@ -67,21 +62,8 @@ def replicate(seed: int) -> Replicate:
     reading = clean + sum(one.noise.draw(one.table.noise(theta), voltage.size, source))
     record = Record(voltage[:LEAD], reading[:LEAD], INTERVAL)
     posterior = usual.altered(voltage=voltage[:LEAD], displacement=reading[:LEAD])
-    draws = drawn(posterior, source)
+    _, draws = posterior_draws(posterior, source)
     return Replicate(posterior, draws, record, voltage[LEAD:], reading[LEAD:])
-
-
-def drawn(posterior: Posterior, source: np.random.Generator) -> FloatArray:
-    """Return draws (KEPT, free): places of a Student-t about the point fit, by their weights."""
-    point = pointfit.fit(posterior, source)
-    proposal = StudentMixture(
-        np.ones(1), point.mode[np.newaxis], np.linalg.cholesky(point.covariance)[np.newaxis]
-    )
-    places = proposal.draw(np.random.RandomState(source.bit_generator), PLACES)
-    weights, shape = smoothed_weights(posterior.log_density(places) - proposal.log_density(places))
-    assert shape < 0.7
-    chosen = source.choice(PLACES, KEPT, p=weights)
-    return posterior.prior.constrain(places[chosen])[0]
 
 
 def ranks(replicates: Iterable[Replicate]) -> IntArray:

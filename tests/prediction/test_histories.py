@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import Span
 from bwbayes.prediction.histories import Histories, _by_grids, choose_histories
 from bwbayes.prediction.initial_state import started
@@ -34,13 +33,6 @@ def record_after(reach: float) -> Record:
     displacement = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
     return Record(95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, 1 / RATE)
-
-
-def likelihoods(spans: list[Span]) -> tuple[Likelihood, ...]:
-    return tuple(
-        replace(POSTERIOR.likelihood, actuator=replace(POSTERIOR.only.actuator, span=span))
-        for span in spans
-    )
 
 
 @pytest.mark.parametrize("reach", [30.0, 60.0])
@@ -76,21 +68,6 @@ def test_every_draw_is_simulated_with_its_own_history() -> None:
             begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]]
         )[0][0]
         np.testing.assert_allclose(whole[row], one, atol=1e-9)
-
-
-def test_answers_come_back_in_the_order_of_the_draws() -> None:
-    which = np.random.default_rng(4).integers(0, 3, 40)
-    spans = [Span(-volts, volts) for volts in (10.0, 20.0, 30.0)]
-    histories = Histories(likelihoods(spans), which)
-
-    def ask(one: Likelihood, some: FloatArray) -> tuple[FloatArray, ...]:
-        assert one.actuator.span is not None
-        return some[:, 0], np.full((len(some), 2), one.actuator.span.high)
-
-    theta = DRAWS + np.arange(40.0)[:, np.newaxis]
-    first, second = histories.each(theta, ask)
-    np.testing.assert_array_equal(theta[:, 0], first)
-    np.testing.assert_array_equal(np.stack([10.0 * (1 + which)] * 2, axis=1), second)
 
 
 def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:

@@ -16,7 +16,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
+from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.prediction.loops import (
     MEASURES,
@@ -187,29 +187,6 @@ def problem(name: str, draws: int = 40) -> tuple[Any, FloatArray]:
     return of, free[np.argsort(away)[:draws]]
 
 
-@settings(deadline=None, max_examples=40)
-@given(st.floats(5, 120), st.floats(0.2, 1.0), st.floats(0.0, 0.8), st.floats(2, 80))
-def test_masings_rules(half: float, d: float, alpha: float, threshold: float) -> None:
-    """Plays: each branch of each loop is the initial curve, twice as large."""
-    actuator = still(PrandtlIshlinskii())
-    column = columns(actuator, d=d, alpha=alpha, threshold=threshold)
-    loop = steady_loop(actuator, column, -half, half, 201)
-    _, curve = initial_curve(actuator, column, -half, half, 401)
-    first = curve[0, 200:]  # half as far apart, from zero volts on
-    rising, falling = loop.rising[0], loop.falling[0]
-    tolerance = 1e-10 * half
-    np.testing.assert_allclose(rising - rising[0], 2 * first, rtol=0, atol=tolerance)
-    np.testing.assert_allclose(falling[-1] - falling[::-1], 2 * first, rtol=0, atol=tolerance)
-
-
-def test_bouc_wen_does_not_follow_masings_rules() -> None:
-    actuator = still()
-    column = columns(actuator, d=0.7, alpha=0.36, beta=0.027, gamma=0.017, exponent=1.0)
-    rising = steady_loop(actuator, column, -100.0, 100.0, 201).rising[0]
-    _, curve = initial_curve(actuator, column, -100.0, 100.0, 401)
-    assert np.max(np.abs(rising - rising[0] - 2 * curve[0, 200:])) > 1.0
-
-
 @settings(deadline=None, max_examples=30)
 @given(st.floats(-20, 20), st.floats(-10, 10))
 def test_a_gain_without_memory_changes_neither_area_nor_opening(q2: float, q3: float) -> None:
@@ -260,15 +237,6 @@ def test_initial_curve_starts_at_zero_volts_and_ends_where_the_voltage_does() ->
     _, both = initial_curve(actuator, column, -80.0, 80.0, 161)
     np.testing.assert_allclose(both[0], -both[0, ::-1], atol=1e-12)
     np.testing.assert_allclose(both[0, 80:], curve[0], atol=1e-12)
-
-
-def test_state_before_the_record_and_offset_do_not_count() -> None:
-    of, draws = problem("bouc-wen")
-    theta = of.prior.theta(draws)
-    column = of.table.columns(theta)
-    moved = {**column, "initial": column["initial"] + 3.0, "offset": column["offset"] + 5.0}
-    one, other = (steady_loop(of.only.actuator, c, -50.0, 50.0) for c in (column, moved))
-    np.testing.assert_array_equal(one.rising, other.rising)
 
 
 def test_summary_holds_mean_sd_and_interval_of_the_draws() -> None:

@@ -7,8 +7,6 @@ interval and at others.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -125,19 +123,6 @@ def test_a_lead_in_tells_the_offset_as_the_dense_matrix_does(
     whole = float(np.sqrt(sd**2 + DISCREPANCY**2 + SENSOR**2))
     np.testing.assert_allclose(whole, sds(bands, "sensor"), rtol=5e-3)
     assert_scores_are_of(bands, mean, whole)
-
-
-def test_twin_the_training_intervals_noise_would_be_seen(posterior: Posterior) -> None:
-    """Four times as many samples a second, taken for as many: the offset's sd is a third less."""
-    record = another(posterior, INTERVAL / 4)
-    _, sd = offset_of_lead_in(posterior, record)
-    assert record.displacement is not None
-    stretched = replace(record, interval=INTERVAL)
-    samples = round(LEAD_IN / record.interval)
-    lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples))) * stretched.interval
-    covariance = DISCREPANCY**2 * np.exp(-lags / TIME) + SENSOR**2 * np.eye(samples)
-    wrong = np.linalg.solve(covariance, np.ones(samples)).sum() ** -0.5
-    assert wrong < 0.8 * sd
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -20,8 +20,9 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.prediction import prediction
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import Started, started
-from bwbayes.prediction.prediction import Start, predict_record, predict_windows, thinned
+from bwbayes.prediction.prediction import Start, predict_record, predict_windows
 from bwbayes.record.record import Record
+from tests.prediction.process import process
 from tests.prediction.running import left_by_running_drives
 
 TRUTH = {
@@ -51,11 +52,7 @@ def made(samples: int = 1200, offset: float = 5.0, start: float = 0.0) -> Record
     actuator = Actuator("lag", "first", INTERVAL)
     theta = np.array([[TRUTH[n] for n in actuator.parameters]])
     generator = np.random.default_rng(4)
-    x = np.zeros(samples)
-    phi = np.exp(-INTERVAL / TRUTH["discrepancy_time"])
-    x[0] = generator.standard_normal()
-    for i in range(1, samples):
-        x[i] = phi * x[i - 1] + np.sqrt(1 - phi**2) * generator.standard_normal()
+    x = process(samples, INTERVAL / TRUTH["discrepancy_time"], generator)
     truth = actuator.displacement(theta, voltage)[0] - TRUTH["offset"] + offset + x
     reading = truth + TRUTH["sensor_sd"] * generator.standard_normal(samples)
     return Record(voltage, reading, INTERVAL, truth=truth, origin="made up")
@@ -166,14 +163,6 @@ def start_of(
 def initial(posterior: Posterior, begun: Started) -> FloatArray:
     states: FloatArray = begun.model[:, posterior.only.actuator.parameters.index("initial")]
     return states
-
-
-def test_the_offset_comes_from_the_lead_in(posterior: Posterior, draws: FloatArray) -> None:
-    """A record shifted by 30 um is predicted 30 um higher, and its bands are as wide."""
-    here = predicted(posterior, draws, made(), Start(from_rest=True))
-    elsewhere = predicted(posterior, draws, made(offset=35.0), Start(from_rest=True))
-    np.testing.assert_allclose(30.0, elsewhere.mean - here.mean, atol=0.02)
-    np.testing.assert_allclose(width(here), width(elsewhere), atol=0.02)
 
 
 def test_the_lead_in_is_told_and_a_longer_one_tells_more(
@@ -321,23 +310,6 @@ def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArr
     np.testing.assert_allclose(expected, bands.mean, atol=1e-6)
 
 
-def test_a_lead_in_that_fits_passes_and_one_of_another_actuator_does_not(
-    posterior: Posterior, draws: FloatArray
-) -> None:
-    record = made(start=0.4)
-    assert record.displacement is not None
-    good = predicted(posterior, draws, record, Start(lead_in=1.0)).lead_in
-    drifting = replace(record, displacement=record.displacement + 40 * record.time**2)
-    stretched = replace(record, displacement=1.5 * record.displacement)
-    assert good is not None
-    assert good.p_value > 0.01
-    assert (good.start, good.stop, good.samples) == (0.0, 1.0, 100)
-    for bad in (drifting, stretched):
-        told = predicted(posterior, draws, bad, Start(lead_in=1.0)).lead_in
-        assert told is not None
-        assert told.p_value < 0.002
-
-
 def test_a_window_of_another_record_is_that_part_of_the_whole(
     posterior: Posterior, draws: FloatArray
 ) -> None:
@@ -375,19 +347,6 @@ def test_missing_readings_are_not_judged_and_bands_go_on(
     assert np.isfinite(bands.upper["sensor", 95]).all()
 
 
-def test_a_planned_voltage_has_the_training_records_offset(
-    posterior: Posterior, draws: FloatArray
-) -> None:
-    planned = replace(made(), displacement=None, truth=None)
-    bands = predicted(posterior, draws, planned, Start(from_rest=True))
-    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
-    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
-    expected = posterior.only.actuator.displacement(theta, planned.voltage).mean(axis=0)
-    np.testing.assert_allclose(expected, bands.mean, rtol=1e-9)
-    assert bands.measured is bands.pit is bands.crps is None
-    assert bands.scored_from == 0
-
-
 def test_another_sampling_interval_gives_the_same_bands(
     posterior: Posterior, draws: FloatArray
 ) -> None:
@@ -406,12 +365,3 @@ def test_a_lead_in_that_leaves_nothing_is_refused(
 ) -> None:
     with pytest.raises(InputError, match="lead-in"):
         predicted(posterior, draws, made(), Start(lead_in=lead_in))
-
-
-def test_thinning_takes_draws_from_anywhere() -> None:
-    """A thousand of ten thousand: their mean is known to 87, and late ones are among them."""
-    every = np.arange(10_000.0)[:, np.newaxis]
-    kept = thinned(every, np.random.default_rng(0), 1000)
-    assert 5000 == pytest.approx(np.mean(kept), abs=4 * 87)
-    assert np.min(kept) < 100
-    assert np.max(kept) > 9900

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.special import ndtr
 from scipy.stats import norm
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
-from bwbayes.prediction.scores import block_bootstrap_error, block_length, score
+from bwbayes.prediction.scores import score
+from tests.prediction.process import process
 
 # The window of the measured record: 14 s at 200 Hz, correlation time 0.65 s.
 SAMPLES, CORRELATION = 2800, 130
@@ -21,11 +21,7 @@ SAMPLES, CORRELATION = 2800, 130
 
 def correlated(generator: np.random.Generator, series: int, samples: int = SAMPLES) -> FloatArray:
     """Stationary AR(1) series (series, samples) of unit variance."""
-    rho = np.exp(-1 / CORRELATION)
-    shocks = generator.normal(size=(series, samples)) * np.sqrt(1 - rho**2)
-    shocks[:, 0] /= np.sqrt(1 - rho**2)
-    values: FloatArray = lfilter([1.0], [1.0, -rho], shocks)
-    return values
+    return np.stack([process(samples, 1 / CORRELATION, generator) for _ in range(series)])
 
 
 def bands_around(
@@ -72,17 +68,6 @@ def test_width_and_interval_score_are_those_of_the_definition() -> None:
     width = 2 * norm.ppf(0.95)
     assert width == pytest.approx(scores.width_um[90])
     assert width + 20 * 2 * (3 - norm.ppf(0.95)) / 4 == pytest.approx(scores.interval_score_um[90])
-
-
-def test_the_interval_score_is_best_for_the_true_width() -> None:
-    values = np.random.default_rng(1).normal(size=20_000)
-    got = {
-        sd: score(bands_around(0 * values, values, sd), np.random.default_rng(0))
-        for sd in (0.7, 1.0, 1.4)
-    }
-    for level in LEVELS:
-        best = min(got, key=lambda sd: got[sd].interval_score_um[level])
-        assert 1.0 == best
 
 
 def test_coverage_counts_readings_in_the_sensor_band_and_truth_in_the_displacement_band() -> None:
@@ -170,23 +155,6 @@ def test_the_binomial_error_would_be_too_small_by_far() -> None:
     assert covered.std() > 5 * naive
 
 
-def test_independent_hits_have_the_binomial_error() -> None:
-    hits = np.random.default_rng(9).random(20_000) < 0.9
-    expected = np.sqrt(0.9 * 0.1 / hits.size)
-    got = block_bootstrap_error(hits, 1, np.random.default_rng(0))
-    assert expected == pytest.approx(got, rel=0.15)
-
-
-def test_the_bootstrap_of_blocks_has_the_variance_of_their_means() -> None:
-    """What the replicates estimate, in closed form: the variance of all blocks of the ring."""
-    hits = inside(correlated(np.random.default_rng(10), 1)[0], 90)
-    ring = np.concatenate([hits, hits])
-    means = [ring[i : i + 280].mean() for i in range(SAMPLES)]
-    expected = np.sqrt(np.var(means) / 10 / (1 - 0.1))
-    got = block_bootstrap_error(hits, 280, np.random.default_rng(0), 20_000)
-    assert expected == pytest.approx(got, rel=0.02)
-
-
 def test_a_band_that_is_never_missed_still_has_an_error() -> None:
     """A band thrice too wide covers a whole window, which holds some tens of independent hits."""
     values = correlated(np.random.default_rng(11), 1)[0]
@@ -196,18 +164,3 @@ def test_a_band_that_is_never_missed_still_has_an_error() -> None:
     assert scores.coverage["sensor"] is not None
     assert 1.0 == scores.coverage["sensor"][95]
     assert 0.01 < error[95] < 0.1
-
-
-def test_hits_without_a_miss_have_no_bootstrap_error() -> None:
-    assert 0.0 == block_bootstrap_error(np.ones(10, dtype=np.bool_), 2, np.random.default_rng(0))
-
-
-def test_blocks_are_three_autocorrelation_times_long() -> None:
-    """The integrated time of an AR(1) series is (1 + rho)/(1 - rho), twice its decay time."""
-    values = correlated(np.random.default_rng(12), 1, samples=2_000 * CORRELATION)[0]
-    expected = 3 * 2 * CORRELATION
-    assert expected == pytest.approx(block_length(values), rel=0.2)
-
-
-def test_a_residual_that_does_not_vary_has_blocks_of_one() -> None:
-    assert 1 == block_length(np.zeros(100))

@@ -92,18 +92,6 @@ def test_creep_is_the_sum_of_its_lags() -> None:
     assert grown == pytest.approx(got.crept.mean[-1], rel=1e-3)
 
 
-def test_creep_of_equal_strengths_is_even_over_the_decades() -> None:
-    times = tuple(10.0**power for power in range(-4, 4))
-    actuator = Actuator("none", "first", INTERVAL, creep=Creep(times))
-    of, draws = problem(actuator, **{f"creep_{i + 1}": 0.01 for i in range(8)})
-    got = measure_step(of, draws, Step(50.0, 10.0)).estimates
-    creep = got["creep_percent"]
-    assert creep is not None
-    assert 1 / (1 + 0.01 * 3.25) == pytest.approx(creep.mean, rel=0.03)
-    assert got["rise_s"] is None
-    assert got["overshoot_percent"] is None
-
-
 def test_a_gain_counts_from_the_displacement_before_the_step() -> None:
     gain = PolynomialGain(("quadratic",), Span(-20.0, 100.0))
     of, draws = problem(Actuator("lag", "first", INTERVAL, gain=gain), quadratic=3.0)
