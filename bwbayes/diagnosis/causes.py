@@ -9,10 +9,9 @@ filter. What was fitted has :mod:`bwbayes.diagnosis.explanations` instead.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp, ndtri
+from scipy.special import logsumexp
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.explanations import likely_causes
@@ -84,8 +83,9 @@ def cause(
     beyond
         In what the drive leaves training.
     """
-    residuals = Residuals.of(bands, judged, memory)
-    ranked = sorted(residuals.explanations(), key=lambda finding: -finding.nats)
+    ranked = sorted(
+        _explanations(bands, np.flatnonzero(judged), memory), key=lambda finding: -finding.nats
+    )
     likely = joined(likely_causes(ranked)) or Finding(
         "unknown",
         "unknown (no pattern in the residuals)",
@@ -111,82 +111,28 @@ def cause(
     return likely
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """Residuals (readings,), um, at ``rows`` (readings,) of the bands, and what these say of them.
+def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
+    """Weigh all causes by the readings at ``rows`` (readings,), with nats against none."""
+    assert bands.measured is not None
+    mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
+    residual = bands.measured[rows] - mean
+    own, slow, whole = (float(np.mean(bands.sd(kind)[rows] ** 2)) for kind in KINDS)
+    floor = 1e-12 * max(whole, 1e-300)
+    sds = np.sqrt(np.maximum([whole - slow, slow - own if memory > 0 else 0.0], floor))
+    noise = np.array([[*sds, max(memory, interval)]])
+    # The parameters' errors, each of an independent standard normal size.
+    varying = np.sqrt(max(own - bands.common_sd**2, 0.0)) * (mean - np.mean(mean))
+    errors = np.stack([np.full(rows.size, bands.common_sd), varying / (np.std(mean) or 1.0)])
+    skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
 
-    ``expected`` (readings, columns) are the parameters' errors, um, each of an independent standard
-    normal size; ``noise`` (1, 3) are the parameters of the discrepancy.
-    """
-
-    bands: Bands
-    rows: IntArray
-    residual: FloatArray
-    expected: FloatArray
-    noise: FloatArray
-
-    @classmethod
-    def of(cls, bands: Bands, judged: BoolArray, memory: float) -> Residuals:
-        """Take the judged readings (samples,) out of bands; ``memory`` of the discrepancy, s."""
-        assert bands.measured is not None
-        rows, mean = np.flatnonzero(judged), bands.mean[judged]
-        variances = [
-            float(np.mean((bands.upper[kind, 90] - bands.lower[kind, 90])[rows] ** 2))
-            / (2 * ndtri(0.95)) ** 2
-            for kind in KINDS
-        ]
-        floor = 1e-12 * max(variances[2], 1e-300)
-        discrepancy, sensor = np.sqrt(np.maximum(np.diff(variances), floor))
-        if memory <= 0:
-            discrepancy = np.sqrt(floor)
-        shape = (mean - np.mean(mean)) / (np.std(mean) or 1.0)
-        varying = np.sqrt(max(variances[0] - bands.common_sd**2, 0.0))
-        expected = np.stack([np.full(rows.size, bands.common_sd), varying * shape], axis=1)
-        noise = np.array([[sensor, discrepancy, max(memory, bands.interval)]])
-        return cls(bands, rows, bands.measured[rows] - mean, expected, noise)
-
-    def explanations(self) -> list[Finding]:
-        """Weigh all causes, with nats against none."""
-        plain, white = self._fit(np.empty((0, self.rows.size)), self.residual)
-        shapes = self._shapes()
-        nats = {kind: self._fit(added, self.residual)[0] - plain for kind, added in shapes.items()}
-        # Twice the mean to the readings: then they are its opposite.
-        opposite = self.residual + 2 * self.bands.mean[self.rows]
-        nats["sign"] = self._fit(shapes["offset"], opposite)[0] - plain
-        starts = [
-            self._fit(3 * shapes["offset"] * np.exp(-self._time_share / decay), self.residual)[0]
-            for decay in DECAYS
-        ]
-        nats["start"] = float(logsumexp(starts)) - np.log(len(DECAYS)) - plain
-        nats["outliers"] = tail_nats(white)
-        square = float(np.mean(white**2))
-        nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
-        interval, time = self.bands.interval, self.bands.time[self.rows]
-        settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
-        words = {
-            "name": self.bands.name,
-            "settled": clock(settled, interval),
-            "size": f"{np.mean(self.residual):+.3g}",
-            "spikes": ", ".join(
-                f"[{clock(t, interval)}, {clock(t + interval, interval)}]"
-                for t in time[np.abs(white) > 5][:3].tolist()
-            ),
-        }
-        return [
-            Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
-            for kind, (text, fix) in WORDS.items()
-        ]
-
-    def _fit(self, added: FloatArray, residual: FloatArray) -> tuple[float, FloatArray]:
-        """Explain a residual (readings,) by shapes (shapes, readings) of standard normal sizes.
+    def weigh(added: FloatArray, residual: FloatArray = residual) -> tuple[float, FloatArray]:
+        """Explain a residual by shapes (shapes, readings) of standard normal sizes.
 
         Returns its log density, up to what is the same for all shapes, and the innovations
         (readings,) less what the shapes explain, in sds.
         """
-        series = np.concatenate([[residual], self.expected.T, added])
-        skipped = np.concatenate([[0.0], np.diff(self.rows) - 1.0])
-        noise = DiscrepancyNoise(self.bands.interval)
-        white = noise.whiten(self.noise, series[np.newaxis], skipped)[0][0]
+        series = np.concatenate([[residual], errors, added])
+        white = DiscrepancyNoise(interval).whiten(noise, series[np.newaxis], skipped)[0][0]
         precision = np.eye(len(series) - 1) + white[1:] @ white[1:].T
         pull = white[1:] @ white[0]
         sizes = np.linalg.solve(precision, pull)
@@ -194,29 +140,49 @@ class Residuals:
         log_volume = float(np.linalg.slogdet(precision)[1])
         return -0.5 * (squares + log_volume), white[0] - sizes @ white[1:]
 
-    @property
-    def _time_share(self) -> FloatArray:
-        """Time (readings,) from the first reading to the last, as a fraction."""
-        time = self.bands.time[self.rows] - self.bands.time[self.rows[0]]
-        share: FloatArray = time / max(float(time[-1]), self.bands.interval)
-        return share
+    plain, white = weigh(np.empty((0, rows.size)))
+    along = (time - time[0]) / max(float(np.ptp(time)), interval)
+    shapes = _shapes(bands, rows, along)
+    nats = {kind: weigh(added)[0] - plain for kind, added in shapes.items()}
+    # Twice the mean to the readings: then they are its opposite.
+    nats["sign"] = weigh(shapes["offset"], residual + 2 * mean)[0] - plain
+    starts = [weigh(3 * shapes["offset"] * np.exp(-along / decay))[0] for decay in DECAYS]
+    nats["start"] = float(logsumexp(starts)) - np.log(len(DECAYS)) - plain
+    nats["outliers"] = tail_nats(white)
+    square = float(np.mean(white**2))
+    nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
+    settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
+    words = {
+        "name": bands.name,
+        "settled": clock(settled, interval),
+        "size": f"{np.mean(residual):+.3g}",
+        "spikes": ", ".join(
+            f"[{clock(t, interval)}, {clock(t + interval, interval)}]"
+            for t in time[np.abs(white) > 5][:3].tolist()
+        ),
+    }
+    return [
+        Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
+        for kind, (text, fix) in WORDS.items()
+    ]
 
-    def _shapes(self) -> dict[str, FloatArray]:
-        """Shapes (shapes, readings) that may be added to the mean, by kind, um.
 
-        Prior sds: a tenth of the mean's range; of a gain 0.3; of a delay 0.3 of the time in which
-        the mean changes by its sd.
-        """
-        mean, voltage = self.bands.mean[self.rows], self.bands.voltage[self.rows]
-        slope = np.gradient(self.bands.mean, self.bands.interval)[self.rows]
-        size, share = 0.1 * (float(np.ptp(mean)) or 1.0), self._time_share
-        level = (voltage - np.mean(voltage)) / (float(np.max(np.abs(voltage))) or 1.0)
-        speed = rate(self.bands.voltage, self.bands.interval)[self.rows]
-        way = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
-        return {
-            "drift": size * np.stack([share, share**2]),
-            "offset": np.full((1, share.size), size),
-            "gain": 0.3 * (mean - np.mean(mean))[np.newaxis],
-            "delay": 0.3 * np.std(mean) / (np.std(slope) or 1.0) * slope[np.newaxis],
-            "loop": size * np.stack([level, level**2, level**3, way, way * level, way * level**2]),
-        }
+def _shapes(bands: Bands, rows: IntArray, along: FloatArray) -> dict[str, FloatArray]:
+    """Shapes (shapes, readings) that may be added to the mean, by kind, um.
+
+    ``along`` (readings,) goes from 0 to 1. Prior sds: a tenth of the mean's range; of a gain 0.3;
+    of a delay 0.3 of the time in which the mean changes by its sd.
+    """
+    mean, voltage = bands.mean[rows], bands.voltage[rows]
+    slope = np.gradient(bands.mean, bands.interval)[rows]
+    size = 0.1 * (float(np.ptp(mean)) or 1.0)
+    level = (voltage - np.mean(voltage)) / (float(np.max(np.abs(voltage))) or 1.0)
+    speed = rate(bands.voltage, bands.interval)[rows]
+    way = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
+    return {
+        "drift": size * np.stack([along, along**2]),
+        "offset": np.full((1, rows.size), size),
+        "gain": 0.3 * (mean - np.mean(mean))[np.newaxis],
+        "delay": 0.3 * np.std(mean) / (np.std(slope) or 1.0) * slope[np.newaxis],
+        "loop": size * np.stack([level, level**2, level**3, way, way * level, way * level**2]),
+    }

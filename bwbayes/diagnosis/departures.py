@@ -1,9 +1,9 @@
 """How readings may depart from their bands: too few covered, too far off, to one side, too near.
 
 What luck alone may do to a mean of many readings depends on how many independent ones they are
-worth, and that is far fewer than there are: a discrepancy forgets slowly, and the parameters' error
-is one and the same all along. The bands themselves say how large each part is. Where luck may do
-it too, a departure comes with the chance of that on a record that the fitted model describes.
+worth, far fewer than there are: a discrepancy forgets slowly, and the parameters' error is one and
+the same all along. The bands themselves say how large each part is. Where luck may do it too, a
+departure comes with the chance of that on a record that the fitted model describes.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy.special import betainc, ndtri
+from scipy.special import betainc
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.reversals import rate
-from bwbayes.prediction.bands import LEVELS, Bands, Kind
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
 
 __all__ = ["Standardized", "percent"]
@@ -64,16 +64,12 @@ class Standardized:
         """
         assert bands.measured is not None
 
-        def sd(kind: Kind) -> FloatArray:
-            width = (bands.upper[kind, 90] - bands.lower[kind, 90])[judged]
-            half: FloatArray = width / (2 * ndtri(0.95))
-            return half
-
-        sensor = np.maximum(sd("sensor"), np.finfo(float).tiny)
+        own, slow, sensor = (bands.sd(kind)[judged] for kind in KINDS)
+        sensor = np.maximum(sensor, np.finfo(float).tiny)
         z = (bands.measured - bands.mean)[judged] / sensor
         total = float(np.mean(sensor**2))
-        p = min(float(np.mean(sd("parameter") ** 2)) / total, 1.0)
-        q = min(float(np.mean(sd("displacement") ** 2)) / total, 1.0) - p
+        p = min(float(np.mean(own**2)) / total, 1.0)
+        q = min(float(np.mean(slow**2)) / total, 1.0) - p
         q = max(q, 0.0) if memory > 0 else 0.0
         once, twice = _mean_correlations(judged, bands.interval, memory)
         single = 1 / z.size

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.diagnosis.series_patterns import turning_points
+from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
 __all__ = ["LoopFit", "fit_loop"]
@@ -79,7 +79,12 @@ def fit_loop(record: Record) -> LoopFit:
     decays = np.exp(-elapsed[:, np.newaxis] / times)
 
     best: tuple[float, FloatArray, float, int] | None = None
-    lags = _lags(record)
+    # None, and from half an interval to a part of a half turn.
+    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
+    edges = np.concatenate([[0], turns, [record.samples - 1]])
+    slowest = 0.3 * record.interval * float(np.median(np.diff(edges)))
+    some = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
+    lags = np.concatenate([[0.0], some])
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), judged), strict=True):
         basis = np.column_stack([loops, trend_shape])
@@ -125,23 +130,13 @@ def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
     return np.unique(np.concatenate([[0], evenly, early, extremes]))
 
 
-def _lags(record: Record) -> FloatArray:
-    """Return the lags to try, s: none, and from half an interval to a part of a half turn."""
-    smallest_turn = 0.1 * float(np.ptp(record.voltage))
-    turns = turning_points(record.voltage, smallest_turn)
-    slowest = 0.3 * record.interval * float(np.median(np.diff(turns)))
-    lags = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
-    return np.concatenate([[0.0], lags])
-
-
 def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
     """Return the voltage behind a first-order lag that is settled at its start."""
     if samples == 0:
         return voltage
     decay = np.exp(-1 / samples)
-    shifted = voltage - voltage[0]
-    lagged: FloatArray = voltage[0] + scipy.signal.lfilter([1 - decay], [1.0, -decay], shifted)
-    return lagged
+    follow = scipy.signal.lfilter([1 - decay], [1.0, -decay], voltage - voltage[0])
+    return np.asarray(voltage[0] + follow)
 
 
 def _bases(voltages: FloatArray, judged: BoolArray) -> Iterator[FloatArray]:

@@ -15,12 +15,8 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.frozen import Stuck, clipped, held, repeated
 from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
-from bwbayes.diagnosis.series_patterns import (
-    find_gross_outliers,
-    scatter,
-    spikes,
-    turning_points,
-)
+from bwbayes.diagnosis.series_patterns import find_gross_outliers, scatter, spikes
+from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
 __all__ = ["inspect", "isolated_outliers", "settle_fix"]
@@ -57,12 +53,9 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     unlike = [*_relation(record, loop)]
     if {"few readings", "coarse sampling"} & {finding.kind for finding in findings}:
         # Of so little only the most obvious can be said.
-        return (
-            *findings,
-            *(finding for finding in unlike if finding.kind == "no relation"),
-            *spiky,
-        )
-    unlike += [*_stuck(record), *_clipping(record)]
+        obvious = [finding for finding in unlike if finding.kind == "no relation"]
+        return (*findings, *obvious, *spiky)
+    unlike += _stuck(record)
     findings += [*unlike, *spiky]
     if not unlike:
         findings += [*_transient(record, loop), *_drift(record, loop)]
@@ -101,15 +94,14 @@ def _plausibility(record: Record) -> Iterator[Finding]:
         if record.readings < 100:
             text = f"{record.readings} readings, some ten for each parameter"
             yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
-    turns = turning_points(record.voltage, 0.1 * span)
-    spacing = float(np.median(np.diff(turns)))
-    if turns.size >= 5 and spacing < 6:
-        text = f"{2 * spacing:.3g} samples a period of the drive, so its turns are not seen"
+    spacing = np.diff(turning_points(record.voltage, 0.1 * span))
+    if spacing.size >= 3 and np.median(spacing) < 6:
+        text = (
+            f"{2 * np.median(spacing):.3g} samples a period of the drive, so its turns are not seen"
+        )
         fix = "sample faster (20 samples a period or more), or drive more slowly"
         yield _whole(record, "coarse sampling", text, fix)
-    # All but the unfinished ones at the ends.
-    turns = turning_points(record.voltage, 0.02 * span)
-    swings = np.abs(np.diff(record.voltage[turns]))[1:-1]
+    swings = np.abs(np.diff(record.voltage[turning_points(record.voltage, 0.02 * span)]))
     if swings.size >= 3 and np.ptp(swings) < 0.05 * np.median(swings):
         text = f"every swing of the voltage is {np.median(swings):.4g} V"
         fix = (
@@ -176,7 +168,7 @@ def _leads(record: Record) -> bool | None:
     rows = np.flatnonzero(record.has_reading)
     voltage, displacement = record.voltage[rows], _readings(record)
     turns = turning_points(voltage, 0.2 * float(np.ptp(voltage)))
-    if turns.size < 4:
+    if turns.size < 3:
         return None
     # From one turn to the next but one, twice the area between loop and chord.
     steps_v, steps_d = np.diff(voltage), np.diff(displacement)
@@ -201,50 +193,38 @@ def _leads(record: Record) -> bool | None:
 
 def _stuck(record: Record) -> Iterator[Finding]:
     """Find readings that stay where they are while the voltage moves on."""
-    assert record.displacement is not None
-    rows = np.flatnonzero(record.has_reading)
-    voltage, displacement = record.voltage[rows], _readings(record)
-    stuck = repeated(voltage, displacement)
-    if stuck is not None:
-        count = f"{stuck.samples} samples repeat"
-        text = f"{count} the one before, voltage and displacement, and then jump"
-        yield _where(record, rows, "repeated samples", text, stuck)
-        return
-    stuck = held(voltage, displacement)
-    if stuck is not None:
-        text = (
-            f"{stuck.samples} readings repeat the one before and then jump, while the voltage moves"
-        )
-        yield _where(record, rows, "held readings", text, stuck)
+    rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
+    voltage = record.voltage[rows]
+    repeats, jump = repeated(voltage, displacement), "repeat the one before{} and then jump{}"
+    if repeats is not None:
+        seen = f"samples {jump.format(', voltage and displacement,', '')}"
+        yield _where(record, rows, "repeated samples", seen, repeats)
+    elif (holds := held(voltage, displacement)) is not None:
+        seen = f"readings {jump.format('', ', while the voltage moves')}"
+        yield _where(record, rows, "held readings", seen, holds)
+    for side, sign in (("largest", 1.0), ("smallest", -1.0)):
+        ends = clipped(sign * displacement, voltage)
+        if ends is not None:
+            value = displacement[ends.first[0]]
+            seen = f"readings stay at the {side} value, {value:g} um, while the voltage moves"
+            yield _where(record, rows, "clipping", seen, ends)
 
 
-def _where(record: Record, rows: IntArray, kind: str, text: str, stuck: Stuck) -> Finding:
+def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -> Finding:
     """Return a finding about stuck samples, with the windows to leave out if these are few."""
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval
-    windows = [
-        f"[{record.clock(a)}, {record.clock(b)}]" for a, b in zip(starts, stops, strict=True)
-    ]
-    text += f", first at {record.clock(starts[0])} s"
-    if len(windows) <= 5:
+    if starts.size <= 5:
+        windows = [
+            f"[{record.clock(a)}, {record.clock(b)}]" for a, b in zip(starts, stops, strict=True)
+        ]
         fix = f"exclude = [{', '.join(windows)}] under [record]"
     elif kind == "clipping":
         fix = "use a wider range"
     else:
         fix = f"decimate = {stuck.length} under [record], or record at the sensor's own rate"
+    text = f"{stuck.samples} {seen}, first at {record.clock(starts[0])} s"
     return Finding(kind, text, fix, float(starts[0]), float(stops[-1]))
-
-
-def _clipping(record: Record) -> Iterator[Finding]:
-    """Find a sensor at the end of its range."""
-    rows = np.flatnonzero(record.has_reading)
-    voltage, displacement = record.voltage[rows], _readings(record)
-    for side, sign in (("largest", 1.0), ("smallest", -1.0)):
-        stuck = clipped(sign * displacement, voltage)
-        if stuck is not None:
-            value = displacement[stuck.first[0]]
-            text = f"{stuck.samples} readings stay at the {side} value, {value:g} um, while the "
-            yield _where(record, rows, "clipping", text + "voltage moves", stuck)
 
 
 def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:

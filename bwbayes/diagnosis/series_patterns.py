@@ -1,4 +1,4 @@
-"""Shapes in a series of numbers: turning points, runs and spikes."""
+"""Shapes in a series of numbers: runs and spikes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["find_gross_outliers", "runs", "scatter", "spikes", "turning_points"]
+__all__ = ["find_gross_outliers", "runs", "scatter", "spikes"]
 
 # Samples in the median that a spike is held against: two beside each other are a spike still.
 NEIGHBORS = 5
@@ -26,30 +26,6 @@ def scatter(values: FloatArray) -> float:
     """Return the sd of values about their median, whatever a minority of them is."""
     # A normal distribution's sd is 1.4826 times its median absolute deviation.
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
-
-
-def turning_points(values: FloatArray, least: float) -> IntArray:
-    """Return the samples at which values (samples,) turn by more than `least`, ends included."""
-    steps = np.sign(np.diff(values))
-    moving = np.flatnonzero(steps)
-    if not moving.size:
-        return np.array([0, values.size - 1])
-    turns = moving[1:][np.diff(steps[moving]) != 0]
-    kept = [0]
-    direction, extreme = 0.0, 0
-    # Over local extremes alone; an extreme counts once the way back from it is long enough.
-    for at in [*turns.tolist(), values.size - 1]:
-        value = values[at]
-        if direction == 0.0:
-            if abs(value - values[0]) > least:
-                direction, extreme = float(np.sign(value - values[0])), at
-        elif direction * (value - values[extreme]) >= 0:
-            extreme = at
-        elif direction * (values[extreme] - value) > least:
-            kept.append(extreme)
-            direction, extreme = -direction, at
-    last = extreme if direction else values.size - 1
-    return np.array([*kept, *([last] if last != kept[-1] else [])])
 
 
 def spikes(

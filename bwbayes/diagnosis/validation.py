@@ -1,21 +1,16 @@
 """Whether bands hold on a record: the verdict that stands first on screen and report.
 
 Bands are held against the readings in three ways: how many readings they cover, how large the
-residuals are, and whether the residuals lean to one side. What luck alone may do to these three
-depends on how many independent readings a record is worth, and that is far fewer than it has: its
-discrepancy forgets slowly, and the parameters' error is one and the same all along. The bands
-themselves say how large each part is, so that the number follows from the model
-(:mod:`bwbayes.diagnosis.departures`). Validation fails where luck would do it in one of 5,000 good
-records, and is inconclusive where it would in one of a hundred, or where the record is worth too
-few readings. A fit is judged on its own readings too. There the noise model grows until it covers
-whatever the model misses, so that a fit fails when it misses more than a part of the displacement's
-range.
+residuals are, and whether the residuals lean to one side (:mod:`bwbayes.diagnosis.departures`).
+Validation fails where luck would do it in one of 5,000 good records, and is inconclusive where it
+would in one of a hundred, or where the record is worth too few readings. A fit is judged on its own
+readings too. There the noise model grows until it covers whatever the model misses, so that a fit
+fails when it misses more than a part of the displacement's range.
 
 A verdict that fails names the likely cause: on readings that were fitted the explanation with the
 best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
 residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
-the best explanation is a transient, a drift or a step without which a parameter is another one: its
-noise model covers what it then misses everywhere.
+the best explanation is a transient, a drift or a step without which a parameter is another one.
 """
 
 from __future__ import annotations
@@ -37,9 +32,6 @@ from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief
 
 __all__ = ["STATUSES", "Background", "Verdict", "assess"]
-
-# Worth fewer independent readings than this a record cannot show that bands hold.
-MIN_EFFECTIVE_SIZE = 5.0
 
 
 @dataclass(frozen=True)
@@ -75,17 +67,16 @@ class Background:
             noise = dataset.table.noise(single.prior.theta(record_draws))
             # Rather too long than too short.
             memory.append(float(np.quantile(dataset.noise.correlation_time(noise), 0.9)))
-            sds = dataset.noise.marginal_sd(noise)
-            noise_log_sd.append(float(np.std(np.log(np.sqrt(sum(sd**2 for sd in sds))))))
-        datasets = posterior.datasets
+            variance = np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0)
+            noise_log_sd.append(float(np.std(np.log(variance)) / 2))
         voltage = np.concatenate(
-            [dataset.voltage[window] for dataset in datasets for window in dataset.training]
+            [data.voltage[window] for data in posterior.datasets for window in data.training]
         )
         return cls(
             max(memory),
             max(noise_log_sd),
             (float(voltage.min()), float(voltage.max())),
-            max(dataset.extent for dataset in datasets),
+            max(dataset.extent for dataset in posterior.datasets),
         )
 
 
@@ -182,11 +173,11 @@ def assess(
         return None
     standard = Standardized.of(bands, judged, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
-    likely = likely_causes(explanations)
-    verdict = Verdict(bands.name, bands.training, True, separate=bands.separate)
-    verdict = replace(verdict, notes=_lead_in(bands))
+    verdict = Verdict(
+        bands.name, bands.training, True, notes=_lead_in(bands), separate=bands.separate
+    )
     if reasons:
-        why = joined(likely) or (
+        why = joined(likely_causes(explanations)) or (
             REVERSED_SIGN
             if reasons[0].startswith("the readings fall")
             else cause(bands, judged, background.memory, beyond)
@@ -202,14 +193,15 @@ def assess(
         doubts.append(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
         )
-    if standard.effective_size < MIN_EFFECTIVE_SIZE:
+    least = 5.0  # worth fewer independent readings a record cannot show that bands hold
+    if standard.effective_size < least:
         doubts.append(
             f"effective sample size {standard.effective_size:.1f} is too small to validate the "
-            f"bands; use a record {MIN_EFFECTIVE_SIZE / standard.effective_size:.2g} times as long"
+            f"bands; use a record {least / standard.effective_size:.2g} times as long"
         )
-    if doubts:
-        return replace(verdict, holds=None, reasons=tuple(doubts), cause=followed)
-    return verdict
+    return (
+        replace(verdict, holds=None, reasons=tuple(doubts), cause=followed) if doubts else verdict
+    )
 
 
 def _lead_in(bands: Bands) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.shown import brief
@@ -93,6 +94,11 @@ class Bands:
             return [slice(0, self.time.size)]
         edges = np.flatnonzero(np.diff(self.inside, prepend=False, append=False))
         return [slice(*edge) for edge in edges.reshape(-1, 2).tolist()]
+
+    def sd(self, kind: Kind) -> FloatArray:
+        """Sd (samples,) of a normal distribution whose 90 % band is as wide, um."""
+        width: FloatArray = (self.upper[kind, 90] - self.lower[kind, 90]) / (2 * ndtri(0.95))
+        return width
 
     def covers(self, kind: Kind, level: int, values: FloatArray) -> BoolArray:
         """Tell which values (samples,), um, a band covers; its edges belong to it."""
