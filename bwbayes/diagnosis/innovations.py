@@ -3,16 +3,15 @@
 Where model and noise model are right, a residual less what the readings before it predict, over
 its standard deviation, is an independent standard normal number. Two things show in these
 innovations that the residuals hide: whether they are white, and whether their mean depends on the
-voltage (its rate, its level, its direction). Oscillations, heavy tails and noise that grows are
-explanations (:mod:`bwbayes.diagnosis`). A departure is reported where it is both beyond chance and
-large enough to matter; on a record that the model describes this happens to fewer than one in a
-hundred.
+voltage (its rate, its level, its direction). A departure is reported where it is both beyond chance
+and large enough to matter; of records that the model describes fewer than one in a hundred has one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 import scipy
@@ -28,9 +27,6 @@ __all__ = ["Innovations", "departures", "innovations"]
 
 # Probability of a false alarm of each of the tests, of which there are about ten.
 ALARM = 1e-4
-
-# Fewer innovations show nothing.
-MIN_READINGS = 100
 
 
 @dataclass(frozen=True)
@@ -149,12 +145,10 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
 
 def departures(series: Innovations) -> tuple[Finding, ...]:
     """Return where the innovations depart from what the noise model assumes."""
-    if series.white.size < MIN_READINGS:
+    if series.white.size < 100:  # these show nothing
         return ()
-    findings = [*_correlated(series)]
-    for quantity in ("rate", "voltage", "direction"):
-        findings += _one_sided(series, quantity)
-    return tuple(findings)
+    sides = [_one_sided(series, quantity) for quantity in ("rate", "voltage", "direction")]
+    return tuple(chain(_correlated(series), *sides))
 
 
 def _correlated(series: Innovations) -> Iterator[Finding]:

@@ -8,9 +8,9 @@ ones too. A number that hardly any of them reaches says what the model, noise in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
+from functools import partial
 
 import numpy as np
 import scipy
@@ -22,9 +22,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
 __all__ = ["STATISTICS", "Replicated", "Statistic", "replicated"]
-
-# Replicated records; p-values come in steps of one over them.
-RECORDS = 200
 
 # What is looked at: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
@@ -57,6 +54,12 @@ class Statistic:
         """Whether no more than one in a hundred replicated records has as much, or as little."""
         return min(self.p, 1 - self.p) < 0.005
 
+    @property
+    def numbers(self) -> dict[str, float | bool]:
+        """What ``summary.json`` has of it."""
+        edges = {"lower_95": self.lower, "upper_95": self.upper}
+        return {"observed": self.observed} | edges | {"p": self.p, "odd": self.odd}
+
 
 @dataclass(frozen=True)
 class Replicated:
@@ -72,16 +75,7 @@ class Replicated:
         """What ``summary.json`` has of it, as ``replicated``."""
         return {
             "records": self.records,
-            "statistics": {
-                name: {
-                    "observed": statistic.observed,
-                    "lower_95": statistic.lower,
-                    "upper_95": statistic.upper,
-                    "p": statistic.p,
-                    "odd": statistic.odd,
-                }
-                for name, statistic in self.statistics.items()
-            },
+            "statistics": {name: statistic.numbers for name, statistic in self.statistics.items()},
         }
 
 
@@ -90,6 +84,7 @@ def replicated(
     draws: FloatArray,
     generator: np.random.Generator,
     record: str | None = None,
+    records: int = 200,
 ) -> Replicated:
     """Check the training readings of a record against replicated ones.
 
@@ -98,36 +93,42 @@ def replicated(
     posterior
         The posterior that was sampled.
     draws
-        (draws, free), parameters in their own units; ``RECORDS`` of them are used.
+        (draws, free), parameters in their own units; ``records`` of them are used.
     generator
         Chooses draws, and draws their noise.
     record
         The record's name; may be left out of one alone.
+    records
+        Replicated ones; p-values come in steps of one over them.
     """
     dataset = posterior.only if record is None else posterior.alone(record).only
-    count = min(RECORDS, len(draws))
+    count = min(records, len(draws))
     chosen = draws[generator.choice(len(draws), count, replace=False)]
     theta = posterior.prior.theta(chosen)
     rows = dataset.readings.rows
     noise = dataset.table.noise(posterior.table.of(theta, dataset.name))
-    mean, spread = _moments(posterior.simulations(theta, rows, record))
-    variance = np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0)
-    sd = np.sqrt(np.mean(variance) + spread)
-    voltage, samples = dataset.voltage[rows], int(rows[-1]) + 1
+    # Simulated twice, rather than to keep all: first for their mean and their spread about it.
+    total, squares, origin = np.zeros(rows.size), np.zeros(rows.size), dataset.readings.values
+    for simulated in posterior.simulations(theta, rows, record):
+        total += np.sum(simulated - origin, axis=0)
+        squares += np.sum((simulated - origin) ** 2, axis=0)
+    away = total / count
+    variance = np.mean(np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0))
+    sd = np.sqrt(variance + np.maximum(squares / count - away**2, 0.0))
     # Where readings are missing they are missing in all.
     neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
-    statistics, row = [], 0
-    # Simulated once more, rather than to keep all; a few at a time are looked at together.
+    work_out = partial(_statistics, dataset.voltage[rows], origin + away, sd, neighbors)
+    statistics, noises = [], iter(noise[:, np.newaxis])
     for simulated in posterior.simulations(theta, rows, record):
+        # A few at a time are looked at together.
         for batch in batches(len(simulated), rows.size, 1 << 18):
             readings = simulated[batch].copy()
             for i in range(len(readings)):
-                drawn = dataset.noise.draw(noise[row : row + 1], samples, generator)
+                drawn = dataset.noise.draw(next(noises), int(rows[-1]) + 1, generator)
                 readings[i] += np.sum(drawn, axis=0)[rows]
-                row += 1
-            statistics.append(_statistics(readings, voltage, mean, sd, neighbors))
+            statistics.append(work_out(readings))
     replicates = np.concatenate(statistics)
-    observed = _statistics(dataset.readings.values[np.newaxis], voltage, mean, sd, neighbors)[0]
+    observed = work_out(dataset.readings.values[np.newaxis])[0]
     lower, upper = np.quantile(replicates, [0.025, 0.975], axis=0)
     p = np.mean(replicates > observed, axis=0) + 0.5 * np.mean(replicates == observed, axis=0)
     values = np.stack([observed, lower, upper, p], axis=1).tolist()
@@ -136,22 +137,12 @@ def replicated(
     )
 
 
-def _moments(simulations: Iterable[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance (readings,) of rows that come a few at a time, (any, readings)."""
-    mean, squares = np.zeros(1), np.zeros(1)
-    for number, row in enumerate(chain.from_iterable(simulations), 1):
-        deviation = row - mean
-        mean = mean + deviation / number
-        squares = squares + deviation * (row - mean)
-    return mean, squares / number
-
-
 def _statistics(
-    readings: FloatArray,
     voltage: FloatArray,
     mean: FloatArray,
     sd: FloatArray,
     neighbors: IntArray,
+    readings: FloatArray,
 ) -> FloatArray:
     """Work out all ``STATISTICS`` of readings (records, readings): (records, statistics)."""
     residual = readings - mean
