@@ -2,10 +2,7 @@
 
 Every posterior draw is driven slowly, without dynamics, creep and offset: up and down over the
 whole range of the record's voltage until the loop closes (the major loop), the same over half of
-that range (the minor loop), and once from the demagnetized state (the initial curve). What can be
-read off these, the range, the opening, the remanence, the coercive voltage and the area, then has a
-mean, an sd and an interval as any parameter has, and so can be held against another operator's or a
-data sheet's.
+that range (the minor loop), and once from the demagnetized state (the initial curve).
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.operator import Span
 from bwbayes.shown import brief
 
 __all__ = [
@@ -133,17 +129,14 @@ class Loop:
     @property
     def amplitude(self) -> float:
         """Half of the voltage's range, V."""
-        return float(self.voltage[-1] - self.voltage[0]) / 2
+        return float(np.ptp(self.voltage)) / 2
 
     @property
     def numbers(self) -> dict[str, object]:
         """The numbers as a summary holds them."""
-        return {
-            "from_V": float(self.voltage[0]),
-            "to_V": float(self.voltage[-1]),
-            "amplitude_V": self.amplitude,
-            "closed": self.closed,
-        } | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
+        low, high = float(self.voltage[0]), float(self.voltage[-1])
+        path = {"from_V": low, "to_V": high, "amplitude_V": self.amplitude, "closed": self.closed}
+        return path | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
 
 
 @dataclass(frozen=True)
@@ -195,17 +188,17 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     InputError
         A voltage that does not change, or an even number of points.
     """
-    _, alone, its = next(posterior.each(draws))
-    dataset = alone.only
+    _, single, record_draws = next(posterior.each(draws))
+    dataset = single.only
     actuator = dataset.actuator.within(dataset.voltage)
-    column = dataset.table.columns(alone.prior.theta(its))
-    every = [record.voltage for record in posterior.datasets]
-    span = Span(min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every))
-    center, half = span.middle, span.half
-    voltage, curve = initial_curve(actuator, column, span.low, span.high, points)
+    column = dataset.table.columns(single.prior.theta(record_draws))
+    low = min(float(np.min(record.voltage)) for record in posterior.datasets)
+    high = max(float(np.max(record.voltage)) for record in posterior.datasets)
+    quarter = (high - low) / 4
+    voltage, curve = initial_curve(actuator, column, low, high, points)
     return Loops(
-        Loop.of(steady_loop(actuator, column, span.low, span.high, points)),
-        Loop.of(steady_loop(actuator, column, center - half / 2, center + half / 2, points)),
+        Loop.of(steady_loop(actuator, column, low, high, points)),
+        Loop.of(steady_loop(actuator, column, low + quarter, high - quarter, points)),
         voltage,
         Curve.of(curve),
     )
@@ -232,8 +225,7 @@ def steady_loop(
     InputError
         ``low`` is not below ``high``, or an even number of points.
     """
-    voltage = _voltages(low, high, points)
-    column = _demagnetized(column)
+    voltage, column = _voltages(low, high, points), _demagnetized(column)
     memory = actuator.begin(column, np.zeros(1), from_rest=True)
     operator = actuator.hysteresis
     # After two cycles, then after twice as many each time, a thousand at most.
@@ -259,18 +251,13 @@ def initial_curve(
     ``high``; where both lie on one side of zero, only to the farther one. Parameters as in
     :func:`steady_loop`.
     """
-    low, high = min(low, 0.0), max(high, 0.0)
-    voltage = _voltages(low, high, points)
+    voltage = _voltages(min(low, 0.0), max(high, 0.0), points)
     column = _demagnetized(column)
-    sides = [voltage[voltage < 0][::-1], voltage[voltage >= 0]]
-    curves = [
-        actuator.hysteresis.advance(
-            column, side, actuator.begin(column, np.zeros(1), from_rest=True)
-        )[0]
-        if side.size
-        else np.empty((column["offset"].size, 0))
-        for side in sides
-    ]
+    curves = [np.empty((column["offset"].size, 0))] * 2
+    for number, side in enumerate((voltage[voltage < 0][::-1], voltage[voltage >= 0])):
+        if side.size:
+            virgin = actuator.begin(column, np.zeros(1), from_rest=True)
+            curves[number], _ = actuator.hysteresis.advance(column, side, virgin)
     joined = np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
     return voltage, joined + _gain(actuator, column, voltage)
 
@@ -300,23 +287,18 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         cycle, in µJ, once multiplied with the actuator's force per volt, N/V.
     """
     voltage, rising, falling = traced.voltage, traced.rising, traced.falling
-    top, bottom = rising[:, -1], falling[:, 0]
-    mean_path = (top + bottom) / 2
-    gap = falling - rising
-    size = top - bottom
+    gap, size = falling - rising, rising[:, -1] - falling[:, 0]
+    middle = (rising[:, -1] + falling[:, 0]) / 2
     # A displacement may fall with the voltage.
-    sign = np.where(size < 0, -1.0, 1.0)
-    passed = [
-        _crossing(voltage, sign[:, np.newaxis] * (branch - mean_path[:, np.newaxis]))
-        for branch in (rising, falling)
-    ]
+    sign = np.where(size < 0, -1.0, 1.0)[:, np.newaxis]
+    up, down = (_crossing(voltage, sign * (x - middle[:, np.newaxis])) for x in (rising, falling))
     through_zero = bool(voltage[0] < 0 < voltage[-1])
     return {
         "range_um": size,
         "opening_um": _at_zero(voltage, gap) if through_zero else None,
         "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
-        "remanence_um": _at_zero(voltage, falling) - mean_path if through_zero else None,
-        "coercive_V": (passed[0] - passed[1]) / 2,
+        "remanence_um": _at_zero(voltage, falling) - middle if through_zero else None,
+        "coercive_V": (up - down) / 2,
         "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),
     }
 

@@ -31,9 +31,6 @@ __all__ = [
     "step_of",
 ]
 
-# The first time that is looked at, s.
-FIRST = 1e-6
-
 # Time after a step from which creep is counted, s, as data sheets do.
 CREEP_FROM = 0.1
 
@@ -132,8 +129,9 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     column = dataset.table.columns(single.prior.theta(record_draws))
     column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
     actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")
-    held = max(step.held, 10 * FIRST)
-    time = np.geomspace(FIRST, held, round(60 * np.log10(held / FIRST)) + 1)
+    first = 1e-6  # s: shorter than any rise
+    held = max(step.held, 10 * first)
+    time = np.geomspace(first, held, round(60 * np.log10(held / first)) + 1)
     settled, without, creep = _responses(actuator, column, step.height, time)
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
     estimates["level_um"] = Estimate.of(settled)
