@@ -7,7 +7,6 @@ chances to miss. A block bootstrap says how far the coverage may lie from nomina
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.shown import brief
 
-__all__ = ["Scores", "block_bootstrap_error", "block_length", "score"]
+__all__ = ["Scores", "score"]
 
 
 @dataclass(frozen=True)
@@ -73,23 +72,22 @@ class Scores:
     def numbers(self) -> dict[str, object]:
         """What ``validation.NAME`` in summary.json has of them; null for what is no number."""
 
-        def by_level(values: dict[int, float]) -> dict[str, float]:
-            return {str(level): value for level, value in values.items()}
+        def by_level(values: dict[int, float] | None) -> dict[str, float] | None:
+            return None if values is None else {str(level): x for level, x in values.items()}
 
-        def by_kind(values: Mapping[str, dict[int, float] | None]) -> dict[str, object]:
-            return {k: None if levels is None else by_level(levels) for k, levels in values.items()}
+        def finite(value: float | None) -> float | None:
+            return value if value is not None and np.isfinite(value) else None
 
-        known = self.log_score is not None and np.isfinite(self.log_score)
         return {
-            "nrmse": self.nrmse if np.isfinite(self.nrmse) else None,
+            "nrmse": finite(self.nrmse),
             "nrmse_full": self.nrmse_full,
             "max_error_um": self.max_error_um,
-            "log_score": self.log_score if known else None,
+            "log_score": finite(self.log_score),
             "crps_um": self.crps_um,
             **{f"width_{level}_um": width for level, width in self.width_um.items()},
             **{f"interval_score_{level}_um": s for level, s in self.interval_score_um.items()},
-            "coverage": by_kind(self.coverage),
-            "coverage_error": by_kind(self.coverage_error),
+            "coverage": {kind: by_level(x) for kind, x in self.coverage.items()},
+            "coverage_error": {kind: by_level(x) for kind, x in self.coverage_error.items()},
             "worst_second": by_level(self.worst_second),
         }
 
@@ -121,29 +119,29 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
     measured = bands.measured[judged]
     residual = measured - bands.mean[judged]
     extent, rmse = float(np.ptp(measured)), float(np.sqrt(np.mean(residual**2)))
+    coverage: dict[str, dict[int, float] | None] = {}
+    error: dict[str, dict[int, float] | None] = {}
     targets: dict[Kind, FloatArray | None] = {
         "sensor": bands.measured,
         "displacement": bands.truth,
     }
-    coverage: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
-    error: dict[str, dict[int, float] | None] = dict.fromkeys(targets)
     for kind, values in targets.items():
-        if values is None:
-            continue
-        finite = np.isfinite(values)
-        finite[: bands.scored_from] = False
-        hits = {level: bands.covers(kind, level, values)[finite] for level in LEVELS}
-        coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
-        block = block_length((values - bands.mean)[finite])
-        error[kind] = _coverage_errors(hits, block, generator)
+        coverage[kind] = error[kind] = None
+        if values is not None:
+            known = np.isfinite(values)
+            known[: bands.scored_from] = False
+            hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
+            coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
+            block = _block_length((values - bands.mean)[known])
+            error[kind] = _coverage_errors(hits, block, generator)
     width, interval_score, worst = {}, {}, {}
+    scored = slice(bands.scored_from, None)
     for level in LEVELS:
         lower, upper = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
         distance = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
         width[level] = float(np.mean(upper - lower))
         interval_score[level] = float(np.mean(upper - lower + 2 / (1 - level / 100) * distance))
         inside = bands.covers("sensor", level, bands.measured)
-        scored = slice(bands.scored_from, None)
         worst[level] = _worst_second(inside[scored], judged[scored], bands.interval)
     return Scores(
         nrmse=rmse / extent if extent > 0 else np.nan,
@@ -159,37 +157,17 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
     )
 
 
-def block_bootstrap_error(
-    hits: BoolArray | FloatArray,
-    block: int,
-    generator: np.random.Generator,
-    replicates: int = 2000,
+def _bootstrap_error(
+    hits: BoolArray, block: int, generator: np.random.Generator, replicates: int = 2000
 ) -> float:
     """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
 
     The series is closed to a ring, whole blocks are drawn from it with replacement until they
-    make up its length, and the standard deviation of their means is taken over replicates. Means
-    of blocks scatter around the mean of the series, not around the unknown one, which loses the
-    share block / samples of the variance; it is given back.
+    make up its length, and the standard deviation of their means is taken over replicates (2000
+    leave 2 % of chance in it). Means of blocks scatter around the mean of the series, not around
+    the unknown one, which loses the share block / samples of the variance; it is given back. Zero
+    if all hits are equal, since then the series shows no variance.
 
-    Parameters
-    ----------
-    hits
-        (samples,) whether the band holds the value; or any other series.
-    block
-        Samples in a block, see `block_length`; kept between 1/500 and a quarter of all samples.
-    generator
-        Draws the blocks.
-    replicates
-        Series drawn; 2000 leave 2 % of chance in the error.
-
-    Returns
-    -------
-    float
-        Standard error; 0 if all hits are equal, since then the series shows no variance.
-
-    Notes
-    -----
     D. N. Politis and J. P. Romano, A circular block-resampling procedure for stationary data,
     in Exploring the Limits of Bootstrap, Wiley 1992, 263-270.
     """
@@ -206,18 +184,12 @@ def block_bootstrap_error(
     return float(np.sqrt(variance / (1 - block / samples)))
 
 
-def block_length(residual: FloatArray) -> int:
+def _block_length(residual: FloatArray) -> int:
     """Choose the samples in a block of the bootstrap: three integrated autocorrelation times.
 
-    The time is the residual's, estimated with Sokal's window. A hit depends on the residual's
-    size, not on its sign, and the square of a Gaussian series forgets twice as fast as the
-    series, so that a block is at least six times as long as the hits' own time. 1 for a residual
-    that does not vary.
-
-    Parameters
-    ----------
-    residual
-        (samples,) value minus the mean of its band.
+    Of the residual (samples,), with Sokal's window. A hit depends on the residual's size, not on
+    its sign, and the square of a Gaussian series forgets twice as fast as the series, so that a
+    block is at least six times as long as the hits' own time.
     """
     time = autocorrelation_time(residual[np.newaxis])
     return max(1, round(3 * time)) if np.isfinite(time) else 1
@@ -233,7 +205,7 @@ def _coverage_errors(
     the squared error; another level's error is at least that of m hits at Jeffreys' estimate
     (m p + 1/2) / (m + 1) of its coverage.
     """
-    errors = {level: block_bootstrap_error(hit, block, generator) for level, hit in hits.items()}
+    errors = {level: _bootstrap_error(hit, block, generator) for level, hit in hits.items()}
     covered = {level: float(hit.mean()) for level, hit in hits.items()}
     nearest = min(covered, key=lambda level: abs(covered[level] - 0.5))
     p = covered[nearest]
