@@ -22,7 +22,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Values
 from bwbayes.model.distributions import Distribution
 
-__all__ = ["around", "conflicts", "effective"]
+__all__ = ["around", "conflicts", "effective", "normal_scores"]
 
 # Draws that stand for a prior, or for a Gaussian posterior.
 DRAWS = 4000
@@ -45,6 +45,14 @@ def around(prior: JointPrior, point: PointFit, generator: np.random.Generator) -
     moves = generator.standard_normal((DRAWS, point.mode.size)) @ spread.T
     free, density = prior.constrain(point.mode + moves)
     return free[np.isfinite(density)]
+
+
+def normal_scores(parameter: Parameter, values: FloatArray) -> FloatArray:
+    """Return the normal scores of draws (draws,) under a parameter's own prior."""
+    assert parameter.prior is not None
+    low, high = (np.asarray(end) for end in parameter.support)
+    # Beyond 37 there is no probability that a float can hold.
+    return np.clip(parameter.prior.to_normal(values, low, high), -37.0, 37.0)
 
 
 def conflicts(
@@ -101,9 +109,7 @@ def _disagreement(
 ) -> Finding | None:
     """Find that the posterior's mean lies more than three sds from a parameter's prior."""
     assert parameter.prior is not None
-    low, high = (np.asarray(end) for end in parameter.support)
-    scores = np.clip(parameter.prior.to_normal(values, low, high), -37, 37)
-    score = float(np.mean(scores))
+    score = float(np.mean(normal_scores(parameter, values)))
     if abs(score) <= 3:
         return None
     side = "above" if score > 0 else "below"
@@ -111,9 +117,11 @@ def _disagreement(
         f"posterior mean {np.mean(values):.3g} {parameter.unit} is {abs(score):.1f} SD {side} its "
         f"prior {parameter.prior}"
     )
-    wider = parameter.prior if default is None or parameter.prior == default else default
-    if wider is parameter.prior:
-        wider = _widened(wider)
+    wider = default or parameter.prior
+    if wider == parameter.prior:
+        widths = ("sd", "sigma", "scale")
+        double = {k: 2 * v if k in widths else v for k, v in wider.arguments.items()}
+        wider = Distribution(wider.name, double)
     line = _line(parameter.name, wider)
     fix = f"check the units of prior and record; if both are right, give {line}"
     return Finding(parameter.name, text, fix)
@@ -168,21 +176,10 @@ def _near(gap: FloatArray) -> bool:
 
 
 def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
-    configured = parameter.lower if side == "lower" else parameter.upper
-    assert parameter.prior is not None
     fix = f"move parameters.{parameter.name}.{side}"
-    if configured != bound:
+    if bound not in (parameter.lower, parameter.upper):
         fix = f"widen its prior {parameter.prior}, which ends there"
     return Finding(parameter.name, f"lies on its {side} bound {bound:.4g} {parameter.unit}", fix)
-
-
-def _widened(distribution: Distribution) -> Distribution:
-    """Return a prior twice as wide, if it has a width by name."""
-    wider = {
-        key: 2 * value if key in ("sd", "sigma", "scale") else value
-        for key, value in distribution.arguments.items()
-    }
-    return Distribution(distribution.name, wider)
 
 
 def _line(name: str, distribution: Distribution) -> str:

@@ -2,24 +2,19 @@
 
 A joint fit takes its records for those of one actuator. If one of them was measured with another
 gain or another mounting, the joint posterior lies between them and fits none. So each record is
-fitted alone, by a point fit with the joint fit's noise, and two things are compared with the joint
-one: its residuals, and where the shared parameters of the actuator are.
-
-With m and C mean and covariance of its parameters given all records, m_r and C_r given record r
-alone, and ℓ its log likelihood,
+fitted alone, by a point fit with the joint fit's noise. With m and C mean and covariance of its
+parameters given all records, m_r and C_r given record r alone, and ℓ its log likelihood,
 
     D = 2 [ℓ(m_r) − ℓ(m) + ∇ℓ(m_r)ᵀ (m − m_r)]
 
 is what the joint fit costs the record, less what the prior at m_r has cost it already. Were all
 normal, D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
-If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C): the
-covariance of a mean learned from more is larger by what the posterior's is smaller (the law of
+If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C) (the law of
 total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
-A (C_r − C): what the record does not tell, or tells alone, has no weight. That sum is nearly a
-multiple of a χ² variable, with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946;
-at p = 1e-3 off by less than a factor of two). With (m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in
-Hausman's test, a bent posterior would pass for a disagreement: D is a difference of likelihoods, in
-whatever coordinates.
+A (C_r − C), nearly a multiple of a χ² variable with its mean and variance (Satterthwaite,
+Biometrics Bulletin 2, 1946; at p = 1e-3 off by less than a factor of two). With
+(m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in Hausman's test, a bent posterior would pass for a
+disagreement: D is a difference of likelihoods, in whatever coordinates.
 
 Another noise shows elsewhere: the innovations of a record at the joint mode have a root mean square
 of 1 if the noise that the records share is its own.
@@ -46,9 +41,6 @@ __all__ = ["Agreement", "agreements", "disagreements"]
 
 # Probability of a false alarm for a record.
 ALARM = 1e-3
-
-# Step along m − m_r for the prior's slope there, as a part of it.
-STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -146,13 +138,16 @@ def agreements(
         own_free, _ = with_noise.prior.constrain(own.mode[np.newaxis])
         series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
         own_residual = innovations(with_noise, own_free[0]).residual
-        # Residuals are kept for pictures, some 2,000 of them.
+        joint_um, own_um, size = (
+            float(np.sqrt(np.mean(x**2))) for x in (series.residual, own_residual, series.white)
+        )
+        # Residuals are for pictures, some 2,000 of them.
         step = slice(None, None, -(-series.time.size // 2000))
         compared[name] = Agreement(
-            float(np.sqrt(np.mean(series.residual**2))),
-            float(np.sqrt(np.mean(own_residual**2))),
+            joint_um,
+            own_um,
             *_distance(posterior, point, with_noise, own),
-            float(np.sqrt(np.mean(series.white**2))),
+            size,
             series.time.size,
             series.time[step],
             series.residual[step],
@@ -204,12 +199,13 @@ def _distance(
 
 def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
     """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
-    step = STEP * (joint - coordinates)
+    part = 1e-3
+    step = part * (joint - coordinates)
     places = np.stack([coordinates, joint, coordinates + step, coordinates - step])
     _, log_prior = alone.prior.constrain(places)
     log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
     # At the mode, the likelihood's slope is the prior's turned round.
-    slope = (log_prior[3] - log_prior[2]) / (2 * STEP)
+    slope = (log_prior[3] - log_prior[2]) / (2 * part)
     return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
 
 

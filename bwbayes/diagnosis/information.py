@@ -3,8 +3,7 @@
 The contraction 1 − (posterior sd / prior sd)² is near one where the record decided and near zero
 where it told nothing. Scaling the power of the prior, or of the likelihood, by a little shows which
 of them a posterior hangs on: one that moves with the prior and not with the likelihood is what was
-put in. Together with the combinations of parameters that stayed widest this is what a user should
-know before quoting a single parameter.
+put in.
 """
 
 # mypy: allow-untyped-calls
@@ -19,18 +18,13 @@ import numpy as np
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.conflict import normal_scores
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.identifiability import LEFT_OPEN, combined, percent
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.shown import brief
 
 __all__ = ["Combination", "Learned", "Taught", "learned"]
-
-# Draws of the prior, and of the posterior, that are looked at.
-DRAWS = 4000
-
-# Sensitivities above this are not small (Kallioinen and others, section 4).
-SENSITIVE = 0.05
 
 
 @dataclass(frozen=True)
@@ -49,7 +43,18 @@ class Taught:
     @property
     def prior_decides(self) -> bool:
         """Whether it moves with the prior, and not with the likelihood."""
-        return self.prior >= SENSITIVE > self.likelihood
+        small = 0.05  # Kallioinen and others, section 4
+        return self.prior >= small > self.likelihood
+
+    @property
+    def numbers(self) -> dict[str, float | bool]:
+        """What ``summary.json`` has of it."""
+        return {
+            "contraction": self.contraction,
+            "prior_sensitivity": self.prior,
+            "likelihood_sensitivity": self.likelihood,
+            "prior_decides": self.prior_decides,
+        }
 
 
 @dataclass(frozen=True)
@@ -92,15 +97,7 @@ class Learned:
     def numbers(self) -> dict[str, object]:
         """What ``summary.json`` has of it, as ``identifiability``."""
         return {
-            "parameters": {
-                name: {
-                    "contraction": taught.contraction,
-                    "prior_sensitivity": taught.prior,
-                    "likelihood_sensitivity": taught.likelihood,
-                    "prior_decides": taught.prior_decides,
-                }
-                for name, taught in self.parameters.items()
-            },
+            "parameters": {name: taught.numbers for name, taught in self.parameters.items()},
             "combinations": [asdict(combination) for combination in self.combinations],
             "findings": [str(finding) for finding in self.findings],
         }
@@ -111,6 +108,7 @@ def learned(
     draws: FloatArray,
     log_density: FloatArray,
     generator: np.random.Generator,
+    count: int = 4000,
 ) -> Learned:
     """Hold the posterior against the prior.
 
@@ -124,17 +122,21 @@ def learned(
         (steps, ensembles, walkers), nats, as the chain has it: in its coordinates.
     generator
         Draws from the prior.
+    count
+        Draws of the prior, and of the posterior, that are looked at.
 
     Notes
     -----
     N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
-    step = max(log_density.size // DRAWS, 1)
+    step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
     log_likelihood = log_density.ravel()[::step] - prior.constrain(prior.unconstrain(thin))[1]
-    after = _scores(prior, thin)
-    before = _scores(prior, prior.draw(generator, DRAWS))
+    before, after = (
+        np.stack([normal_scores(*pair) for pair in zip(prior.free, every.T, strict=True)], axis=1)
+        for every in (prior.draw(generator, count), thin)
+    )
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
     sensitivities = _sensitivities(prior, thin, log_likelihood)
     parameters = {
@@ -142,17 +144,6 @@ def learned(
         for i, name in enumerate(prior.free_names)
     }
     return Learned(parameters, tuple(_combinations(prior.free_names, before, after)))
-
-
-def _scores(prior: JointPrior, free: FloatArray) -> FloatArray:
-    """Return normal scores of draws (draws, free) under each parameter's own prior."""
-    columns = []
-    for parameter, column in zip(prior.free, free.T, strict=True):
-        assert parameter.prior is not None
-        low, high = (np.asarray(end) for end in parameter.support)
-        columns.append(parameter.prior.to_normal(column, low, high))
-    # Beyond 37 there is no probability that a float can hold.
-    return np.clip(np.stack(columns, axis=1), -37.0, 37.0)
 
 
 def _sensitivities(
