@@ -51,32 +51,23 @@ def beyond_training(
     window
         The samples that are predicted; those before are what the actuator went through.
     """
+    windows = [data.voltage[part] for data in posterior.datasets for part in data.training]
+    span = min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
+    turn_times = [
+        time_between_turns(data.voltage, data.actuator.interval, data.training)
+        for data in posterior.datasets
+    ]
     findings = [
-        _range(posterior, voltage[window]),
-        _speed(posterior, voltage[window], interval),
-        _slow(posterior, voltage, interval, window),
+        _range(span, voltage[window]),
+        _speed(posterior, turn_times, voltage[window], interval),
+        _slow(posterior, span, min(turn_times), voltage, interval, window),
         _duration(posterior, voltage[: window.stop].size * interval),
     ]
     return [finding for finding in findings if finding is not None]
 
 
-def _fitted_range(posterior: Posterior) -> tuple[float, float]:
-    windows = [
-        dataset.voltage[window] for dataset in posterior.datasets for window in dataset.training
-    ]
-    return min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
-
-
-def _turn_times(posterior: Posterior) -> list[float]:
-    """Return the typical time between turning points in each record that was fitted, s."""
-    return [
-        time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
-        for dataset in posterior.datasets
-    ]
-
-
-def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
-    low, high = _fitted_range(posterior)
+def _range(span: tuple[float, float], voltage: FloatArray) -> Finding | None:
+    low, high = span
     slack = 0.02 * (high - low)  # a sensor's noise
     if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
         return None
@@ -88,9 +79,11 @@ def _range(posterior: Posterior, voltage: FloatArray) -> Finding | None:
     )
 
 
-def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Finding | None:
+def _speed(
+    posterior: Posterior, turn_times: Sequence[float], voltage: FloatArray, interval: float
+) -> Finding | None:
     turn_time, speeds = time_between_turns(voltage, interval), []
-    for dataset, fitted_turn_time in zip(posterior.datasets, _turn_times(posterior), strict=True):
+    for dataset, fitted_turn_time in zip(posterior.datasets, turn_times, strict=True):
         over = PART * min(fitted_turn_time, turn_time)
         fitted = fastest(dataset.voltage, dataset.actuator.interval, over, dataset.training)
         speeds.append((fastest(voltage, interval, over), fitted))
@@ -108,29 +101,33 @@ def _speed(posterior: Posterior, voltage: FloatArray, interval: float) -> Findin
 
 
 def _slow(
-    posterior: Posterior, voltage: FloatArray, interval: float, window: slice
+    posterior: Posterior,
+    span: tuple[float, float],
+    turn_time: float,
+    voltage: FloatArray,
+    interval: float,
+    window: slice,
 ) -> Finding | None:
     """Hold the voltage's means over some times T against those of training.
 
     Creep with the time T follows the mean over T. The creep that training does not show is as large
     as ∫ (mean now − mean then) d log T, where means go beyond those of training.
     """
-    low, high = _fitted_range(posterior)
+    low, high = span
     a_decade, sides = 8, np.array([[-1.0], [1.0]])  # times, and where a mean may go
     # What is beyond the range is said by itself.
     inside = np.clip(voltage[: window.stop], low, high)
-    longest, shortest = inside.size * interval, PART * min(_turn_times(posterior))
-    decades = max(math.log10(longest / shortest), 0.0)
+    longest = inside.size * interval
+    decades = max(math.log10(longest / (PART * turn_time)), 0.0)
     times = longest / 10 ** (np.arange(1 + math.ceil(a_decade * decades)) / a_decade)
     planned = _slow_means(inside, interval, times, [window])
     fitted = [
-        _slow_means(dataset.voltage, dataset.actuator.interval, times, dataset.training)
+        sides * _slow_means(dataset.voltage, dataset.actuator.interval, times, dataset.training)
         for dataset in posterior.datasets
     ]
-    now, before = sides * planned, np.max([sides * _filled(means) for means in fitted], axis=0)
     # A mean over a longer time is that over a shorter one somewhere.
-    before = np.maximum.accumulate(before, axis=1)
-    excess = np.maximum(np.nan_to_num(now - before), 0.0)
+    before = np.maximum.accumulate(np.max(fitted, axis=0), axis=1)
+    excess = np.maximum(sides * planned - before, 0.0)
     # In volts times decades of time; a sine over the whole range has half the range to either side.
     unknown = np.sum(excess, axis=1) / a_decade
     if unknown.max() <= math.log10(LONGER) * (high - low) / 2:
@@ -144,13 +141,6 @@ def _slow(
         "; the bands extrapolate, with slow creep at its prior",
         "train on a record that is as slow, or is held as long",
     )
-
-
-def _filled(means: FloatArray) -> FloatArray:
-    """Replace each nan of (sides, times) by the first number after it: that of the next time."""
-    finite = np.flatnonzero(np.isfinite(means[0]))
-    filled: FloatArray = means[:, finite[np.searchsorted(finite, np.arange(means.shape[1]))]]
-    return filled
 
 
 def _duration(posterior: Posterior, duration: float) -> Finding | None:
@@ -173,17 +163,17 @@ def _slow_means(
     """Return the lowest and the highest mean voltage over some times, (2, times), V.
 
     The mean over the time T before a sample is what creep with that time follows, of all samples in
-    the windows that have so much before them; nan, if none has.
+    the windows; over all that is before a window's end, where that is shorter.
     """
     spans = [window.indices(voltage.size)[:2] for window in windows]
     total = np.concatenate([[0.0], np.cumsum(voltage[: spans[-1][1]])])
-    extremes = np.full((2, times.size), np.nan)
-    for i, length in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
+    extremes = np.tile([[np.inf], [-np.inf]], times.size)
+    for i, samples in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
         for start, stop in spans:
+            length = min(samples, stop)
             # Means over many samples change slowly: the last one, and one in a fiftieth of them.
             ends = np.arange(stop, max(start, length - 1), -max(length // 50, 1))
-            if ends.size:
-                means = (total[ends] - total[ends - length]) / length
-                extremes[0, i] = np.fmin(extremes[0, i], means.min())
-                extremes[1, i] = np.fmax(extremes[1, i], means.max())
+            means = (total[ends] - total[ends - length]) / length
+            extremes[0, i] = min(extremes[0, i], means.min())
+            extremes[1, i] = max(extremes[1, i], means.max())
     return extremes
