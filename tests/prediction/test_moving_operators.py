@@ -4,8 +4,8 @@ As in :mod:`tests.prediction.test_moving`, with the virtual stand's true values 
 the parameters are the true ones, so all that a band can get wrong is the start. The drive's
 amplitude goes up and down before the record and in it, which leaves operators with a memory of
 extrema in states that no sweep through the whole range leaves. Mean coverages are held to the
-spread between records; a t-value beyond four standard errors has a probability of 1 in 3,000 with
-40 records.
+spread between records; a t-value beyond four standard errors has a probability of 1 in 1,300 with
+20 records.
 
 A twin takes all earlier drives for as large as the range of voltages: then the 95 % band of the
 operators with such a memory covers some 85 %, and the test fails.
@@ -41,7 +41,7 @@ from tests.prediction.moving import (
     widening,
 )
 
-QUICK = 40
+QUICK = 20
 QUICK_LIMIT = 4.0
 # Of those that remember extrema the quicker one.
 FEW = ("preisach", pytest.param("duhem", marks=pytest.mark.slow))
@@ -71,14 +71,8 @@ def test_bands_cover_records_cut_from_a_running_drive(name: str) -> None:
 @pytest.mark.slow
 def test_twin_earlier_drives_taken_for_as_large_as_the_range_do_not_cover_them() -> None:
     with patch.object(RemembersExtrema, "earlier", Operator.earlier):
-        every = studied(Case(hysteresis="preisach"), QUICK, seed=1)
+        every = studied(Case(hysteresis="preisach"), 2 * QUICK, seed=1)
     assert np.mean(covered(every, 95)) < LEAST
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FEW)
-def test_not_knowing_that_a_record_starts_from_rest_costs_little(name: str) -> None:
-    assert widening(Case(hysteresis=name, discrepancy=1.5), 5) < 1.1
 
 
 @pytest.mark.slow

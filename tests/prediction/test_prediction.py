@@ -11,17 +11,15 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.distributions import Distribution
 from bwbayes.prediction import prediction
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import Started, started
 from bwbayes.prediction.prediction import Start, predict_record, predict_windows
 from bwbayes.record.record import Record
+from tests.inference.problems import posterior_of
 from tests.prediction.process import process
 from tests.prediction.running import left_by_running_drives
 
@@ -65,24 +63,17 @@ def record() -> Record:
 
 @pytest.fixture(scope="module")
 def posterior(record: Record) -> Posterior:
-    actuator, noise = Actuator("lag", "first", INTERVAL), DiscrepancyNoise(INTERVAL)
-    wide = Distribution("normal", {"mean": 0.0, "sd": 10.0})
-    broad = Distribution("lognormal", {"median": 0.1, "sigma": 2.0})
-    parameters = [
-        Parameter(
-            name,
-            "",
-            name,
-            "",
-            prior=None if name == "exponent" else wide if value == 0 or name == "offset" else broad,
-            fixed=1.0 if name == "exponent" else None,
-        )
-        for name, value in TRUTH.items()
-    ]
     assert record.displacement is not None
-    windows = (slice(0, 600),)
-    one = Dataset(record.voltage, record.displacement, windows, actuator, noise, from_rest=True)
-    return Posterior((one,), JointPrior(parameters))
+    actuator = Actuator("lag", "first", INTERVAL)
+    whole = posterior_of(
+        record.voltage,
+        record.displacement,
+        actuator,
+        "discrepancy",
+        {"exponent": 1.0},
+        from_rest=True,
+    )
+    return whole.altered(training=(slice(0, 600),))
 
 
 @pytest.fixture(scope="module")
