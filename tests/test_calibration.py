@@ -39,7 +39,6 @@ from bwbayes.inference.posterior import Posterior
 from tests.measured import keep
 from tests.together import (
     LEVEL,
-    Plant,
     errors_off,
     narrowed,
     narrowed_a_tenth,
@@ -53,8 +52,6 @@ SEED = 1
 FEW = 10
 
 FULL = 500
-
-EVERY_SAMPLE = slice(None)
 
 
 def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
@@ -77,44 +74,11 @@ def judged(outcome: list[Replicate]) -> Calibration:
     return judge([one.entry for one in outcome], np.random.default_rng(SEED))
 
 
-# The sound calibration, and defects that are planted on its draws
-
-
-@pytest.fixture(scope="module")
-def sound() -> list[Replicate]:
-    return made(experiment(problem()), FULL, SEED + 1)
-
-
-@pytest.fixture(scope="module")
-def prior() -> JointPrior:
-    return problem().posterior.prior
-
-
 @pytest.mark.slow
-def test_calibration_passes(sound: list[Replicate]) -> None:
-    outcome = judged(sound)
-    assert () == outcome.shortcomings
-    assert () == outcome.unconverged
-
-
-@pytest.mark.slow
-def test_parameters_together_are_calibrated(sound: list[Replicate], prior: JointPrior) -> None:
-    assert together_test(sound, prior) > LEVEL
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("defect", [narrowed, widened, shifted])
-def test_twin_planted_defect_is_found(
-    sound: list[Replicate], prior: JointPrior, defect: Plant
-) -> None:
-    assert together_test(sound, prior, defect) < LEVEL
-
-
-@pytest.mark.slow
-def test_five_hundred_replicates_find_small_defects(
-    sound: list[Replicate], prior: JointPrior
-) -> None:
-    outcome = judged(sound)
+def test_five_hundred_replicates_pass_and_find_small_defects() -> None:
+    common = experiment(problem())
+    sound, prior = made(common, FULL, SEED + 1), common.posterior.prior
+    outcome, off = judged(sound), errors_off(sound)
     keep(
         "calibration",
         {
@@ -126,15 +90,13 @@ def test_five_hundred_replicates_find_small_defects(
             "bands": {name: round(band.mean, 4) for name, band in outcome.bands.items()},
         },
     )
+    assert () == outcome.shortcomings
+    assert () == outcome.unconverged
     assert outcome.power["20 % too small"] > 0.98
-    assert together_test(sound, prior, narrowed_a_tenth) < LEVEL
-
-
-@pytest.mark.slow
-def test_bands_cover_held_out_samples_with_parameters_from_the_prior(
-    sound: list[Replicate],
-) -> None:
-    assert {} == {name: off for name, off in errors_off(sound).items() if not abs(off) < LIMIT}
+    assert {} == {name: errors for name, errors in off.items() if not abs(errors) < LIMIT}
+    assert together_test(sound, prior) > LEVEL
+    for defect in (narrowed, narrowed_a_tenth, widened, shifted):
+        assert together_test(sound, prior, defect) < LEVEL, defect.__name__
 
 
 # Defects that are planted in the likelihood or the prior
@@ -182,7 +144,7 @@ class Swapped(Posterior):
     def simulate(
         self,
         theta: FloatArray,
-        rows: IntArray | slice = EVERY_SAMPLE,
+        rows: IntArray | slice = slice(None),  # as the posterior has it
         record: str | None = None,
     ) -> FloatArray:
         """Displacement of the model with the wrong sign."""
