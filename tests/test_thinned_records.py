@@ -33,6 +33,7 @@ from scipy import linalg, stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import defaults
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.prediction import predict_windows
 from bwbayes.record import Record, write_record
@@ -125,12 +126,6 @@ def apart(one: Answer, other: Answer) -> dict[str, float]:
     return {n: abs(one[n].mean - other[n].mean) / max(one[n].sd, other[n].sd) for n in one}
 
 
-def off(one: Answer) -> dict[str, float]:
-    """Return how many sds an answer is from the truth."""
-    log = {n: v if n in PLAIN else float(np.log(v)) for n, v in TRUTH.items()}
-    return {n: abs(one[n].mean - v) / one[n].sd for n, v in log.items()}
-
-
 def variances(lag: float, every: int) -> dict[str, float]:
     """Return the posterior variances that a part of the samples leaves, by Fisher's information."""
     return of_simulation(lag, every / RATE) | of_noise(every / RATE)
@@ -157,22 +152,12 @@ def slopes(lag: float, interval: float) -> dict[str, FloatArray]:
 def of_simulation(lag: float, interval: float) -> dict[str, float]:
     """Return variances of the simulation's parameters at the truth.
 
-    The inverse of DᵀC⁻¹D, with the derivatives D and the noise's covariance C = σ²R + s²I, where
-    Q = R⁻¹ has three diagonals: C⁻¹ = Q (σ²I + s²Q)⁻¹.
+    The inverse of DᵀC⁻¹D, with the derivatives D and the noise's covariance C.
     """
     moves = slopes(lag, interval)
-    derivatives = np.column_stack(list(moves.values()))
-    kept = np.exp(-interval / TRUTH["discrepancy_time"])
-    beside = np.full(len(derivatives), -kept / (1 - kept**2))
-    middle = np.full(len(derivatives), (1 + kept**2) / (1 - kept**2))
-    middle[[0, -1]] = 1 / (1 - kept**2)
-    both = SENSOR**2 * np.stack([beside, middle, beside])
-    both[1] += TRUTH["discrepancy_sd"] ** 2
-    solved = linalg.solve_banded((1, 1), both, derivatives)
-    precise = middle[:, np.newaxis] * solved
-    precise[1:] += beside[0] * solved[:-1]
-    precise[:-1] += beside[0] * solved[1:]
-    told = derivatives.T @ precise
+    noise = np.array([[SENSOR, TRUTH["discrepancy_sd"], TRUTH["discrepancy_time"]]])
+    white = DiscrepancyNoise(interval).whiten(noise, np.stack([*moves.values()])[np.newaxis])[0][0]
+    told = white @ white.T
     told[-1, -1] += START_SD**-2
     return dict(zip(moves, np.diag(linalg.inv(told)), strict=True))
 
