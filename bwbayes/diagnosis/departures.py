@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy.special import betainc
+from scipy.special import betainc, ndtr, ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.reversals import rate
@@ -137,17 +137,19 @@ class Standardized:
         """Find levels at which fewer readings lie in the sensor band than stated."""
         assert self.bands.measured is not None
         # Factors on the noise's sd, evenly probable, that the fit allows.
-        chance = (np.arange(200) + 0.5) / 200
-        scales = np.sqrt(self.noise_size / scipy.stats.chi2.ppf(chance, self.noise_size))
+        scales = np.empty(0)
         for level in reversed(LEVELS):
             hits = self.bands.covers("sensor", level, self.bands.measured)[self.judged]
             covered, nominal = float(np.mean(hits)), level / 100
             odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
             if odds >= 1 / ODDS:
                 continue
+            if not scales.size:
+                chance = (np.arange(200) + 0.5) / 200
+                scales = np.sqrt(self.noise_size / scipy.stats.chi2.ppf(chance, self.noise_size))
             # The binomial distribution function, for a number of readings that is not whole.
             inside = covered * self.square_size
-            outside = 2 * scipy.stats.norm.sf(scipy.stats.norm.isf((1 - nominal) / 2) / scales)
+            outside = 2 * ndtr(ndtri((1 - nominal) / 2) / scales)
             chances = betainc(self.square_size - inside, inside + 1, outside)
             text = f"the {level}% sensor band covers {percent(covered)} of readings"
             yield text, float(np.mean(chances))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
@@ -64,7 +64,7 @@ def made(
 def bands_of(record: Made, spoilt: FloatArray | float = 0.0, *, training: bool = False) -> Bands:
     """Return the bands of a record whose readings have ``spoilt`` (samples,) um added."""
     half = {
-        (kind, level): norm.ppf(0.5 + level / 200) * record.sds[kind]
+        (kind, level): ndtri(0.5 + level / 200) * record.sds[kind]
         for kind in KINDS
         for level in LEVELS
     }
@@ -78,7 +78,7 @@ def bands_of(record: Made, spoilt: FloatArray | float = 0.0, *, training: bool =
         mean=record.mean,
         lower={key: record.mean - width for key, width in half.items()},
         upper={key: record.mean + width for key, width in half.items()},
-        pit=norm.cdf((measured - record.mean) / record.sds["sensor"]),
+        pit=ndtr((measured - record.mean) / record.sds["sensor"]),
         crps=np.abs(measured - record.mean),
         interval=float(record.time[1] - record.time[0]),
         training=training,
