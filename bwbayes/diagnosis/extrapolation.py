@@ -121,13 +121,16 @@ def _slow(
     decades = max(math.log10(longest / (PART * turn_time)), 0.0)
     times = longest / 10 ** (np.arange(1 + math.ceil(a_decade * decades)) / a_decade)
     planned = _slow_means(inside, interval, times, [window])
-    fitted = [
-        sides * _slow_means(dataset.voltage, dataset.actuator.interval, times, dataset.training)
-        for dataset in posterior.datasets
-    ]
+    fitted = []
+    for dataset in posterior.datasets:
+        interval = dataset.actuator.interval
+        means = sides * _slow_means(dataset.voltage, interval, times, dataset.training)
+        # What is longer than the record is taken for the longest time that is not.
+        finite = np.flatnonzero(np.isfinite(means[0]))
+        fitted.append(means[:, finite[np.searchsorted(finite, np.arange(times.size))]])
     # A mean over a longer time is that over a shorter one somewhere.
     before = np.maximum.accumulate(np.max(fitted, axis=0), axis=1)
-    excess = np.maximum(sides * planned - before, 0.0)
+    excess = np.maximum(np.nan_to_num(sides * planned - before), 0.0)
     # In volts times decades of time; a sine over the whole range has half the range to either side.
     unknown = np.sum(excess, axis=1) / a_decade
     if unknown.max() <= math.log10(LONGER) * (high - low) / 2:
@@ -163,17 +166,17 @@ def _slow_means(
     """Return the lowest and the highest mean voltage over some times, (2, times), V.
 
     The mean over the time T before a sample is what creep with that time follows, of all samples in
-    the windows; over all that is before a window's end, where that is shorter.
+    the windows that have so much before them; nan, if none has.
     """
     spans = [window.indices(voltage.size)[:2] for window in windows]
     total = np.concatenate([[0.0], np.cumsum(voltage[: spans[-1][1]])])
-    extremes = np.tile([[np.inf], [-np.inf]], times.size)
-    for i, samples in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
+    extremes = np.full((2, times.size), np.nan)
+    for i, length in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
         for start, stop in spans:
-            length = min(samples, stop)
             # Means over many samples change slowly: the last one, and one in a fiftieth of them.
             ends = np.arange(stop, max(start, length - 1), -max(length // 50, 1))
-            means = (total[ends] - total[ends - length]) / length
-            extremes[0, i] = min(extremes[0, i], means.min())
-            extremes[1, i] = max(extremes[1, i], means.max())
+            if ends.size:
+                means = (total[ends] - total[ends - length]) / length
+                extremes[0, i] = np.fmin(extremes[0, i], means.min())
+                extremes[1, i] = np.fmax(extremes[1, i], means.max())
     return extremes
