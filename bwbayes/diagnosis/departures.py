@@ -37,9 +37,8 @@ class Standardized:
     ``z`` (readings,) are residuals over the sensor band's sd; ``mean_size`` and ``square_size`` are
     how many independent readings the record is worth to the mean of z and to that of z².
     ``varying`` is z about its mean, scaled to a variance of one, worth ``varying_size`` readings to
-    that of its square; ``common`` is the part of the band's variance that is one and the same for
-    all readings, such as an offset's. ``noise_log_sd`` is the sd of the logarithm of the noise's
-    sd.
+    that of its square; ``common`` is the part of the band's variance that all readings share, such
+    as an offset's. ``noise_log_sd`` is the sd of the logarithm of the noise's sd.
     """
 
     bands: Bands

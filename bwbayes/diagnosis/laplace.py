@@ -51,11 +51,10 @@ NONE = Effect(lambda simulate, voltage, _: simulate(voltage), np.zeros((1, 0)))
 
 @dataclass(frozen=True)
 class LocalFit:
-    """A mode of a posterior of one record, with an effect's sizes behind its coordinates.
+    """A mode of a posterior of one record: ``coordinates`` (free + sizes,), an effect's sizes last.
 
-    ``coordinates`` (free + sizes,); ``log_evidence`` and ``log_density`` in nats; ``covariance``
-    (free + sizes, free + sizes) has no correlation of noise and physical parameters;
-    ``displacement`` (readings,) um.
+    ``log_evidence`` and ``log_density`` in nats; ``covariance`` (free + sizes, free + sizes) has no
+    correlation of noise and physical parameters; ``displacement`` (readings,) um.
     """
 
     posterior: Posterior

@@ -90,11 +90,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Traced:
-    """A steady loop of some models.
+    """A steady loop of some models: displacements ``rising`` and ``falling`` (models, points), um.
 
-    ``voltage`` (points,) rises from the lowest to the highest, V; ``rising`` and ``falling``
-    (models, points) are the displacements at these voltages on the way up and on the way down, um;
-    ``closed`` says whether the last cycle was as the one before.
+    ``voltage`` (points,) rises, V; ``closed`` says whether the last cycle was as the one before.
     """
 
     voltage: FloatArray
@@ -172,16 +170,9 @@ class Loops:
 
 
 def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS) -> Loops:
-    """Measure the loops of every draw.
+    """Measure the loops of every draw (draws, free), in the range of the records' voltages.
 
-    Parameters
-    ----------
-    posterior
-        The posterior that was sampled; its records' voltages give the range.
-    draws
-        (draws, free), parameters in their own units.
-    points
-        Voltages along each branch, an odd number.
+    ``points`` is the number of voltages along each branch.
 
     Raises
     ------
@@ -209,16 +200,9 @@ def steady_loop(
 ) -> Traced:
     """Drive models from the demagnetized state up and down until the loop closes.
 
-    Parameters
-    ----------
-    actuator
-        Its operator and gain; dynamics, creep and offset do not count.
-    column
-        Columns (models,) of the parameters, by name.
-    low, high
-        Where the voltage turns, V.
-    points
-        Voltages along each branch, an odd number.
+    Of the ``actuator`` operator and gain count alone; ``column`` has columns (models,) of its
+    parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points`` is the odd number
+    of voltages along a branch.
 
     Raises
     ------

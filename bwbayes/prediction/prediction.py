@@ -94,7 +94,7 @@ def predict_windows(
     windows
         Slices of its samples, by name: one, or several, which make one set of bands.
     generator
-        Draws the state of the dynamics at the record's start, where that is unknown.
+        Draws the state of the dynamics at the start, where that is unknown.
     watch
         Is called with a number of samples whenever so many more are done.
     """
@@ -129,16 +129,8 @@ def forecast(
     first, and as wide as ever later. Creep with a time longer than the record is known by its prior
     alone: the model needs times up to the forecast's length.
 
-    Parameters
-    ----------
-    posterior, draws, generator
-        As in :func:`predict_windows`.
-    record
-        The training record, whole.
-    voltage
-        (samples,), V, at the record's sampling interval.
-    name
-        Name of the bands.
+    Parameters are as in :func:`predict_windows`; ``voltage`` is (samples,), V, at the record's
+    sampling interval.
 
     Raises
     ------
@@ -171,7 +163,7 @@ def predict_record(
 
     Parameters
     ----------
-    posterior, draws
+    posterior, draws, watch
         As in :func:`predict_windows`.
     record
         The other record, at any sampling interval: the model lives in continuous time.
@@ -184,8 +176,6 @@ def predict_record(
     window
         Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
         its first sample in any case.
-    watch
-        Is called with a number of samples whenever so many more are done.
 
     Raises
     ------

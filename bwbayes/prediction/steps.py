@@ -115,14 +115,7 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
         100 (c(T) − c(0.1 s)) / (x_∞ + c(0.1 s)) / log₁₀(T / 0.1 s), with T the end of the step;
         None without creep, or if T is less than a second.
 
-    Parameters
-    ----------
-    posterior
-        The posterior that was sampled.
-    draws
-        (draws, free), parameters in their own units.
-    step
-        The step.
+    ``draws`` (draws, free) are parameters in their own units.
     """
     _, single, record_draws = next(posterior.each(draws))
     dataset = single.only

@@ -165,7 +165,7 @@ def test_the_lead_in_is_told_and_a_longer_one_tells_more(
     assert width(long).mean() < width(short).mean()
 
 
-@pytest.mark.parametrize("lead_in_from", [0.0, 2.0])
+@pytest.mark.parametrize("lead_in_from", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
 def test_offset_and_unrest_are_those_of_the_dense_normal_equations(
     posterior: Posterior, draws: FloatArray, lead_in_from: float
 ) -> None:
