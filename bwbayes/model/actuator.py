@@ -117,16 +117,8 @@ class Actuator:
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
-        drive = (*self.hysteresis.parameters, *self._added)
-        return (*drive, *self.filter.parameters, *self._crept, OFFSET)
-
-    @property
-    def _added(self) -> tuple[Declaration, ...]:
-        return self.gain.parameters if self.gain else ()
-
-    @property
-    def _crept(self) -> tuple[Declaration, ...]:
-        return self.creep.parameters if self.creep else ()
+        parts = (self.hysteresis, self.gain, self.filter, self.creep)
+        return (*(d for part in parts if part is not None for d in part.parameters), OFFSET)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -196,15 +188,13 @@ class Actuator:
         sections = self.sections(column)
         if state is None:
             memory = self.begin(column, path, from_rest=from_rest)
-            drives, hysteresis = self._drives(column, path, memory)
-            equilibrium = tuple(drive[:, 0].copy() for drive in drives)
-            filtered = sections.begin(unrest)
         else:
-            drives, hysteresis = self._drives(column, path, state.hysteresis)
-            equilibrium, filtered = (
-                state.rest,
-                tuple(filter_state.copy() for filter_state in state.filter),
-            )
+            memory = state.hysteresis
+        drives, hysteresis = self._drives(column, path, memory)
+        if state is None:
+            equilibrium, filtered = tuple(w[:, 0].copy() for w in drives), sections.begin(unrest)
+        else:
+            equilibrium, filtered = state.rest, tuple(carried.copy() for carried in state.filter)
         # The recursions see the drives' distance from rest, so that they start at zero exactly.
         for drive, before in zip(drives, equilibrium, strict=True):
             np.subtract(drive, before[:, np.newaxis], out=drive)
@@ -255,7 +245,9 @@ class Actuator:
         """Raise an InputError where a model is outside of the domain of a part."""
         self.hysteresis.check(column)
         self.filter.check(column)
-        check((*self._added, *self._crept, OFFSET), column, ("creep_growth",))
+        for part in (self.gain, self.creep):
+            check(part.parameters if part else (), column, ("creep_growth",))
+        check((OFFSET,), column)
 
     def sections(self, column: Values) -> Sections:
         """Return dynamics and creep of models given by the columns (models,) of θ."""

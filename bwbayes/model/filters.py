@@ -10,6 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
+
 from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
@@ -28,9 +30,10 @@ class Filter(ABC):
     def parameters(self) -> tuple[Declaration, ...]:
         """Its parameters."""
 
-    @abstractmethod
     def unknowns(self, hold: Hold) -> int:
         """Return how many numbers say in which state it is at a record's first sample."""
+        ones = {parameter.name: np.ones(1) for parameter in self.parameters}
+        return self.recursion(ones, 1, 1.0, hold).unknowns
 
     @abstractmethod
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:
@@ -49,10 +52,6 @@ class NoDynamics(Filter):
     """No dynamics, x = w: the displacement follows the drive at once, or with the hold."""
 
     parameters: tuple[Declaration, ...] = ()
-
-    def unknowns(self, hold: Hold) -> int:
-        """One if the drive is held: what the last sample held."""
-        return int(hold == "zero")
 
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # nothing to tell it
         """Return x = w; see :func:`~bwbayes.model.linear.no_dynamics`."""
@@ -75,10 +74,6 @@ class Lag(Filter):
         ),
     )
 
-    def unknowns(self, hold: Hold) -> int:  # noqa: ARG002  # with either
-        """One: how far the displacement is from rest."""
-        return 1
-
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the column has them
         """Return that of :func:`~bwbayes.model.linear.first_order_lag`."""
         return first_order_lag(column["lag"], interval, hold)
@@ -92,50 +87,27 @@ def _damping(context: Context) -> Distribution | None:
     return lognormal(LAG * context.ranges.time * stiffness, LAG_SIGMA)
 
 
-# A record shows at most the ratios of the three.
-RATIOS = "a record shows mass and stiffness only through the damping"
-
-
 @dataclass(frozen=True)
 class SecondOrder(Filter):
     """Equation (7) of the paper, (m/k) x″ + (b/k) x′ + x = w."""
 
-    parameters: tuple[Declaration, ...] = (
+    parameters: tuple[Declaration, ...] = tuple(
         Declaration(
-            "mass",
-            "kg",
-            r"m",
-            "effective mass",
-            lambda _: None,
+            name,
+            unit,
+            label,
+            description,
+            default,
             floor=0.0,
-            aliases=("m",),
-            without_default=RATIOS,
-        ),
-        Declaration(
-            "damping",
-            "N s/m",
-            r"b",
-            "effective damping",
-            _damping,
-            floor=0.0,
-            aliases=("b",),
-            without_default=RATIOS,
-        ),
-        Declaration(
-            "stiffness",
-            "N/m",
-            r"k",
-            "mechanical stiffness",
-            lambda _: None,
-            floor=0.0,
-            aliases=("k",),
-            without_default=RATIOS,
-        ),
+            aliases=(label,),
+            without_default="a record shows mass and stiffness only through the damping",
+        )
+        for name, unit, label, description, default in (
+            ("mass", "kg", "m", "effective mass", lambda _: None),
+            ("damping", "N s/m", "b", "effective damping", _damping),
+            ("stiffness", "N/m", "k", "mechanical stiffness", lambda _: None),
+        )
     )
-
-    def unknowns(self, hold: Hold) -> int:  # noqa: ARG002  # with either
-        """Two: how far the displacement is from rest, and how fast it moves."""
-        return 2
 
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the columns have them
         """Return that of :func:`~bwbayes.model.linear.second_order`."""

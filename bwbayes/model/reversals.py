@@ -21,7 +21,6 @@ __all__ = [
     "fastest",
     "monotone_stretches",
     "rate",
-    "stretch_times",
     "time_between_turns",
     "turning_points",
 ]
@@ -91,34 +90,23 @@ def turning_points(voltage: FloatArray, threshold: float | None = None) -> IntAr
     return np.array([turn for turn in turns if turn > 0], dtype=np.int64)
 
 
-def stretch_times(
-    voltage: FloatArray, interval: float, windows: Sequence[slice] = (slice(None),)
-) -> FloatArray:
-    """Return how long the voltage goes one way, (stretches,), s, within windows of a record.
-
-    A window's borders cut stretches too; one without a turn is one stretch.
-    """
-    inside = np.concatenate([voltage[window] for window in windows])
-    threshold = RETURN * float(np.ptp(inside))
-    times = []
-    for window in windows:
-        segment = voltage[window]
-        edges = np.concatenate([[0], turning_points(segment, threshold), [segment.size - 1]])
-        times.append(np.diff(edges) * interval)
-    joined = np.concatenate(times)
-    return joined[joined > 0]
-
-
 def time_between_turns(
     voltage: FloatArray, interval: float, windows: Sequence[slice] = (slice(None),)
 ) -> float:
     """Return the typical time between turning points, s: of a sine, half its period.
 
     For half of the time, the voltage is on a stretch that takes this long or longer; so a long rest
-    before the drive does not count for more than it lasts. At rest, or without a turn, it is the
-    length of the (longest) window.
+    before the drive does not count for more than it lasts. The borders of ``windows`` of a record
+    cut stretches too. At rest, or without a turn, it is the length of the (longest) window.
     """
-    times = np.sort(stretch_times(voltage, interval, windows))
+    threshold = RETURN * float(np.ptp(np.concatenate([voltage[window] for window in windows])))
+    stretches = []
+    for window in windows:
+        segment = voltage[window]
+        edges = np.concatenate([[0], turning_points(segment, threshold), [segment.size - 1]])
+        stretches.append(np.diff(edges) * interval)
+    times = np.sort(np.concatenate(stretches))
+    times = times[times > 0]
     if times.size == 0:
         return interval
     passed = np.cumsum(times)

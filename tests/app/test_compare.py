@@ -185,7 +185,7 @@ def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
     signals = {"steady": 80 * wave, "fading": 80 * wave * (1 - 0.3 * time), "far": 300 * wave}
     best, second, last = fit.design("beta", candidates=signals)
     assert (best.name, second.name) == ("fading", "steady")
-    assert last.refused.startswith("goes from")
+    assert last.refused.startswith("needs ")
     # Its bands do not hold, which is said.
     with pytest.warns(InputWarning, match="VALIDATION FAILED: later"):
         assert linear.design(50 * wave, voltage=(-100, 100))[0].left < 1

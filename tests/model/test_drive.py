@@ -14,7 +14,6 @@ from bwbayes.model.reversals import (
     RETURN,
     fastest,
     monotone_stretches,
-    stretch_times,
     time_between_turns,
     turning_points,
 )
@@ -94,7 +93,6 @@ def test_windows_alone_count_each_with_its_own_turns() -> None:
     slow, fast = slice(0, 5000), slice(5000, 10000)
     assert time_between_turns(voltage, INTERVAL, [slow]) == pytest.approx(0.5)
     assert time_between_turns(voltage, INTERVAL, [fast]) == pytest.approx(0.05)
-    assert stretch_times(voltage, INTERVAL, [slow, fast]).sum() == pytest.approx(9.998)
 
 
 def test_fastest_is_the_largest_slope_and_noise_counts_for_little() -> None:

@@ -136,7 +136,11 @@ class _Single:
                 f"reference: no voltage gives {displacement[sample]:.6g} um at "
                 f"{sample * interval:.6g} s; make it smaller, or ask for the nearest command"
             )
-        limits.require(voltage, displacement, interval)
+        if why := limits.refuses(voltage, interval):
+            raise InputError(
+                f"reference: {why}; make it smaller or smoother, widen the limits, or ask for the "
+                "nearest command"
+            )
         return voltage
 
     def _undo(self, displacement: FloatArray, within: _Range) -> FloatArray:

@@ -215,13 +215,13 @@ def hysteresis(
         "alpha": alpha, "beta": beta, "gamma": gamma, "exponent": exponent, "initial": initial,
     }  # fmt: skip
     rows = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in arguments.items()}
-    size = max(values.size for values in rows.values())
+    size, column = max(values.size for values in rows.values()), {}
     for name, values in rows.items():
         if values.ndim != 1 or values.size not in (1, size):
             raise InputError(
                 f"{name}: has shape {values.shape}; give one number, or ({size},) as the others"
             )
-    column = {name: np.broadcast_to(values, (size,)) for name, values in rows.items()}
+        column[name] = np.broadcast_to(values, (size,))
     column["d"] = np.zeros(size)
     operator = BoucWen(passive=False)
     operator.check(column)
