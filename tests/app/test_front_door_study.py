@@ -21,7 +21,7 @@ from bwbayes.errors import InputError, InputWarning
 from tests.app import small
 from tests.app.test_front_door import SEPARATORS, UNITS, drive, play, written
 from tests.measured import keep
-from tests.record.instruments import INSTRUMENTS, Written, signals
+from tests.record.instruments import INSTRUMENTS, Written
 
 RECORDS = 200
 
@@ -79,7 +79,7 @@ def arguments(written: Written) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_no_file_of_an_instrument_is_refused(tmp_path: Path, name: str) -> None:
-    given = arguments(INSTRUMENTS[name](tmp_path, *signals()))
+    given = arguments(INSTRUMENTS[name](tmp_path))
     run = ["run", *given, "--out", str(tmp_path / "run"), "--workers", "1", "--quiet"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)

@@ -29,152 +29,167 @@ class Written(NamedTuple):
     fs: float | None = None
 
 
-def signals() -> tuple[Array, Array, Array]:
-    """Return time, s, a decaying sine, V, and the displacement of a play with a gain, um."""
-    time = INTERVAL * np.arange(SAMPLES)
-    voltage = np.round(60 * np.exp(-0.5 * time) * np.sin(2 * np.pi * time / 0.5), 4)
+Writer = Callable[[Path], Written]
+INSTRUMENTS: dict[str, Writer] = {}
+
+
+def _instrument(name: str) -> Callable[[Writer], Writer]:
+    def register(write: Writer) -> Writer:
+        INSTRUMENTS[name] = write
+        return write
+
+    return register
+
+
+def _displacement(voltage: Array) -> Array:
+    """Return the displacement of a play with a gain, um."""
     state, states = 0.0, []
     for value in voltage:
         state = min(max(state, value - 6), value + 6)
         states.append(state)
     noise = np.random.default_rng(1).normal(scale=0.02, size=SAMPLES)
-    return time, voltage, np.round(0.3 * voltage + 0.2 * np.array(states) + noise, 5)
+    return np.round(0.3 * voltage + 0.2 * np.array(states) + noise, 5)
 
 
-def _rows(columns: list[Array], separator: str, decimal: str = ".", end: str = "") -> list[str]:
+TIME = INTERVAL * np.arange(SAMPLES)  # s
+VOLTAGE = np.round(60 * np.exp(-0.5 * TIME) * np.sin(2 * np.pi * TIME / 0.5), 4)
+DISPLACEMENT = _displacement(VOLTAGE)
+COLUMNS = [TIME, VOLTAGE, DISPLACEMENT]
+UNITS = {"time": "s", "voltage": "V", "displacement": "um"}
+
+
+def _named(*names: str) -> dict[str, str]:
+    return dict(zip(UNITS, names, strict=True))
+
+
+def _rows(columns: list[Array], separator: str, form: str = ".6f", end: str = "") -> list[str]:
     return [
-        separator.join(f"{value:.6f}".replace(".", decimal) for value in row) + end
+        separator.join(f"{value:{form}}" for value in row) + end
         for row in zip(*columns, strict=True)
     ]
 
 
-def _text(path: Path, lines: list[str], encoding: str = "utf-8", newline: str = "\r\n") -> Written:
-    path.write_bytes((newline.join(lines) + newline).encode(encoding))
-    return Written(path)
+def _commas(rows: list[str]) -> list[str]:
+    return [row.replace(".", ",") for row in rows]
 
 
-def _excel(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], ";", ",", ";in Ordnung")
+def _text(path: Path, lines: list[str], encoding: str = "utf-8", **said: Any) -> Written:
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode(encoding))
+    return Written(path, **said)
+
+
+@_instrument("Excel, German, cp1252, preamble")
+def _(folder: Path) -> Written:
     head = ["Prüfstand 3", "Bediener;Müller", "Datum;3. März 2026", ""]
-    return _text(
-        folder / "messung.csv",
-        [*head, "Zeit [s];Spannung [V];Weg [µm];Bemerkung", *rows],
-        "cp1252",
-    )
+    names = "Zeit [s];Spannung [V];Weg [µm];Bemerkung"
+    rows = _commas(_rows(COLUMNS, ";", end=";in Ordnung"))
+    return _text(folder / "messung.csv", [*head, names, *rows], "cp1252")
 
 
-def _unicode_text(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], "\t", ",")
+@_instrument("Excel, Unicode text")
+def _(folder: Path) -> Written:
+    rows = _commas(_rows(COLUMNS, "\t"))
     return _text(folder / "a.txt", ["Time (s)\tDrive (V)\tStroke (µm)", *rows], "utf-16")
 
 
-def _lvm_head(separator: str = "Tab", columns: str = "One") -> list[str]:
-    mark = {"Tab": "\t", "Comma": ","}[separator]
-    pairs = {
-        "Writer_Version": "2",
-        "Reader_Version": "2",
-        "Separator": separator,
-        "Decimal_Separator": ".",
-        "Multi_Headings": "Yes",
-        "X_Columns": columns,
-        "Time_Pref": "Relative",
-        "Operator": "bench",
-        "Date": "2026/03/03",
-        "Time": "16:00:05.123",
-    }
-    lines = [f"{key}{mark}{value}" for key, value in pairs.items()]
-    return [f"LabVIEW Measurement{mark}", *lines, f"***End_of_Header***{mark}", mark]
-
-
-def _lvm_segment(names: str, samples: int, delta: float = INTERVAL) -> list[str]:
-    return [
-        "Channels\t2\t\t",
-        f"Samples\t{samples}\t{samples}\t",
-        "Date\t2026/03/03\t2026/03/03\t",
-        "Time\t16:00:05.1\t16:00:05.1\t",
-        "Y_Unit_Label\tV\tum\t",
-        "X_Dimension\tTime\tTime\t",
-        "X0\t0.0000000000000000E+0\t0.0000000000000000E+0\t",
-        f"Delta_X\t{delta:.6f}\t{delta:.6f}\t",
-        "***End_of_Header***\t\t\t",
-        names,
+def _lvm(folder: Path, segments: list[list[str]], names: str, x_columns: str = "One") -> Written:
+    """Write LabVIEW's text with its header, and one for each segment."""
+    lines = [
+        *("LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"),
+        *("Decimal_Separator\t.", "Multi_Headings\tYes", f"X_Columns\t{x_columns}"),
+        *("Time_Pref\tRelative", "Operator\tbench", "Date\t2026/03/03", "Time\t16:00:05.123"),
+        *("***End_of_Header***\t", "\t"),
     ]
+    for rows in segments:
+        lines += [
+            *("Channels\t2\t\t", f"Samples\t{len(rows)}\t{len(rows)}\t"),
+            *("Date\t2026/03/03\t2026/03/03\t", "Time\t16:00:05.1\t16:00:05.1\t"),
+            *("Y_Unit_Label\tV\tum\t", "X_Dimension\tTime\tTime\t"),
+            "X0\t0.0000000000000000E+0\t0.0000000000000000E+0\t",
+            f"Delta_X\t{INTERVAL:.6f}\t{INTERVAL:.6f}\t",
+            *("***End_of_Header***\t\t\t", f"{names}\tComment", *rows, ""),
+        ]
+    return _text(folder / "a.lvm", lines[:-1])
 
 
-def _lvm(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], "\t")
-    segment = _lvm_segment("X_Value\tVoltage\tPosition\tComment", SAMPLES)
-    return _text(folder / "a.lvm", [*_lvm_head(), *segment, f"{rows[0]}\t", *rows[1:]])
+@_instrument("LabVIEW lvm")
+def _(folder: Path) -> Written:
+    first, *rows = _rows(COLUMNS, "\t")
+    return _lvm(folder, [[f"{first}\t", *rows]], "X_Value\tVoltage\tPosition")
 
 
-def _lvm_segments(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], "\t")
-    segment = _lvm_segment("X_Value\tVoltage\tPosition\tComment", SAMPLES // 3)
-    third = SAMPLES // 3
-    lines = _lvm_head()
-    for first in (0, third, 2 * third):
-        lines += [*segment, *rows[first : first + third], ""]
-    return _text(folder / "a.lvm", lines)
+@_instrument("LabVIEW lvm, three segments")
+def _(folder: Path) -> Written:
+    rows = _rows(COLUMNS, "\t")
+    return _lvm(folder, [rows[:200], rows[200:400], rows[400:]], "X_Value\tVoltage\tPosition")
 
 
-def _lvm_without_times(folder: Path, _: Array, voltage: Array, displacement: Array) -> Written:
-    rows = [f"\t{row}" for row in _rows([voltage, displacement], "\t")]
-    segment = _lvm_segment("X_Value\tVoltage\tPosition\tComment", SAMPLES)
-    return _text(folder / "a.lvm", [*_lvm_head(columns="No"), *segment, *rows])
+@_instrument("LabVIEW lvm without times")
+def _(folder: Path) -> Written:
+    rows = [f"\t{row}" for row in _rows([VOLTAGE, DISPLACEMENT], "\t")]
+    return _lvm(folder, [rows], "X_Value\tVoltage\tPosition", "No")
 
 
-def _lvm_many_times(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, time, displacement], "\t")
-    segment = _lvm_segment("X_Value\tVoltage\tX_Value\tPosition\tComment", SAMPLES)
-    return _text(folder / "a.lvm", [*_lvm_head(columns="Multi"), *segment, *rows])
+@_instrument("LabVIEW lvm, times of each channel")
+def _(folder: Path) -> Written:
+    rows = _rows([TIME, VOLTAGE, TIME, DISPLACEMENT], "\t")
+    return _lvm(folder, [rows], "X_Value\tVoltage\tX_Value\tPosition", "Multi")
 
 
-def _tdms(folder: Path, channels: Mapping[str, tuple[Array, Mapping[str, Any]]]) -> Written:
+def _tdms(folder: Path, channels: Mapping[str, Array], **properties: dict[str, Any]) -> Path:
     from nptdms import ChannelObject, TdmsWriter  # noqa: PLC0415  # an extra
 
     with TdmsWriter(folder / "a.tdms") as writer:
         writer.write_segment(
-            [ChannelObject("Log", name, data, known) for name, (data, known) in channels.items()]
+            [ChannelObject("Log", n, data, properties.get(n, {})) for n, data in channels.items()]
         )
-    return Written(folder / "a.tdms")
+    return folder / "a.tdms"
 
 
-def _tdms_waveform(folder: Path, _: Array, voltage: Array, displacement: Array) -> Written:
+@_instrument("TDMS waveforms")
+def _(folder: Path) -> Written:
     wave = {"wf_increment": INTERVAL, "wf_start_offset": 0.0, "wf_samples": SAMPLES}
-    return _tdms(
-        folder,
-        {
-            "Voltage": (voltage, wave | {"unit_string": "V"}),
-            "Position": (displacement, wave | {"unit_string": "um"}),
-        },
-    )
+    units = {"Voltage": wave | {"unit_string": "V"}, "Position": wave | {"unit_string": "um"}}
+    return Written(_tdms(folder, {"Voltage": VOLTAGE, "Position": DISPLACEMENT}, **units))
 
 
-def _tdms_times(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    channels = {"Time (s)": time, "U_V": voltage, "laser": displacement}
-    written = _tdms(folder, {name: (values, {}) for name, values in channels.items()})
-    return written._replace(columns={"displacement": "laser"}, units={"displacement": "um"})
+@_instrument("TDMS with times")
+def _(folder: Path) -> Written:
+    path = _tdms(folder, {"Time (s)": TIME, "U_V": VOLTAGE, "laser": DISPLACEMENT})
+    return Written(path, {"displacement": "laser"}, {"displacement": "um"})
 
 
-def _struct(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    log = {"time": time, "Ux": voltage, "Uy": 0 * voltage, "x": displacement, "y": 0.1 * voltage}
-    scipy.io.savemat(folder / "a.mat", {"log": log, "operator": "bench"})
-    columns = {"voltage": "log.Ux", "displacement": "log.x"}
-    return Written(folder / "a.mat", columns, {"time": "s", "voltage": "V", "displacement": "um"})
+def _mat(folder: Path, variables: dict[str, Any], *names: str) -> Written:
+    scipy.io.savemat(folder / "a.mat", variables)
+    return Written(folder / "a.mat", _named(*names), UNITS)
 
 
-def _struct_array(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+@_instrument("MATLAB struct of two axes")
+def _(folder: Path) -> Written:
+    axes = {"Ux": VOLTAGE, "Uy": 0 * VOLTAGE, "x": DISPLACEMENT, "y": 0.1 * VOLTAGE}
+    written = _mat(folder, {"log": {"time": TIME} | axes, "operator": "bench"}, *"tux")
+    return written._replace(columns={"voltage": "log.Ux", "displacement": "log.x"})
+
+
+@_instrument("MATLAB struct array")
+def _(folder: Path) -> Written:
     channels = np.zeros(2, dtype=[("Name", object), ("Data", object)])
     channels["Name"] = ["Model Root/u", "Model Root/y"]
-    channels["Data"] = [voltage, displacement]
-    scipy.io.savemat(folder / "a.mat", {"rec": {"X": {"Data": time}, "Y": channels}})
-    columns = {"time": "rec.X.Data", "voltage": "rec.Y(1).Data", "displacement": "rec.Y(2).Data"}
-    return Written(folder / "a.mat", columns, {"time": "s", "voltage": "V", "displacement": "um"})
+    channels["Data"] = [VOLTAGE, DISPLACEMENT]
+    variables = {"rec": {"X": {"Data": TIME}, "Y": channels}}
+    return _mat(folder, variables, "rec.X.Data", "rec.Y(1).Data", "rec.Y(2).Data")
 
 
-def _struct_7_3(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+@_instrument("MATLAB matrix")
+def _(folder: Path) -> Written:
+    variables = {"data": np.stack(COLUMNS, axis=1), "fs": 200.0}
+    return _mat(folder, variables, "data[1]", "data[2]", "data[3]")
+
+
+@_instrument("MATLAB 7.3 struct")
+def _(folder: Path) -> Written:
     with h5py.File(folder / "a.mat", "w", userblock_size=512) as file:
-        for name, values in (("t", time), ("U_V", voltage), ("pos_um", displacement)):
+        for name, values in zip(("t", "U_V", "pos_um"), COLUMNS, strict=True):
             file[f"log/{name}"] = values[np.newaxis, :]
             file[f"log/{name}"].attrs["MATLAB_class"] = np.bytes_("double")
         file["log/operator"] = np.frombuffer("bench".encode("utf-16-le"), "<u2")[:, np.newaxis]
@@ -185,169 +200,130 @@ def _struct_7_3(folder: Path, time: Array, voltage: Array, displacement: Array) 
     return Written(folder / "a.mat", {}, {"time": "s"})
 
 
-def _matrix(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    data = np.stack([time, voltage, displacement], axis=1)
-    scipy.io.savemat(folder / "a.mat", {"data": data, "fs": 200.0})
-    columns = {"time": "data[1]", "voltage": "data[2]", "displacement": "data[3]"}
-    return Written(folder / "a.mat", columns, {"time": "s", "voltage": "V", "displacement": "um"})
-
-
-def _groups(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+@_instrument("HDF5 groups with units")
+def _(folder: Path) -> Written:
     with h5py.File(folder / "a.h5", "w") as file:
         for run in ("run_001", "run_003"):
             group = file.create_group(f"measurement/{run}")
-            group["t"], group["hv_out"] = 1e3 * time, voltage
-            group["axis_x"], group["axis_y"] = 1e3 * displacement, 0 * displacement
+            group["t"], group["hv_out"] = 1e3 * TIME, VOLTAGE
+            group["axis_x"], group["axis_y"] = 1e3 * DISPLACEMENT, 0 * DISPLACEMENT
             for name, unit in (("t", "ms"), ("hv_out", "V"), ("axis_x", "nm"), ("axis_y", "nm")):
                 group[name].attrs["unit"] = unit
-    columns = {
-        "voltage": "measurement/run_003/hv_out",
-        "displacement": "measurement/run_003/axis_x",
-    }
+    run = "measurement/run_003"
+    columns = {"voltage": f"{run}/hv_out", "displacement": f"{run}/axis_x"}
     return Written(folder / "a.h5", columns)
 
 
-def _table(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
+@_instrument("HDF5 table")
+def _(folder: Path) -> Written:
     rows = np.zeros(SAMPLES, dtype=[("t_s", "f8"), ("u_V", "f4"), ("pos_um", "f8")])
-    rows["t_s"], rows["u_V"], rows["pos_um"] = time, voltage, displacement
+    rows["t_s"], rows["u_V"], rows["pos_um"] = COLUMNS
     with h5py.File(folder / "a.hdf5", "w") as file:
         file["log"] = rows
     return Written(folder / "a.hdf5")
 
 
-def _savetxt(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    data = np.stack([time, voltage, displacement], axis=1)
-    np.savetxt(folder / "a.dat", data, header="t_s u_V x_um")
+@_instrument("numpy.savetxt")
+def _(folder: Path) -> Written:
+    np.savetxt(folder / "a.dat", np.stack(COLUMNS, axis=1), header="t_s u_V x_um")
     return Written(folder / "a.dat")
 
 
-def _bare(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    written = _text(folder / "a.asc", _rows([time, displacement, voltage], "  "), newline="\n")
-    columns = {"time": "1", "voltage": "3", "displacement": "2"}
-    return written._replace(
-        columns=columns, units={"time": "s", "voltage": "V", "displacement": "um"}
-    )
+@_instrument("no header, blanks")
+def _(folder: Path) -> Written:
+    rows = _rows([TIME, DISPLACEMENT, VOLTAGE], "  ")
+    return _text(folder / "a.asc", rows, columns=_named("1", "3", "2"), units=UNITS)
 
 
-def _scope(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    """Of an oscilloscope: names, units in brackets, an empty line; the sensor's is a voltage."""
-    rows = _rows([1e3 * time, voltage, 1e3 * displacement], ",")
-    written = _text(folder / "a.csv", ["Time,Channel A,Channel B", "(ms),(V),(mV)", "", *rows])
+@_instrument("oscilloscope, units in brackets")
+def _(folder: Path) -> Written:
+    """With an empty line; the sensor's is a voltage."""
+    rows = _rows([1e3 * TIME, VOLTAGE, 1e3 * DISPLACEMENT], ",")
+    lines = ["Time,Channel A,Channel B", "(ms),(V),(mV)", "", *rows]
     columns = {"voltage": "Channel A", "displacement": "Channel B"}
-    return written._replace(columns=columns, units={"displacement": "nm"})
+    return _text(folder / "a.csv", lines, columns=columns, units={"displacement": "nm"})
 
 
-def _scope_words(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], ",")
-    written = _text(folder / "a.csv", ["x-axis,1,2", "second,Volt,Volt", *rows])
+@_instrument("oscilloscope, units in words")
+def _(folder: Path) -> Written:
+    lines = ["x-axis,1,2", "second,Volt,Volt", *_rows(COLUMNS, ",")]
     columns = {"voltage": "2", "displacement": "3"}
-    return written._replace(columns=columns, units={"displacement": "um"})
+    return _text(folder / "a.csv", lines, columns=columns, units={"displacement": "um"})
 
 
-def _logger(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(time, unit="s")
-    values = zip(moments, voltage, displacement, strict=True)
-    rows = [f"{t.isoformat(timespec='milliseconds')},{v},{d}" for t, v, d in values]
-    return _text(folder / "a.csv", ["Timestamp,Command [V],Position [um]", *rows])
+def _stamped(folder: Path, names: str, stamps: Any) -> Written:
+    rows = [f"{t},{v},{d}" for t, v, d in zip(stamps, VOLTAGE, DISPLACEMENT, strict=True)]
+    return _text(folder / "a.csv", [names, *rows])
 
 
-def _clock(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    values = zip(time, voltage, displacement, strict=True)
-    rows = [f"00:00:{t:06.3f},{v},{d}" for t, v, d in values]
-    return _text(folder / "a.csv", ["Time,Command [V],Position [um]", *rows])
+@_instrument("logger with dates")
+def _(folder: Path) -> Written:
+    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(TIME, unit="s")
+    stamps = [t.isoformat(timespec="milliseconds") for t in moments]
+    return _stamped(folder, "Timestamp,Command [V],Position [um]", stamps)
 
 
-def _thousands(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    marks = str.maketrans(",.", ".,")
-    table = zip(1e3 * time, 1e3 * voltage, 1e3 * displacement, strict=True)
-    rows = [";".join(f"{value:,.2f}".translate(marks) for value in row) for row in table]
-    return _text(folder / "a.csv", ["Zeit [ms];Spannung [mV];Weg [nm]", *rows])
+@_instrument("Unix time in ms")
+def _(folder: Path) -> Written:
+    stamps = np.rint(1_772_539_199_000 + 1e3 * TIME).astype(np.int64)
+    return _stamped(folder, "t_ms,u_V,x_um", stamps)
 
 
-def _fortran(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    table = zip(time, voltage, displacement, strict=True)
-    rows = ["  ".join(f"{value:.9E}".replace("E", "D") for value in row) for row in table]
-    return _text(folder / "a.dat", ["% t/s u/V x/um", *rows], newline="\n")
+@_instrument("times of day")
+def _(folder: Path) -> Written:
+    return _stamped(folder, "Time,Command [V],Position [um]", [f"00:00:{t:06.3f}" for t in TIME])
 
 
-def _beside(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    """Of an oscilloscope: what it was set to stands beside the first numbers."""
-    rows = _rows([time, voltage, displacement], ",")
-    head = ['"Record Length",600', '"Source","CH1"', '"Vertical Units","V"']
-    head += [","] * (len(rows) - len(head))
-    written = _text(folder / "a.csv", [f"{a},{b}" for a, b in zip(head, rows, strict=True)])
-    columns = {"time": "3", "voltage": "4", "displacement": "5"}
-    return written._replace(
-        columns=columns, units={"time": "s", "voltage": "V", "displacement": "um"}
-    )
-
-
-def _no_names(folder: Path, _: Array, voltage: Array, displacement: Array) -> Written:
-    written = _text(folder / "a.txt", _rows([voltage, displacement], "\t"))
-    return written._replace(
-        columns={"voltage": "1", "displacement": "2"},
-        units={"voltage": "V", "displacement": "um"},
-        fs=1 / INTERVAL,
-    )
-
-
-def _unix(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    stamps = np.rint(1_772_539_199_000 + 1e3 * time).astype(np.int64)
-    values = zip(stamps, voltage, displacement, strict=True)
-    return _text(folder / "a.csv", ["t_ms,u_V,x_um", *(f"{t},{v},{d}" for t, v, d in values)])
-
-
-def _frame(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    columns = {"time_s": time, "voltage_V": voltage, "displacement_um": displacement}
+@_instrument("pandas with its index")
+def _(folder: Path) -> Written:
+    columns = dict(zip(("time_s", "voltage_V", "displacement_um"), COLUMNS, strict=True))
     pd.DataFrame(columns).to_csv(folder / "a.csv")
     return Written(folder / "a.csv")
 
 
-def _japanese(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], ",")
-    return _text(
-        folder / "a.csv", ["圧電アクチュエータ", "時間(s),電圧(V),変位(um)", *rows], "cp932"
-    )
+@_instrument("Japanese, cp932")
+def _(folder: Path) -> Written:
+    lines = ["圧電アクチュエータ", "時間(s),電圧(V),変位(um)", *_rows(COLUMNS, ",")]
+    return _text(folder / "a.csv", lines, "cp932")
 
 
-def _trailing(folder: Path, time: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([time, voltage, displacement], "\t", end="\t")
-    return _text(folder / "a.txt", ['"t_s"\t"u_V"\t"x_um"\t', *rows])
+@_instrument("separators at the ends")
+def _(folder: Path) -> Written:
+    return _text(folder / "a.txt", ['"t_s"\t"u_V"\t"x_um"\t', *_rows(COLUMNS, "\t", end="\t")])
 
 
-def _no_times(folder: Path, _: Array, voltage: Array, displacement: Array) -> Written:
-    rows = _rows([voltage, displacement], ",")
-    return _text(folder / "a.csv", ["u_V,x_um", *rows])._replace(fs=1 / INTERVAL)
+@_instrument("no times at all")
+def _(folder: Path) -> Written:
+    rows = _rows([VOLTAGE, DISPLACEMENT], ",")
+    return _text(folder / "a.csv", ["u_V,x_um", *rows], fs=1 / INTERVAL)
 
 
-INSTRUMENTS: Mapping[str, Callable[[Path, Array, Array, Array], Written]] = {
-    "Excel, German, cp1252, preamble": _excel,
-    "Excel, Unicode text": _unicode_text,
-    "LabVIEW lvm": _lvm,
-    "LabVIEW lvm, three segments": _lvm_segments,
-    "LabVIEW lvm without times": _lvm_without_times,
-    "LabVIEW lvm, times of each channel": _lvm_many_times,
-    "TDMS waveforms": _tdms_waveform,
-    "TDMS with times": _tdms_times,
-    "MATLAB struct of two axes": _struct,
-    "MATLAB struct array": _struct_array,
-    "MATLAB 7.3 struct": _struct_7_3,
-    "MATLAB matrix": _matrix,
-    "HDF5 groups with units": _groups,
-    "HDF5 table": _table,
-    "numpy.savetxt": _savetxt,
-    "no header, blanks": _bare,
-    "oscilloscope, units in brackets": _scope,
-    "oscilloscope, units in words": _scope_words,
-    "logger with dates": _logger,
-    "Unix time in ms": _unix,
-    "pandas with its index": _frame,
-    "Japanese, cp932": _japanese,
-    "separators at the ends": _trailing,
-    "no times at all": _no_times,
-    "no names and no times": _no_names,
-    "times of day": _clock,
-    "marks between thousands": _thousands,
-    "exponents of Fortran": _fortran,
-    "settings beside the numbers": _beside,
-}
+@_instrument("no names and no times")
+def _(folder: Path) -> Written:
+    columns = {"voltage": "1", "displacement": "2"}
+    units = {"voltage": "V", "displacement": "um"}
+    rows = _rows([VOLTAGE, DISPLACEMENT], "\t")
+    return _text(folder / "a.txt", rows, columns=columns, units=units, fs=1 / INTERVAL)
+
+
+@_instrument("marks between thousands")
+def _(folder: Path) -> Written:
+    rows = _rows([1e3 * column for column in COLUMNS], ";", ",.2f")
+    rows = [row.translate(str.maketrans(",.", ".,")) for row in rows]
+    return _text(folder / "a.csv", ["Zeit [ms];Spannung [mV];Weg [nm]", *rows])
+
+
+@_instrument("exponents of Fortran")
+def _(folder: Path) -> Written:
+    rows = [row.replace("E", "D") for row in _rows(COLUMNS, "  ", ".9E")]
+    return _text(folder / "a.dat", ["% t/s u/V x/um", *rows])
+
+
+@_instrument("settings beside the numbers")
+def _(folder: Path) -> Written:
+    """Of an oscilloscope."""
+    rows = _rows(COLUMNS, ",")
+    head = ['"Record Length",600', '"Source","CH1"', '"Vertical Units","V"']
+    head += [","] * (len(rows) - len(head))
+    lines = [f"{a},{b}" for a, b in zip(head, rows, strict=True)]
+    return _text(folder / "a.csv", lines, columns=_named("3", "4", "5"), units=UNITS)

@@ -10,7 +10,7 @@ import pytest
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
-from tests.record.instruments import INSTRUMENTS, INTERVAL, Written, signals
+from tests.record.instruments import DISPLACEMENT, INSTRUMENTS, INTERVAL, VOLTAGE, Written
 
 
 def read(written: Written) -> Record:
@@ -22,19 +22,18 @@ def read(written: Written) -> Record:
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
-    time, voltage, displacement = signals()
-    record = read(INSTRUMENTS[name](tmp_path, time, voltage, displacement))
+    record = read(INSTRUMENTS[name](tmp_path))
     assert record.interval == pytest.approx(INTERVAL, rel=1e-9)
     assert 0.0 == record.start
-    np.testing.assert_allclose(record.voltage, voltage, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(record.voltage, VOLTAGE, rtol=1e-6, atol=1e-6)
     assert record.displacement is not None
-    np.testing.assert_allclose(record.displacement, displacement, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(record.displacement, DISPLACEMENT, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
     """Without a word from the user a file is read, or one message has a guess that reads it."""
-    written = INSTRUMENTS[name](tmp_path, *signals())
+    written = INSTRUMENTS[name](tmp_path)
     alone, error = written._replace(columns={}, units={}, fs=None), None
     try:
         read(alone)
@@ -49,14 +48,14 @@ def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
 
 
 def test_a_clock_counts_from_the_first_sample_and_is_kept(tmp_path: Path) -> None:
-    record = read(INSTRUMENTS["Unix time in ms"](tmp_path, *signals()))
+    record = read(INSTRUMENTS["Unix time in ms"](tmp_path))
     assert (0.0, 1_772_539_199.0) == (record.start, record.time_offset)
-    dated = read(INSTRUMENTS["logger with dates"](tmp_path, *signals()))
+    dated = read(INSTRUMENTS["logger with dates"](tmp_path))
     assert (0.0, 1_772_539_199.0) == (dated.start, dated.time_offset)
 
 
 def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> None:
-    path = INSTRUMENTS["Excel, German, cp1252, preamble"](tmp_path, *signals()).path
+    path = INSTRUMENTS["Excel, German, cp1252, preamble"](tmp_path).path
     with (
         pytest.warns(InputWarning, match=r"messung.csv:1: 3 lines above the header skipped"),
         pytest.warns(InputWarning, match=r"messung.csv:5: ignored columns: Bemerkung"),
@@ -65,7 +64,7 @@ def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> Non
 
 
 def test_every_series_of_a_struct_is_listed_with_its_range(tmp_path: Path) -> None:
-    path = INSTRUMENTS["MATLAB struct of two axes"](tmp_path, *signals()).path
+    path = INSTRUMENTS["MATLAB struct of two axes"](tmp_path).path
     with pytest.raises(InputError) as caught:
         read_record(path)
     for text in ("600 values each: 'log.time' (0 to 2.995)", "'log.Ux' (", "'log.y' ("):
@@ -73,7 +72,7 @@ def test_every_series_of_a_struct_is_listed_with_its_range(tmp_path: Path) -> No
 
 
 def test_tdms_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = INSTRUMENTS["TDMS waveforms"](tmp_path, *signals()).path
+    path = INSTRUMENTS["TDMS waveforms"](tmp_path).path
     monkeypatch.setitem(__import__("sys").modules, "nptdms", None)
     with pytest.raises(InputError, match=r"npTDMS; pip install 'bwbayes\[tdms\]'"):
         read_record(path)

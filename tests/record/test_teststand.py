@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import itertools
 import math
+from hashlib import sha256
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.record.teststand import Amplifier, VirtualTestStand, creep
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
+from bwbayes.record.teststand import Amplifier, LaserSensor, VirtualTestStand, creep
 from bwbayes.record.waveforms import Decay, Sine, Triangle, Waveform, signal
 
 MILLISECOND = 1e-3
@@ -30,13 +36,6 @@ def truth_of(stand: VirtualTestStand, drive: Waveform | FloatArray, seed: int = 
     truth = stand.run(drive, generator(seed)).truth
     assert truth is not None
     return truth
-
-
-def noise_of(stand: VirtualTestStand, drive: Waveform | FloatArray) -> FloatArray:
-    record = stand.run(drive, generator())
-    assert record.displacement is not None
-    assert record.truth is not None
-    return record.displacement - record.truth
 
 
 def scalar_output(command: FloatArray) -> list[float]:
@@ -110,32 +109,27 @@ def test_a_command_beyond_100_volts_is_limited_and_said_so() -> None:
 
 
 def test_the_sensors_noise_has_an_sd_of_half_a_micrometre() -> None:
-    noise = noise_of(VirtualTestStand("process"), signal("verification"))
+    record = VirtualTestStand("process").run(signal("verification"), generator())
+    assert record.displacement is not None
+    assert record.truth is not None
+    noise = record.displacement - record.truth
     error = 0.5 / math.sqrt(2 * noise.size)
     np.testing.assert_allclose(0.5, noise.std(), rtol=0, atol=4 * error)
     np.testing.assert_allclose(0.0, noise.mean(), rtol=0, atol=4 * 0.5 / math.sqrt(noise.size))
 
 
-@pytest.fixture(scope="module")
-def processes() -> FloatArray:
-    """Process discrepancies (2000 seeds, 1001 samples), um: the truth at a command of zero."""
-    stand, command = VirtualTestStand("process"), np.zeros(1001)
-    return np.stack([truth_of(stand, command, seed) for seed in range(2000)])
-
-
-def test_the_process_is_stationary_with_an_sd_of_1_5(processes: FloatArray) -> None:
+def test_the_process_is_stationary_and_forgets_exponentially_in_half_a_second() -> None:
+    """The truth at a command of zero: 600 seeds."""
+    stand, command, seeds = VirtualTestStand("process"), np.zeros(1001), 600
+    processes = np.stack([truth_of(stand, command, seed) for seed in range(seeds)])
     for sample in (0, 1, 10, 500, 1000):
         values = processes[:, sample]
-        np.testing.assert_allclose(1.5, values.std(), rtol=4 / math.sqrt(2 * values.size))
-        error = 1.5 / math.sqrt(values.size)
-        np.testing.assert_allclose(0.0, values.mean(), rtol=0, atol=4 * error)
-
-
-def test_the_process_forgets_exponentially_in_half_a_second(processes: FloatArray) -> None:
+        np.testing.assert_allclose(1.5, values.std(), rtol=4 / math.sqrt(2 * seeds))
+        np.testing.assert_allclose(0.0, values.mean(), rtol=0, atol=4 * 1.5 / math.sqrt(seeds))
     for lag in (50, 250, 500, 1000):
         expected = math.exp(-lag * MILLISECOND / 0.5)
         got = np.corrcoef(processes[:, 0], processes[:, lag])[0, 1]
-        error = (1 - expected**2) / math.sqrt(len(processes))
+        error = (1 - expected**2) / math.sqrt(seeds)
         np.testing.assert_allclose(expected, got, rtol=0, atol=4 * error)
 
 
@@ -173,23 +167,12 @@ def test_the_same_seed_gives_the_same_record_and_another_seed_another(
     assert np.mean(first.displacement != other.displacement) > 0.5
 
 
-def test_the_true_parameters_are_table_1_in_micrometres_and_the_noise() -> None:
-    table = {
-        "d": 0.7,
-        "alpha": 0.3575,
-        "beta": 0.0272,
-        "gamma": 0.0172,
-        "exponent": 1.0,
-        "initial": 0.0,
-        "mass": 0.00134,
-        "damping": 1580.0,
-        "stiffness": 4.10e5,
-        "offset": 0.0,
-        "sensor_sd": 0.5,
-    }
+def test_the_true_parameters_are_table_1_in_micrometers_and_the_noise() -> None:
+    bouc_wen = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "exponent": 1.0}
+    mechanics = {"mass": 0.00134, "damping": 1580.0, "stiffness": 4.10e5}
+    table = bouc_wen | mechanics | {"initial": 0.0, "offset": 0.0, "sensor_sd": 0.5}
     process = {"discrepancy_sd": 1.5, "discrepancy_time": 0.5}
-    expected = table | process
-    assert expected == VirtualTestStand("process").parameters()
+    assert table | process == VirtualTestStand("process").parameters()
     assert table == VirtualTestStand("none").parameters()
     assert table == VirtualTestStand("structural").parameters()
 
@@ -205,3 +188,129 @@ def test_bad_input_is_named_in_one_line() -> None:
             stand.run(voltage, generator())
     with pytest.raises(InputError, match="cannot resolve 600 Hz"):
         stand.run(Waveform(Sine(1.0, 600.0), 1.0), generator())
+
+
+# Any actuator on the stand: its truth is what the fitted model computes, to rounding
+
+RATE = 100.0
+SIGNAL = "{ amplitude = 90.0, frequency = 1.0, duration = 4.0, decay = 0.2 }"
+MECHANICS = "".join(
+    f"{name} = {{ fixed = {value} }}\n"
+    for name, value in (("mass", 0.00134), ("damping", 1580.0), ("stiffness", 4.1e5))
+)
+
+EVERY = {name: f"hysteresis = '{name}'\n" for name in HYSTERESIS} | {
+    "duhem with even terms": "hysteresis = 'duhem'\nodd = false\n",
+    "plays at given thresholds": "hysteresis = 'plays'\nthresholds = [5.0, 20.0]\n",
+    "gain": "gain = ['quadratic', 'cubic']\n",
+    "creep": "creep = true\n",
+    "creep that grows": "creep = [0.5, 5.0]\ncreep_growth = true\n",
+    "all": "hysteresis = 'preisach'\ngain = ['quadratic']\ncreep = [2.0]\n",
+}
+
+
+def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -> Problem:
+    """Resolve a config with an actuator on the stand and a model of it."""
+    text = (
+        f"[record]\nsignal = {SIGNAL}\n{record}"
+        f"[stand]\ndiscrepancy = 'none'\nsample_rate = {RATE}\n"
+        f"[stand.model]\n{stand}[model]\nnoise = 'white'\n{model}{more}"
+    )
+    return resolve(parse(text, "config"), folder)
+
+
+def assert_reproduced(problem: Problem) -> None:
+    """Compute the record's truth by the fitted model from the true values and the output."""
+    posterior, true = problem.posterior, problem.config.truth
+    actuator, truth = posterior.likelihood.actuator, problem.record.truth
+    theta = np.array([[({"initial": 0.0} | true)[name] for name in actuator.parameters]])
+    output = Amplifier().output(posterior.only.voltage, actuator.interval)
+    (displacement,) = actuator.displacement(theta, output, from_rest="initial" not in true)
+    assert truth is not None
+    np.testing.assert_allclose(displacement, truth, rtol=0, atol=1e-12 * np.ptp(truth))
+
+
+@pytest.mark.parametrize("parts", EVERY)
+def test_the_model_reproduces_the_stands_record_with_the_stated_truth(
+    parts: str, tmp_path: Path
+) -> None:
+    stand = EVERY[parts]
+    lag = "" if "dynamics" in stand else "dynamics = 'lag'\n"
+    problem = of(stand + lag, stand + lag, tmp_path)
+    names = {p.name for p in problem.parameters} - {"initial"}
+    assert names <= set(problem.config.truth)
+    assert_reproduced(problem)
+
+
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_so_it_does_with_all_dynamics(dynamics: str, tmp_path: Path) -> None:
+    parts = f"hysteresis = 'prandtl-ishlinskii'\ndynamics = '{dynamics}'\n"
+    more = f"[parameters]\n{MECHANICS}" if dynamics == "second-order" else ""
+    assert_reproduced(of(parts, parts, tmp_path, more))
+
+
+@pytest.mark.parametrize("name", ["duhem", "prandtl-ishlinskii", "jiles-atherton"])
+def test_so_it_does_from_a_state_that_is_stated(name: str, tmp_path: Path) -> None:
+    """And not with another value."""
+    parts = f"hysteresis = '{name}'\ndynamics = 'lag'\n"
+    problem = of(parts, parts, tmp_path, "[stand.parameters]\ninitial = 0.4\n")
+    assert problem.config.truth["initial"] == 0.4
+    assert_reproduced(problem)
+    parts = "hysteresis = 'preisach'\ndynamics = 'lag'\n"
+    problem = of(parts, parts, tmp_path, "[truth]\nsaturation = 199.0\n")
+    with pytest.raises(AssertionError):
+        assert_reproduced(problem)
+
+
+@pytest.mark.parametrize("name", [name for name in HYSTERESIS if name != "linear"])
+def test_every_operator_is_an_actuator_of_the_ring_benders_size(name: str) -> None:
+    """Its range at 100 V within a quarter, the opening of its loop within a half.
+
+    A linear actuator has no loop to open.
+    """
+    voltage = 100 * np.sin(np.arange(2000) * 2 * np.pi / 1000)
+
+    def size(operator: str) -> tuple[float, float]:
+        actuator = Actuator("none", "zero", 1e-3, made("", operator, HYSTERESIS, {}))
+        stand = VirtualTestStand("none", sensor=LaserSensor(sd=0.0), actuator=actuator)
+        truth = stand.run(voltage, np.random.default_rng(1)).truth
+        assert truth is not None
+        return float(np.ptp(truth[1000:])), float(truth[1501] - truth[1001])
+
+    np.testing.assert_allclose(size(name)[0], size("bouc-wen")[0], rtol=0.25)
+    np.testing.assert_allclose(size(name)[1], size("bouc-wen")[1], rtol=0.5)
+
+
+LEVELS = {
+    "none": "41ad81fc7c39d3a9",
+    "process": "657223cd6d81ace3",
+    "structural": "2ed3767a738c0246",
+}
+
+
+@pytest.mark.parametrize("kind", LEVELS)
+def test_the_default_is_the_ring_bender_as_it_always_was(
+    kind: Literal["none", "process", "structural"],
+) -> None:
+    record = VirtualTestStand(kind, RATE).run(signal("identification"), np.random.default_rng(7))
+    assert record.displacement is not None
+    levels = np.round(record.displacement / LaserSensor().step).astype("<i4")
+    assert LEVELS[kind] == sha256(levels.tobytes()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(
+    ("stand", "true", "said"),
+    [
+        ("hysteresis = 'plais'\n", "", "stand.model.hysteresis: 'plais' is unknown; "),
+        ("odd = true\n", "", "stand.model.hysteresis: 'bouc-wen' has no option odd"),
+        ("creep_growth = true\n", "", "stand.model.creep_growth: there is no creep"),
+        ("", "bete = 0.1\n", "test stand: bete: its actuator has no such parameter; .*beta"),
+        ("", "alpha = -1.0\n", "test stand: alpha: -1 "),
+        ("gain = ['square']\n", "", "stand.gain: 'square' is unknown"),
+    ],
+)
+def test_what_the_stand_cannot_be_is_said_in_one_line(
+    stand: str, true: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=f"^{said}"):
+        of(stand, "", tmp_path, f"[stand.parameters]\n{true}")
