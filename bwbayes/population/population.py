@@ -47,8 +47,6 @@ FEWEST = 3
 
 # Populations that are drawn, and draws of each shrunk specimen.
 DRAWS = 1000
-# Of how many populations one serves as a prior of a specimen; so many are enough for that.
-EVERY = 4
 
 
 @dataclass(frozen=True)
@@ -144,17 +142,15 @@ class Population:
         """Return a pandas.DataFrame, a row for each parameter."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        rows = {}
-        for name, spread in self.parameters.items():
-            rows[name] = {
+        rows = {
+            name: {
                 f"{quantity}_{key}": value
-                for quantity, values in (
-                    ("mean", spread.mean),
-                    ("spread", spread.spread),
-                    ("new", spread.new),
-                )
-                for key, value in _interval(values).items()
-            } | {"unit": spread.unit, "outliers": ", ".join(spread.outliers)}
+                for quantity in ("mean", "spread", "new")
+                for key, value in _interval(getattr(parameter, quantity)).items()
+            }
+            | {"unit": parameter.unit, "outliers": ", ".join(parameter.outliers)}
+            for name, parameter in self.parameters.items()
+        }
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -194,11 +190,9 @@ def next_specimen(
     ----------
     population
         What the specimens have shown.
-    posterior
-        That of one of them, for the order of the parameters and the model's constraints; draws
-        that break these are left out.
-    draws
-        (draws, free) of its parameters: noise and all that belongs to one record comes from there.
+    posterior, draws
+        That of one of them, and (draws, free) of its parameters. Draws of the population that break
+        the model's constraints are left out.
     generator
         Pairs them.
 
@@ -231,63 +225,63 @@ def _population_of(
     prior = Hyperprior(mean, width, width)
     normal = likelihoods(specimens, name)
     draws = [(specimen.draws[:, i], specimen.log_prior[:, i]) for specimen, i in pairs]
-    reweighted = _reweighted(draws, normal, prior, generator)
+    mean, spread, is_normal, shapes, k = _populations(draws, normal, prior, generator)
     p = left_out(normal, prior)
     scale = np.exp if logarithmic else np.positive
     among = {}
-    for i, specimen in enumerate(specimens):
-        shrunk, alone = (
-            scale(np.quantile(y, [0.025, 0.5, 0.975])).tolist()
-            for y in (reweighted.shrunk[i], draws[i][0])
+    for i, (specimen, (y, log_prior)) in enumerate(zip(specimens, draws, strict=True)):
+        shrunk = (
+            normal.shrunk(i, mean, spread, generator)
+            if is_normal[i]
+            else _resampled(y, log_prior, mean, spread, generator)
         )
+        lower, median, upper = scale(np.quantile(shrunk, [0.025, 0.5, 0.975])).tolist()
+        own_lower, own_median, own_upper = scale(np.quantile(y, [0.025, 0.5, 0.975])).tolist()
         among[specimen.name] = SpecimenEstimate(
-            **dict(zip(("lower", "median", "upper"), shrunk, strict=True)),
-            **dict(zip(("own_lower", "own_median", "own_upper"), alone, strict=True)),
+            lower=lower,
+            median=median,
+            upper=upper,
+            own_lower=own_lower,
+            own_median=own_median,
+            own_upper=own_upper,
             p=float(p[i]),
             outlier=bool(p[i] * tests < 0.05),
-            pareto_k=float(reweighted.shapes[i]),
-            normal=bool(reweighted.normal[i]),
+            pareto_k=float(shapes[i]),
+            normal=bool(is_normal[i]),
         )
-    new = reweighted.mean + reweighted.spread * generator.standard_normal(DRAWS)
-    return PopulationParameter(
-        name,
-        specimens[0].units[columns[0]],
-        logarithmic,
-        scale(reweighted.mean),
-        reweighted.spread,
-        scale(new),
-        among,
-        reweighted.pareto_k,
-    )
+    new = scale(mean + spread * generator.standard_normal(DRAWS))
+    unit = specimens[0].units[columns[0]]
+    return PopulationParameter(name, unit, logarithmic, scale(mean), spread, new, among, k)
 
 
-@dataclass(frozen=True)
-class _Reweighted:
-    """Draws of populations and of shrunk specimens (specimens, DRAWS), and what judges them."""
-
-    mean: FloatArray
-    spread: FloatArray
-    shrunk: FloatArray
-    shapes: FloatArray
-    normal: BoolArray
-    pareto_k: float
-
-
-def _reweighted(
+def _populations(
     draws: Sequence[tuple[FloatArray, FloatArray]],
     normal: NormalLikelihoods,
     prior: Hyperprior,
     generator: np.random.Generator,
-) -> _Reweighted:
-    """Propose populations, weigh them by the specimens' draws, and shrink the specimens."""
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, float]:
+    """Propose populations, and weigh them by the specimens' draws.
+
+    Returns means and spreads, (DRAWS,) each; which specimens are taken for normal, and the Pareto k
+    of their draws reweighted to a typical population, (specimens,) each; Pareto k of the weights.
+    """
     posterior = spreads(normal, prior)
     mean, spread = posterior.draw(generator, DRAWS)
-    shapes, as_normal = _judged(draws, float(np.median(mean)), float(np.median(spread)))
+    shapes, effective = np.empty((2, len(draws)))
+    for i, (y, log_prior) in enumerate(draws):
+        z = (y - np.median(mean)) / np.median(spread)
+        weights, shapes[i] = smoothed_weights(-0.5 * z**2 - log_prior)
+        effective[i] = 1 / np.sum(weights**2)
+    is_normal = ~((shapes <= LARGEST_PARETO_K) & (effective >= 50))
     proposed = prior.log_density(mean, spread) + np.sum(normal.marginal(mean, spread), axis=0)
-    weights, k = np.full(DRAWS, 1 / DRAWS), 0.0
+    k = 0.0
     for _ in range(4):
-        target = prior.log_density(mean, spread)
-        target += np.sum(_marginals(draws, as_normal, normal, mean, spread), axis=0)
+        # Log p(data of i | μ, τ), each up to a constant of its own.
+        logs = normal.marginal(mean, spread)
+        for i in np.flatnonzero(~is_normal).tolist():
+            by_draw, largest = _weights(*draws[i], mean, spread)
+            logs[i] = largest + np.log(np.sum(by_draw, axis=0))
+        target = prior.log_density(mean, spread) + np.sum(logs, axis=0)
         weights, k = smoothed_weights(target - proposed)
         if k <= LARGEST_PARETO_K:
             break
@@ -295,44 +289,9 @@ def _reweighted(
     else:
         # Nothing that reweights can be trusted: the normal likelihoods alone.
         mean, spread = posterior.draw(generator, DRAWS)
-        as_normal, weights = np.ones(len(draws), dtype=np.bool_), np.full(DRAWS, 1 / DRAWS)
+        is_normal, weights = np.ones(len(draws), dtype=np.bool_), np.full(DRAWS, 1 / DRAWS)
     chosen = generator.choice(DRAWS, DRAWS, p=weights)
-    mean, spread = mean[chosen], spread[chosen]
-    shrunk = [
-        normal.shrunk(i, mean, spread, generator)
-        if as_normal[i]
-        else _resampled(y, log_prior, mean, spread, generator)
-        for i, (y, log_prior) in enumerate(draws)
-    ]
-    return _Reweighted(mean, spread, np.stack(shrunk), shapes, as_normal, k)
-
-
-def _judged(
-    draws: Sequence[tuple[FloatArray, FloatArray]], mean: float, spread: float
-) -> tuple[FloatArray, BoolArray]:
-    """Pareto k of each specimen's draws reweighted to a typical population; and which fail."""
-    shapes = np.empty(len(draws))
-    effective = np.empty(len(draws))
-    for i, (y, log_prior) in enumerate(draws):
-        weights, shapes[i] = smoothed_weights(-0.5 * ((y - mean) / spread) ** 2 - log_prior)
-        effective[i] = 1 / np.sum(weights**2)
-    return shapes, ~((shapes <= LARGEST_PARETO_K) & (effective >= 50))
-
-
-def _marginals(
-    draws: Sequence[tuple[FloatArray, FloatArray]],
-    as_normal: BoolArray,
-    normal: NormalLikelihoods,
-    mean: FloatArray,
-    spread: FloatArray,
-) -> FloatArray:
-    """Log p(data of i | μ, τ), (specimens, n), each up to a constant of its own."""
-    logs = normal.marginal(mean, spread)
-    for i, (y, log_prior) in enumerate(draws):
-        if not as_normal[i]:
-            weights, largest = _weights(y, log_prior, mean, spread)
-            logs[i] = largest + np.log(np.sum(weights, axis=0))
-    return logs
+    return mean[chosen], spread[chosen], is_normal, shapes, k
 
 
 def _weights(
@@ -358,7 +317,8 @@ def _resampled(
     generator: np.random.Generator,
 ) -> FloatArray:
     """Draw a specimen's coordinate with populations (n,) for its prior, from its own draws."""
-    by_population, _ = _weights(y, log_prior, mean[::EVERY], spread[::EVERY])
+    # A quarter of the populations are enough for a prior.
+    by_population, _ = _weights(y, log_prior, mean[::4], spread[::4])
     weights = np.mean(by_population / np.sum(by_population, axis=0), axis=1)
     drawn: FloatArray = generator.choice(y, DRAWS, p=weights / np.sum(weights))
     return drawn

@@ -25,9 +25,6 @@ __all__ = ["Specimen", "likelihoods", "shared", "specimen_of"]
 # Draws of a specimen that are kept.
 DRAWS = 1000
 
-# Places along a parameter, and draws of all others at each, that tell what the constraints cut off.
-PLACES, OTHERS = 33, 400
-
 
 @dataclass(frozen=True)
 class Specimen:
@@ -79,18 +76,9 @@ class Specimen:
 def specimen_of(
     name: str, posterior: Posterior, draws: FloatArray, generator: np.random.Generator
 ) -> Specimen:
-    """Keep of a posterior what a population needs.
+    """Keep of a specimen's posterior what a population needs.
 
-    Parameters
-    ----------
-    name
-        The specimen's name.
-    posterior
-        What was sampled.
-    draws
-        (draws, free) in their own units; ``DRAWS`` of them are chosen.
-    generator
-        Chooses them, and draws of the prior.
+    Of the draws (draws, free), in their own units, the generator chooses ``DRAWS``.
     """
     prior = posterior.prior
     table = posterior.table
@@ -107,19 +95,17 @@ def specimen_of(
     logarithmic = np.array([prior.free[i].positive for i in columns], dtype=np.bool_)
     y = _coordinates(chosen[:, columns], logarithmic)
     prior_coordinates = _coordinates(before[:, columns], logarithmic)
-    log_prior = [_log_prior(prior, i, chosen[:, i], generator) for i in columns]
-    log_prior = [
-        # dx/dy = x of the logarithm.
-        density + (y[:, n] if logarithmic[n] else 0.0)
-        for n, density in enumerate(log_prior)
-    ]
+    log_prior = np.empty_like(y)
+    for n, i in enumerate(columns):
+        log_prior[:, n] = _log_prior(prior, i, chosen[:, i], generator)
+    log_prior += np.where(logarithmic, y, 0.0)  # dx/dy = x of the logarithm
     return Specimen(
         name,
         tuple(prior.free[i].name for i in columns),
         tuple(prior.free[i].unit for i in columns),
         logarithmic,
         y,
-        np.stack(log_prior, axis=1) if columns else np.empty((len(y), 0)),
+        log_prior,
         np.mean(prior_coordinates, axis=0),
         np.std(prior_coordinates, axis=0),
     )
@@ -172,21 +158,22 @@ def _log_prior(
     Its own prior's, times the part of all others' prior that the constraints leave at x: by draws
     at some quantiles of x, and on straight lines between those.
     """
+    places, n_others = 33, 400
     marginal = prior.free[column].prior
     assert marginal is not None
-    others = np.stack([_single(p, generator) for p in prior.free], axis=1)
-    places = np.quantile(x, np.linspace(0, 1, PLACES))
-    tried = np.tile(others, (PLACES, 1))
-    tried[:, column] = np.repeat(places, OTHERS)
-    inside = np.isfinite(prior.log_density(tried)).reshape(PLACES, OTHERS)
+    others = np.stack([_single(p, n_others, generator) for p in prior.free], axis=1)
+    at = np.quantile(x, np.linspace(0, 1, places))
+    tried = np.tile(others, (places, 1))
+    tried[:, column] = np.repeat(at, n_others)
+    inside = np.isfinite(prior.log_density(tried)).reshape(places, n_others)
     # A place where draws of the posterior lie has not nothing.
-    possible = np.maximum(np.mean(inside, axis=1), 0.5 / OTHERS)
-    density: FloatArray = marginal.frozen.logpdf(x) + np.interp(x, places, np.log(possible))
+    possible = np.maximum(np.mean(inside, axis=1), 0.5 / n_others)
+    density: FloatArray = marginal.frozen.logpdf(x) + np.interp(x, at, np.log(possible))
     return density
 
 
-def _single(parameter: Parameter, generator: np.random.Generator) -> FloatArray:
-    """Draw from a parameter's own prior, whatever the others are, (OTHERS,)."""
+def _single(parameter: Parameter, size: int, generator: np.random.Generator) -> FloatArray:
+    """Draw from a parameter's own prior, whatever the others are, (size,)."""
     assert parameter.prior is not None
-    uniform = generator.uniform(*parameter.mass_between, OTHERS)
+    uniform = generator.uniform(*parameter.mass_between, size)
     return np.asarray(parameter.prior.frozen.ppf(uniform), dtype=np.float64)
