@@ -221,8 +221,8 @@ def _population_of(
     pairs = list(zip(specimens, columns, strict=True))
     logarithmic = bool(specimens[0].logarithmic[columns[0]])
     width = float(np.mean([specimen.prior_sd[i] for specimen, i in pairs]))
-    mean = float(np.mean([specimen.prior_mean[i] for specimen, i in pairs]))
-    prior = Hyperprior(mean, width, width)
+    center = float(np.mean([specimen.prior_mean[i] for specimen, i in pairs]))
+    prior = Hyperprior(center, width, width)
     normal = likelihoods(specimens, name)
     draws = [(specimen.draws[:, i], specimen.log_prior[:, i]) for specimen, i in pairs]
     mean, spread, is_normal, shapes, k = _populations(draws, normal, prior, generator)
