@@ -39,7 +39,7 @@ from tests.app.mutations import KINDS, Case, case
 from tests.measured import keep
 
 SEED = 1
-FEW, ALL, FITTED = 600, 10_000, 6
+FEW, ALL, FITTED = 600, 10_000, 3
 SECONDS = 10  # of processor time, for a case that takes some hundredths
 LONGEST_LINE = 700
 
