@@ -13,8 +13,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.problem.problem import generator
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.tracked import Tracking
-from bwbayes.control.tracking import track
+from bwbayes.control.tracking import Tracking, track
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import PROCESS_SD, PROCESS_TIME
 from tests.measured import keep

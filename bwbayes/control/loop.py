@@ -9,6 +9,7 @@ whether they look at the readings, and see the same noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,7 +21,23 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 
-__all__ = ["LoopNoise", "LoopPlan", "Stand", "TrackingErrors", "follow"]
+__all__ = [
+    "CONTROLLERS",
+    "LoopNoise",
+    "LoopPlan",
+    "Stand",
+    "TrackingErrors",
+    "follow",
+    "plan_loops",
+]
+
+# Each with whether it looks at the readings.
+CONTROLLERS = {
+    "no compensation": False,
+    "feed-forward": False,
+    "PID": True,
+    "PID with feed-forward": True,
+}
 
 
 @dataclass(frozen=True)
@@ -79,6 +96,67 @@ class TrackingErrors(NamedTuple):
     rms: FloatArray
     largest: FloatArray
     limited: FloatArray
+
+
+def plan_loops(
+    model: SampledModel, references: Sequence[tuple[FloatArray, int]], ends: Span, stand: Stand
+) -> Iterator[LoopPlan]:
+    """Yield what the four controllers do to follow references.
+
+    Parameters
+    ----------
+    model
+        The mean model, once for each row of the references.
+    references
+        (signals, samples), um, with the sample from which on errors count.
+    ends
+        The displacements, um, that slow sweeps between the amplifier's limits end at.
+    stand
+        The test stand.
+
+    Notes
+    -----
+    All references are fed forward at once, in the time that the longest takes: it is a step's own
+    cost that counts, not how many models do it. The others rest where they end.
+    """
+    longest = max(desired.shape[1] for desired, _ in references)
+    padded = [
+        np.pad(desired, ((0, 0), (0, longest - desired.shape[1])), mode="edge")
+        for desired, _ in references
+    ]
+    fed = _feed_forward(model, np.vstack(padded), stand)
+    limits = stand.limits
+    for (desired, begins), *parts in zip(
+        references, *(np.split(values, len(references)) for values in fed), strict=True
+    ):
+        command, reached = (part[:, : desired.shape[1]] for part in parts)
+        linear = limits.middle + (desired - ends.middle) * limits.half / ends.half
+        nothing = np.zeros_like(desired)
+        yield LoopPlan(
+            np.stack([np.clip(linear, *limits), command, nothing, command]),
+            np.stack([nothing, nothing, desired, reached]),
+            tuple(CONTROLLERS.values()),
+            desired,
+            begins,
+        )
+
+
+def _feed_forward(
+    model: SampledModel, desired: FloatArray, stand: Stand
+) -> tuple[FloatArray, FloatArray]:
+    """Return voltages for displacements (models, samples), and where the models go with them."""
+    command, reached = np.zeros_like(desired), np.zeros_like(desired)
+    state, last = model.begin(np.zeros(model.models)), np.zeros(model.models)
+    # A voltage is known to a small part of the DAC's step.
+    tolerance = 1e-4 * stand.amplifier.step
+    for t in range(desired.shape[1] - 1):
+        reached[:, t] = model.displacement(state)
+        guess, last = 2 * state.voltage - last, state.voltage
+        command[:, t], state = model.inverse(
+            state, desired[:, t + 1], stand.limits, guess, tolerance
+        )
+    reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
+    return command, reached
 
 
 def follow(

@@ -11,43 +11,256 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.gains import Robustness, design
-from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, TrackingErrors, follow
+from bwbayes.control.gains import Gains, Margins, Robustness, design
+from bwbayes.control.loop import CONTROLLERS, LoopNoise, Stand, follow, plan_loops
 from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel, require_inverse
-from bwbayes.control.tracked import CONTROLLERS, Tracking
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Picture,
+    Report,
+    Section,
+    Table,
+    kind_of,
+    standing_banner,
+)
+from bwbayes.shown import brief
 
-__all__ = ["track"]
-
-LOOKS = (False, False, True, True)
-
-# Of the reach of the mean model, what a reference swings by unless told otherwise.
-PART = 0.8
-
-# Frequencies of a decade, and the slowest, Hz.
-DECADE, SLOWEST = (1.0, 2.0, 5.0), 0.1
+__all__ = ["Tracking", "track"]
 
 # What dynamics that matter leave of a sine: half of its power.
 LEFT = math.sqrt(0.5)
 
-# Samples that a period must have.
-PER_PERIOD = 10
 
-# A middle that is nearer to zero than this part of the amplitude is zero.
-ROUND = 1e-3
+@dataclass(frozen=True)
+class Tracking:
+    """How well four controllers follow, for every draw.
 
-# Most samples of a signal.
-MOST_SAMPLES = 1_000_000
+    ``rms`` and ``largest`` error, um, and the share of samples ``limited`` by the amplifier are
+    (controllers, frequencies, signals, draws), in the order of ``CONTROLLERS``, ``frequencies``,
+    Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
+    take the time ``rise``, s. ``standing`` is how the validation of the run came out that gave the
+    draws, and ``name`` what it is called.
+    """
 
-# A feed-forward voltage is known to this part of the DAC's step.
-CLOSE = 1e-4
+    __repr__ = brief
+
+    gains: Gains
+    margins: Margins
+    robustness: Robustness
+    stand: Stand
+    frequencies: tuple[float, ...]
+    signals: tuple[str, ...]
+    middle: float
+    amplitude: float
+    rise: float
+    rms: FloatArray
+    largest: FloatArray
+    limited: FloatArray
+    standing: Standing = field(default_factory=Standing)
+    name: str = ""
+
+    @property
+    def best(self) -> FloatArray:
+        """Share of the draws in which PID with feed-forward has less rms error than either alone.
+
+        (frequencies, signals).
+        """
+        return np.asarray(np.mean(self.rms[3] < np.minimum(self.rms[1], self.rms[2]), axis=-1))
+
+    @property
+    def _cases(self) -> list[tuple[str, float, tuple[int, int]]]:
+        """Each signal at each frequency, Hz, and where their errors are."""
+        return [
+            (signal, frequency, (f, s))
+            for s, signal in enumerate(self.signals)
+            for f, frequency in enumerate(self.frequencies)
+        ]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the table: a row for each signal, frequency and controller."""
+        return [
+            {
+                "signal": signal,
+                "frequency_Hz": frequency,
+                "controller": controller,
+                **_mean_and_interval("rms_um", self.rms[c][at]),
+                **_mean_and_interval("largest_um", self.largest[c][at]),
+                "limited": float(np.mean(self.limited[c][at])),
+            }
+            for signal, frequency, at in self._cases
+            for c, controller in enumerate(CONTROLLERS)
+        ]
+
+    def to_pandas(self) -> Any:
+        """Return the table as a pandas.DataFrame."""
+        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
+
+        return pd.DataFrame(self.rows())
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all of it for a summary, with units in the names."""
+        gains, margins = self.gains, self.margins
+        return {
+            "name": self.name,
+            "validation": self.standing.numbers,
+            "controller": {
+                "proportional_V_per_um": gains.proportional,
+                "integral_V_per_um_s": gains.integral,
+                "derivative_V_s_per_um": gains.derivative,
+                "steps_V_per_um": list(gains.steps),
+                "interval_s": gains.interval,
+                "delay_samples": self.stand.delay,
+            },
+            "robustness": {
+                "gain_margin_asked": self.robustness.gain,
+                "phase_margin_asked_deg": self.robustness.phase,
+                "gain_margin_least": float(margins.gain.min()),
+                "phase_margin_least_deg": float(margins.phase.min()),
+                "crossover_Hz": [float(margins.crossover.min()), float(margins.crossover.max())],
+                "circle_criterion_least": float(margins.circle.min()),
+                "stable": margins.stable,
+                "draws": int(margins.gain.size),
+            },
+            "reference": {
+                "middle_um": self.middle,
+                "amplitude_um": self.amplitude,
+                "rise_s": self.rise,
+                "limits_V": list(self.stand.limits),
+            },
+            "draws": int(self.rms.shape[-1]),
+            "best_share": [
+                {"signal": signal, "frequency_Hz": frequency, "share": float(self.best[at])}
+                for signal, frequency, at in self._cases
+            ],
+            "table": self.rows(),
+        }
+
+    def report(self) -> Report:
+        """Return margins, error against frequency, errors, gains and the stand, to be shown."""
+        from bwbayes.report.figures.control import draw_tracking  # noqa: PLC0415
+
+        table = self.to_pandas()
+        picture = Picture(
+            "track",
+            "Error against frequency",
+            "Rms error of the actuator itself, not of the readings: the mean over the draws, and "
+            "where 95 % of them lie.",
+            partial(draw_tracking, table, CONTROLLERS),
+        )
+        return Report(
+            title=f"{self.name}, closed loop",
+            heading=f"Closed loop: {self.name}",
+            about=f"{self.rms.shape[-1]} draws of the posterior as actuators on the virtual test "
+            "stand; its mean is the model that the controller has",
+            banners=[*standing_banner(self.standing), self._stability(), self._comparison()],
+            blocks=[
+                picture,
+                Section("Errors", [self._errors()], folded=False),
+                Section("The controller", [self._gains()], folded=False),
+                Section("The test stand", [self._stand()], folded=False),
+            ],
+            numbers=self.numbers(),
+            csv=table.to_csv(index=False),
+        )
+
+    def _stability(self) -> Banner:
+        margins, requested = self.margins, self.robustness
+        line = (
+            f"{margins.gain.size} draws: gain margin at least {margins.gain.min():.2f} (required: "
+            f"{requested.gain:g}), phase margin at least {margins.phase.min():.0f}° (required: "
+            f"{requested.phase:g}°), crossover at {margins.crossover.min():.3g} to "
+            f"{margins.crossover.max():.3g} Hz; by the circle criterion stable however the slope "
+            "of the hysteresis changes"
+        )
+        return Banner(kind_of(self.standing), "Stable with every draw", [line])
+
+    def _comparison(self, highest: float = 20.0, required: float = 0.95) -> Banner:
+        """Say whether feedback and feed-forward together are best up to a frequency, Hz.
+
+        They are if they are better than either in at least the ``required`` share of the draws.
+        """
+        shares = [self.best[at] for _, frequency, at in self._cases if frequency <= highest]
+        if not shares:
+            line = f"no frequency up to {highest:g} Hz was simulated"
+            return Banner("note", "Feedback and feed-forward are not compared", [line])
+        lowest = min(shares)
+        share = "all" if lowest == 1 else f"at least {100 * lowest:.0f} % of the"
+        is_best = bool(lowest >= required)
+        line = (
+            "PID with feed-forward has less rms error than PID alone and feed-forward alone in "
+            f"{share} draws, on every signal up to {highest:g} Hz"
+        )
+        headline = f"Feedback and feed-forward together are {'' if is_best else 'not always '}best"
+        return Banner(kind_of(self.standing, good=is_best), headline, [line])
+
+    def _errors(self) -> Table:
+        rows = []
+        for signal, frequency, at in self._cases:
+            errors = (f"{rms[at].mean():.2f}" for rms in self.rms)
+            rows.append((f"{signal}, {frequency:g} Hz", *errors, f"{100 * self.best[at]:.0f}"))
+        return Table(
+            "errors",
+            "Rms error, µm, mean over the draws",
+            ("Signal", *CONTROLLERS, "Both best, % of draws"),
+            rows,
+            records=self.rows(),
+            note="The CSV has the spread over the draws, the largest errors, and how often the "
+            "amplifier was at a limit.",
+            on="both",
+        )
+
+    def _gains(self) -> Table:
+        gains = self.gains
+        rows = [
+            ("proportional", f"{gains.proportional:.5g}", "V/µm"),
+            ("integral", f"{gains.integral:.5g}", "V/(µm s)"),
+            ("derivative", f"{gains.derivative:.5g}", "V s/µm"),
+            *((f"q{i}", f"{step:.5g}", "V/µm") for i, step in zip("₀₁₂", gains.steps, strict=True)),
+        ]
+        return Table(
+            "gains",
+            "Gains",
+            ("Gain", "Value", "Unit"),
+            rows,
+            note="u[t] = u[t−1] + q₀ e[t] + q₁ e[t−1] + q₂ e[t−2], kept within the limits together "
+            "with what is fed forward. With feed-forward, e is what the mean model says of the fed "
+            "command, less the reading.",
+            on="both",
+        )
+
+    def _stand(self) -> Facts:
+        stand = self.stand
+        return Facts(
+            [
+                ("references", f"{self.amplitude:.4g} µm about {self.middle:.3g} µm"),
+                ("jumps", f"take {1e3 * self.rise:.3g} ms"),
+                ("limits", f"{stand.limits.low:.4g} to {stand.limits.high:.4g} V"),
+                ("sampling", f"every {1e3 * self.gains.interval:.3g} ms"),
+                ("delay", f"samples from a reading to the command that answers it: {stand.delay}"),
+                ("DAC", f"steps of {stand.amplifier.step:.3g} V, {stand.amplifier.slew:.3g} V/s"),
+                ("ADC", f"steps of {stand.sensor.step:.3g} µm"),
+                ("0 µm", "where the demagnetized actuator stands at zero volts"),
+            ]
+        )
+
+
+def _mean_and_interval(name: str, values: FloatArray) -> dict[str, float]:
+    """Return mean and 95 % interval over the draws."""
+    low, high = np.quantile(values, [0.025, 0.975])
+    return {name: float(values.mean()), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
 def track(
@@ -68,10 +281,8 @@ def track(
     ----------
     actuator
         Parts and the controller's interval; the voltage is held.
-    theta
-        (draws, parameters): the actuators that are simulated.
-    noise
-        Of those draws.
+    theta, noise
+        (draws, parameters): the actuators that are simulated, and what each has beside them.
     stand
         The test stand.
     generator
@@ -93,103 +304,50 @@ def track(
         A model that has no step or no inverse, margins that cannot be had, frequencies that are too
         fast or too slow, or an amplitude that is out of reach.
     """
-    robustness = robustness or Robustness()
+    robustness, limits = robustness or Robustness(), stand.limits
     all_theta = theta if all_theta is None else all_theta
-    mean = SampledModel.of(actuator, all_theta.mean(axis=0)[np.newaxis])
-    draws = SampledModel.of(actuator, all_theta)
-    limits = stand.limits
+    mean_theta = all_theta.mean(axis=0)
+    mean = SampledModel.of(actuator, mean_theta[np.newaxis])
     require_inverse(mean, limits)
     frequencies = _frequencies(mean, frequencies)
     ends = _reach(mean, limits)
-    amplitude = _amplitude(amplitude, ends)
+    if amplitude is None:
+        amplitude = 0.8 * ends.half
+    elif not 0 < amplitude <= ends.half:
+        raise InputError(
+            f"amplitude: {amplitude:g} um; give one above 0 and within the mean model's reach, "
+            f"which is {ends.half:.3g} um about {ends.middle:.3g} um"
+        )
     # A range about zero needs no way to its middle.
-    center = ends.middle if abs(ends.middle) > ROUND * amplitude else 0.0
+    center = ends.middle if abs(ends.middle) > 1e-3 * amplitude else 0.0
     rise = _rise(mean)
-    gains, satisfied = design(mean, draws, limits, stand.delay, robustness)
-
-    names = tuple(TRACKED)
-    rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(names), 1)))
+    draws = SampledModel.of(actuator, all_theta)
+    gains, margins = design(mean, draws, limits, stand.delay, robustness)
     references = [
         tracking_signals(frequency, actuator.interval, center, amplitude, rise)
         for frequency in frequencies
     ]
-    models = SampledModel.of(
-        actuator, np.tile(all_theta.mean(axis=0), (len(frequencies) * len(names), 1))
-    )
-    fed = _fed(models, [desired for desired, _ in references], stand)
-    followed: list[TrackingErrors] = []
-    for (desired, begins), (command, reached) in zip(references, fed, strict=True):
-        plan = _plan(desired, begins, command, reached, ends, limits)
-        followed.append(follow(plan, gains, rows, noise, stand, generator))
-    rms, largest, limited = (np.stack(results, axis=1) for results in zip(*followed, strict=True))
+    signals = tuple(TRACKED)
+    models = SampledModel.of(actuator, np.tile(mean_theta, (len(frequencies) * len(signals), 1)))
+    rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(signals), 1)))
+    errors = [
+        follow(plan, gains, rows, noise, stand, generator)
+        for plan in plan_loops(models, references, ends, stand)
+    ]
+    rms, largest, limited = (np.stack(values, axis=1) for values in zip(*errors, strict=True))
     return Tracking(
         gains,
-        satisfied,
+        margins,
         robustness,
         stand,
         frequencies,
-        names,
+        signals,
         center,
         amplitude,
         rise * actuator.interval,
         rms,
         largest,
         limited,
-    )
-
-
-def _fed(
-    model: SampledModel, references: Sequence[FloatArray], stand: Stand
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the voltage for each reference (signals, samples), and where the model goes with it.
-
-    All at once, in the time that the longest takes: it is a step's own cost that counts, not how
-    many models do it. Of that length the others rest where they end.
-    """
-    longest = max(reference.shape[1] for reference in references)
-    desired = np.vstack(
-        [
-            np.pad(reference, ((0, 0), (0, longest - reference.shape[1])), mode="edge")
-            for reference in references
-        ]
-    )
-    command, reached = np.zeros_like(desired), np.zeros_like(desired)
-    state = model.begin(np.zeros(model.models))
-    last, tolerance = np.zeros(model.models), CLOSE * stand.amplifier.step
-    for t in range(longest - 1):
-        reached[:, t] = model.displacement(state)
-        guess = 2 * state.voltage - last
-        last = state.voltage
-        command[:, t], state = model.inverse(
-            state, desired[:, t + 1], stand.limits, guess, tolerance
-        )
-    reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
-    ends = np.cumsum([reference.shape[0] for reference in references])[:-1]
-    parts = zip(references, np.split(command, ends), np.split(reached, ends), strict=True)
-    return [
-        (fed[:, : reference.shape[1]], delivered[:, : reference.shape[1]])
-        for reference, fed, delivered in parts
-    ]
-
-
-def _plan(
-    desired: FloatArray,
-    begins: int,
-    command: FloatArray,
-    reached: FloatArray,
-    ends: Span,
-    limits: Span,
-) -> LoopPlan:
-    """Return what the four controllers do to follow references (signals, samples)."""
-    slope = ends.half / limits.half
-    linear = np.clip(limits.middle + (desired - ends.middle) / slope, *limits)
-    nothing = np.zeros_like(desired)
-    return LoopPlan(
-        np.stack([linear, command, nothing, command]),
-        np.stack([nothing, nothing, desired, reached]),
-        LOOKS,
-        desired,
-        begins,
     )
 
 
@@ -203,18 +361,6 @@ def _reach(mean: SampledModel, limits: Span) -> Span:
     return Span(ends[4] - ends[0], ends[3] - ends[0])
 
 
-def _amplitude(amplitude: float | None, ends: Span) -> float:
-    """Return the references' amplitude, um."""
-    if amplitude is None:
-        return PART * ends.half
-    if not 0 < amplitude <= ends.half:
-        raise InputError(
-            f"amplitude: {amplitude:g} um; give one above 0 and within the mean model's reach, "
-            f"which is {ends.half:.3g} um about {ends.middle:.3g} um"
-        )
-    return amplitude
-
-
 def _rise(mean: SampledModel) -> int:
     """Return how many samples a jump of a reference is to take.
 
@@ -222,18 +368,19 @@ def _rise(mean: SampledModel) -> int:
     is a Hann window, stays within the reach that the amplitude is 80 % of.
     """
     turns = np.geomspace(1e-4, np.pi, 400)
-    response = np.abs(mean.frequency_response(turns))[0]
-    slow = turns[response < LEFT]
+    slow = turns[np.abs(mean.frequency_response(turns))[0] < LEFT]
     return max(round(4 / float(slow[0])), 1) if slow.size else 1
 
 
 def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tuple[float, ...]:
-    """Return the frequencies, Hz."""
+    """Return the frequencies, Hz: those requested, or 1, 2 and 5 of each decade from 0.1 Hz.
+
+    A period has ten samples or more, and a signal at most a million.
+    """
     interval = mean.actuator.interval
-    fastest = 1 / (PER_PERIOD * interval)
+    slowest, fastest = 3e-6 / interval, 0.1 / interval
     if frequencies is not None:
         for frequency in frequencies:
-            slowest = 3 / (MOST_SAMPLES * interval)
             if not slowest <= frequency <= fastest:
                 raise InputError(
                     f"frequencies: {frequency:g} Hz; at this rate give some from {slowest:.3g} to "
@@ -242,14 +389,9 @@ def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tup
         if not frequencies:
             raise InputError("frequencies: none is given; give some in Hz")
         return tuple(frequencies)
-    chosen: list[float] = []
-    for decade in range(math.floor(math.log10(SLOWEST)), math.ceil(math.log10(fastest)) + 1):
-        for digit in DECADE:
-            frequency = round(digit * 10.0**decade, 12)
-            if frequency > fastest:
-                return tuple(chosen)
-            chosen.append(frequency)
-            response = np.abs(mean.frequency_response(np.array([2 * np.pi * frequency * interval])))
-            if response[0, 0] < LEFT:
-                return tuple(chosen)
-    return tuple(chosen)
+    decades = range(-1, math.ceil(math.log10(fastest)) + 1)
+    every = [round(digit * 10.0**decade, 12) for decade in decades for digit in (1, 2, 5)]
+    allowed = np.array([frequency for frequency in every if frequency <= fastest])
+    response = np.abs(mean.frequency_response(2 * np.pi * interval * allowed))[0]
+    # The first one at which the dynamics matter is the last.
+    return tuple(allowed[: 1 + np.count_nonzero(np.cumprod(response >= LEFT))].tolist())

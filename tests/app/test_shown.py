@@ -22,8 +22,7 @@ from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.calibration.evaluation import judge
 from bwbayes.calibration.replicates import Experiment, replicates
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.tracked import Tracking
-from bwbayes.control.tracking import track
+from bwbayes.control.tracking import Tracking, track
 from bwbayes.diagnosis.validation import Background, assess
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model

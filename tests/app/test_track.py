@@ -14,7 +14,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.products import track as command
-from bwbayes.control.tracked import CONTROLLERS
+from bwbayes.control.loop import CONTROLLERS
 from bwbayes.errors import InputError
 
 FEW = ("--frequency", "2", "--frequency", "5", "--draws", "5")

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.loop import LoopNoise, Stand
+from bwbayes.control.loop import CONTROLLERS, LoopNoise, Stand
 from bwbayes.control.references import TRACKED, tracking_signals
-from bwbayes.control.tracked import CONTROLLERS, Tracking
-from bwbayes.control.tracking import track
+from bwbayes.control.tracking import Tracking, track
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span

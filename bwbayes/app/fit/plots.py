@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from bwbayes.app.problem.problem import Problem
-from bwbayes.control.tracked import CONTROLLERS, Tracking
+from bwbayes.control.loop import CONTROLLERS
+from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import drawn

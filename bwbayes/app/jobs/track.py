@@ -16,7 +16,7 @@ from bwbayes.app.jobs.export import at_rate
 from bwbayes.app.problem.problem import generator
 from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.tracked import Tracking
+from bwbayes.control.tracking import Tracking
 from bwbayes.control.tracking import track as tracked
 from bwbayes.errors import InputError
 from bwbayes.prediction.prediction import thinned

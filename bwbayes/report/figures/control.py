@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ def _draw_errors(
     panel.set(xlabel="time (s)", ylabel="error (µm)")
 
 
-def draw_tracking(table: Any, controllers: Sequence[str]) -> Figure:
+def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
     """Draw the rms errors of the controllers: mean over the draws, and where 95 % of them lie.
 
     The table is a pandas.DataFrame with a row for each signal, frequency and controller.
