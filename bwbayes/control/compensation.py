@@ -78,13 +78,8 @@ class _Plan:
         size = max(2_000_000 // voltage.size, 1)
         for start in range(0, len(states.model), size):
             rows = slice(start, start + size)
-            subset = replace(
-                states,
-                which=states.which[rows],
-                model=states.model[rows],
-                unrest=states.unrest[rows],
-                offset_sd=states.offset_sd[rows],
-            )
+            names = ("which", "model", "unrest", "offset_sd")
+            subset = replace(states, **{name: getattr(states, name)[rows] for name in names})
             yield rows, subset.displacement(voltage)
 
     def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
@@ -92,13 +87,8 @@ class _Plan:
         square, mean = 0.0, np.zeros(voltage.size)
         for rows, displacement in self.displacements(voltage):
             mean += weights[rows] @ displacement
-            square += self.squares(displacement)[1]
+            square += float(np.sum(np.mean((displacement - self.references[1]) ** 2, axis=1)))
         return math.sqrt(square / len(self.draws)), mean
-
-    def squares(self, displacement: FloatArray) -> FloatArray:
-        """Return squared errors, summed over draws, um², to the two references."""
-        errors = displacement - self.references[:, np.newaxis]
-        return np.asarray(np.sum(np.mean(errors**2, axis=2), axis=1))
 
     def played(self, voltage: FloatArray) -> Played:
         """Predict a command."""
@@ -111,8 +101,8 @@ class _Plan:
         rms, largest = np.empty((2, 2, len(theta)))
         squares = np.zeros(2)
         for rows, displacement in self.displacements(voltage):
-            squares += self.squares(displacement)
             for row, values in enumerate(displacement, rows.start):
+                squares += np.mean((values - self.references) ** 2, axis=1)
                 discrepancy = noise.draw(theta[row : row + 1], values.size, rng)[0]
                 errors = values + discrepancy - self.references
                 rms[:, row] = np.sqrt(np.mean(errors**2, axis=1))

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.linear import HOLD_NAMES, Hold
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.record.io.formats import write_record
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
@@ -41,12 +41,6 @@ Choice = Literal["mean", "expected"]
 
 FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.html")
 
-COMMANDS = {"mean": "inverse of the mean model", "expected": "least expected squared error"}
-HOLDS = {
-    "zero": "held until the next sample, as a DAC does (zero-order hold)",
-    "first": "straight lines (first-order hold)",
-}
-
 
 @dataclass(frozen=True, eq=False)
 class Errors:
@@ -62,19 +56,16 @@ class Errors:
     largest: FloatArray
     expected: float
 
-    def probability(self, limit: float) -> float:
-        """Return the probability that the error stays below a limit, um, at all samples."""
-        return float(np.mean(self.largest <= limit))
-
     def numbers(self, limit: float | None) -> dict[str, Any]:
-        """Return means and intervals, um, and the probability of the limit, if there is one."""
+        """Return means and intervals, um, and how probably a limit is kept, if there is one."""
         numbers: dict[str, Any] = {"expected_rms_um": self.expected}
         for name, values in (("rms_um", self.rms), ("largest_um", self.largest)):
-            numbers[name] = {"mean": float(np.mean(values))} | {
-                f"{level}": _interval(values, level) for level in LEVELS
-            }
+            numbers[name] = {"mean": float(np.mean(values))}
+            for level in LEVELS:
+                edges = np.quantile(values, [0.5 - level / 200, 0.5 + level / 200])
+                numbers[name][str(level)] = edges.tolist()
         if limit is not None:
-            numbers["probability_below_limit"] = self.probability(limit)
+            numbers["probability_below_limit"] = float(np.mean(self.largest <= limit))
         return numbers
 
 
@@ -99,11 +90,6 @@ class Played(Errors):
             **super().numbers(limit),
             "to_smoothed_reference": self.smoothed.numbers(limit),
         }
-
-
-def _interval(values: FloatArray, level: int) -> list[float]:
-    tail = (1 - level / 100) / 2
-    return [float(edge) for edge in np.quantile(values, [tail, 1 - tail])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +170,13 @@ class Compensation:
         yield "voltage_V", self.voltage
         bands = self.compensated.bands
         yield "mean_um", bands.mean
-        for kind in KINDS:
+        shown: list[tuple[str, Kind, float | FloatArray]] = [(kind, kind, 0.0) for kind in KINDS]
+        shown += [("error", "displacement", self.asked)]
+        shown += [("smoothed_error", "displacement", self.smoothed)]
+        for name, kind, reference in shown:
             for level in LEVELS:
-                yield f"{kind}_lower_{level}_um", bands.lower[kind, level]
-                yield f"{kind}_upper_{level}_um", bands.upper[kind, level]
-        for name, reference in (("error", self.asked), ("smoothed_error", self.smoothed)):
-            for level in LEVELS:
-                yield f"{name}_lower_{level}_um", bands.lower["displacement", level] - reference
-                yield f"{name}_upper_{level}_um", bands.upper["displacement", level] - reference
+                yield f"{name}_lower_{level}_um", bands.lower[kind, level] - reference
+                yield f"{name}_upper_{level}_um", bands.upper[kind, level] - reference
         yield "uncompensated_voltage_V", self.linear.voltage
         yield "uncompensated_mean_um", self.linear.bands.mean
 
@@ -229,18 +214,13 @@ class Compensation:
         """Return the predicted error beside that of a linear command, with pictures."""
         from bwbayes.report.figures import control as figures  # noqa: PLC0415  # slow to load
 
-        name, target, limit = self.reference.name, self.asked, self.limit
-        commands = self._commands
+        name, shown = self.reference.name, (self.asked, self._commands)
         validation = "" if self.standing.holds else f", validation {self.standing.status}"
-        headline = f"Predicted error{validation}"
+        promise = Banner(kind_of(self.standing), f"Predicted error{validation}", [self._promise()])
         return Report(
             title=f"{name}, compensation",
             heading=f"Compensation: {name}",
-            banners=[
-                *standing_banner(self.standing),
-                Banner(kind_of(self.standing), headline, [self._promise()]),
-                *remarks_banner(self.remarks),
-            ],
+            banners=[*standing_banner(self.standing), promise, *remarks_banner(self.remarks)],
             blocks=[
                 self._table(),
                 Picture(
@@ -248,7 +228,7 @@ class Compensation:
                     "Reference and prediction",
                     "The command, the displacement that it will give with its 95 % bands, and the "
                     "error; beside it what a linear command would do.",
-                    partial(figures.draw_command, name, target, commands, limit),
+                    partial(figures.draw_command, name, *shown, self.limit),
                 ),
                 Picture(
                     "error",
@@ -256,16 +236,16 @@ class Compensation:
                     "Left: the tracking error, to the reference as requested, with its 95 % bands; "
                     "dotted, the limit. Right: what its rms may be, with the discrepancy, over the "
                     "draws.",
-                    partial(figures.draw_error, target, commands, limit),
+                    partial(figures.draw_error, *shown, self.limit),
                 ),
                 Picture(
                     "loops",
                     "Before and after",
                     "What is predicted against the reference: without compensation the loop is "
                     "open.",
-                    partial(figures.draw_loops, target, commands),
+                    partial(figures.draw_loops, *shown),
                 ),
-                Section("Request", [Facts(self._facts())], folded=False),
+                Section("Request", [self._request()], folded=False),
             ],
             numbers=self.summary,
             csv=self.to_pandas().to_csv(index=False, float_format="%.9g"),
@@ -277,27 +257,27 @@ class Compensation:
         return {"uncompensated": self.linear, "compensated": self.compensated}
 
     def _promise(self) -> str:
-        after, before = self.compensated, self.linear
-        low, high = _interval(after.rms, 95)
+        after, before = (played.numbers(self.limit) for played in (self.compensated, self.linear))
+        low, high = after["rms_um"]["95"]
         text = (
-            f"rms error {np.mean(after.rms):.3g} µm (95 %: {low:.3g} to {high:.3g}), without "
-            f"compensation {np.mean(before.rms):.3g} µm"
+            f"rms error {after['rms_um']['mean']:.3g} µm (95 %: {low:.3g} to {high:.3g}), without "
+            f"compensation {before['rms_um']['mean']:.3g} µm"
         )
         if self.limit is not None:
-            within = after.probability(self.limit)
+            within = after["probability_below_limit"]
             text += f"; stays below {self.limit:g} µm with a probability of {within:.2f}"
         return text
 
     def _table(self) -> Table:
-        summary = self.summary
-        played = [summary["compensated"], summary["uncompensated"]]
-        rows = [("Voltage", *(_span(command["voltage_V"]) for command in played), "V")]
+        """Return a row for each number, with a column for each command."""
+        played = [command.numbers(self.limit) for command in (self.compensated, self.linear)]
+        rows = [("Voltage", *(_span(numbers["voltage_V"]) for numbers in played), "V")]
         rows += _error_rows("", played)
         if self.limit is not None:
-            texts = [f"{command['probability_below_limit']:.3f}" for command in played]
+            texts = [f"{numbers['probability_below_limit']:.3f}" for numbers in played]
             rows.append((f"Probability that the error stays below {self.limit:g} µm", *texts, ""))
         if self.reference.moved > 0:
-            smoothed = [command["to_smoothed_reference"] for command in played]
+            smoothed = [numbers["to_smoothed_reference"] for numbers in played]
             rows += _error_rows(" to the smoothed reference", smoothed)
         return Table(
             "error",
@@ -309,29 +289,32 @@ class Compensation:
             "reference over the slope of a straight line through the record that was fitted.",
         )
 
-    def _facts(self) -> list[tuple[str, str]]:
+    def _request(self) -> Facts:
         target, interval = self.asked, self.reference.interval
-        return [
-            (
-                "Reference",
-                f"{np.min(target):.4g} to {np.max(target):.4g} µm, "
-                f"{target.size} samples every {interval:g} s",
-            ),
-            ("Command", COMMANDS[self.command]),
-            ("Voltage between samples", HOLDS[self.hold]),
-            (
-                "Displacement between samples",
-                f"up to {self.between:.3g} µm from a straight line; errors are those at the "
-                "samples, just before the voltage changes",
-            ),
-            (
-                "Start",
-                "demagnetized at zero volts"
-                if self.from_rest
-                else "waited at zero volts, after any drive",
-            ),
-            ("0 µm", "where the actuator stands at zero volts as the command begins"),
-        ]
+        commands = {"mean": "inverse of the mean model", "expected": "least expected squared error"}
+        holds = {
+            "zero": "held until the next sample, as a DAC does (zero-order hold)",
+            "first": "straight lines (first-order hold)",
+        }
+        start = "demagnetized" if self.from_rest else "waited"
+        return Facts(
+            [
+                (
+                    "Reference",
+                    f"{np.min(target):.4g} to {np.max(target):.4g} µm, "
+                    f"{target.size} samples every {interval:g} s",
+                ),
+                ("Command", commands[self.command]),
+                ("Voltage between samples", holds[self.hold]),
+                (
+                    "Displacement between samples",
+                    f"up to {self.between:.3g} µm from a straight line; errors are those at the "
+                    "samples, just before the voltage changes",
+                ),
+                ("Start", f"{start} at zero volts{'' if self.from_rest else ', after any drive'}"),
+                ("0 µm", "where the actuator stands at zero volts as the command begins"),
+            ]
+        )
 
     def __repr__(self) -> str:
         promise = f"compensation for {self.reference.name}: {self._promise()}"

@@ -192,7 +192,9 @@ def test_the_probability_of_a_limit_is_that_of_the_largest_error(asked: Referenc
     command = compensated(of, asked, about(of, 0.02, 200, source), limit=4.0)
     numbers = command.summary["compensated"]
     assert 0 < numbers["probability_below_limit"] == np.mean(command.compensated.largest <= 4.0)
-    assert command.compensated.probability(4.0) > command.linear.probability(4.0)
+    assert command.compensated.numbers(4.0)["probability_below_limit"] > command.linear.probability(
+        4.0
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
