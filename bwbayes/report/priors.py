@@ -11,7 +11,7 @@ from markupsafe import Markup
 from bwbayes.diagnosis.conflict import effective
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.report.report import Table, TableColumn
-from bwbayes.report.tables import name_columns, parameter_words
+from bwbayes.report.tables import name_columns
 from bwbayes.report.words import unit_text
 
 __all__ = ["priors_table"]
@@ -26,27 +26,24 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
     """
     quantiles = effective(prior, np.random.default_rng(0))
     in_effect = dict(zip(prior.free_names, quantiles.T, strict=True))
-    rows = []
-    for parameter in prior.parameters:
-        effect, brief = "", f"fixed at {parameter.fixed:g}" if parameter.prior is None else ""
-        if parameter.prior is not None:
-            low, median, high = in_effect[parameter.name]
-            effect, brief = f"{median:.3g} ({low:.2g} to {high:.2g})", str(parameter.prior)
-            probabilities = parameter.prior.frozen.cdf([low, median, high])
-            # Constraints that move a quantile by less are not told from the draws' own error.
-            if max(abs(probabilities - [0.025, 0.5, 0.975])) > 0.03:
-                brief += f"\n  in effect {effect}"
-        rows.append(
-            (
-                parameter_words(parameter),
-                parameter.name,
-                _stated(parameter),
-                brief,
-                effect,
-                f"{point[parameter.name]:.5g}" if point and parameter.name in point else "",
-                unit_text(parameter.unit),
-            )
-        )
+
+    def effect(parameter: Parameter) -> str:
+        if parameter.prior is None:
+            return ""
+        low, median, high = in_effect[parameter.name]
+        return f"{median:.3g} ({low:.2g} to {high:.2g})"
+
+    def short(parameter: Parameter) -> str:
+        if parameter.prior is None:
+            return f"fixed at {parameter.fixed:g}"
+        probabilities = parameter.prior.frozen.cdf(in_effect[parameter.name])
+        # Constraints that move a quantile by less are not told from the draws' own error.
+        is_cut = max(abs(probabilities - [0.025, 0.5, 0.975])) > 0.03
+        return f"{parameter.prior}" + (f"\n  in effect {effect(parameter)}" if is_cut else "")
+
+    def estimate(parameter: Parameter) -> str:
+        return f"{point[parameter.name]:.5g}" if point and parameter.name in point else ""
+
     bounds = [
         parameter.declared.stated_bounds
         for parameter in prior.parameters
@@ -57,18 +54,18 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
         cut = Markup(
             'model\'s own constraints (<span id="constraints">{}</span>) have cut the joint prior'
         ).format("; ".join(bounds))
-    return Table(
+    return Table.of(
         "priors",
         "Priors and fixed values",
+        prior.parameters,
         (
             *name_columns("Parameter"),
-            TableColumn("Prior or value", on="page"),
-            TableColumn("Prior", on="screen"),
-            TableColumn("In effect", on="page"),
-            TableColumn("Point fit", on="both" if point else "nowhere"),
-            "Unit",
+            TableColumn("Prior or value", on="page", text=_stated),
+            TableColumn("Prior", on="screen", text=short),
+            TableColumn("In effect", on="page", text=effect),
+            TableColumn("Point fit", on="both" if point else "nowhere", text=estimate),
+            TableColumn("Unit", text=lambda parameter: unit_text(parameter.unit)),
         ),
-        rows,
         note=Markup(
             "In effect: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. "
             "The scales of default priors come from the training data's ranges of voltage and "

@@ -8,9 +8,9 @@ is shown; a :class:`~markupsafe.Markup` is taken as HTML.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from bwbayes.diagnosis.standing import Standing
 
@@ -30,6 +30,7 @@ __all__ = [
     "SideBySide",
     "Table",
     "TableColumn",
+    "Target",
     "Text",
     "kind_of",
     "remarks_banner",
@@ -47,11 +48,15 @@ type Block = Table | Picture | Facts | Text | Glossary | Section | SideBySide
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column of a table: its title, that of the columns about it, and where it is shown."""
+    """A column of a table: its title, that of the columns about it, and where it is shown.
+
+    ``text`` returns what a cell says of the row's item; see :meth:`Table.of`.
+    """
 
     title: str
     group: str = ""
     on: Target = "both"
+    text: Callable[[Any], str] = str
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,19 @@ class Table:
     records: Sequence[Mapping[str, object]] = ()
     note: str = ""
     on: Target = "page"
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        caption: str,
+        items: Iterable[Any],
+        columns: Sequence[TableColumn],
+        **rest: Any,
+    ) -> Self:
+        """Return a table with a row for each item, whose texts the columns write."""
+        rows = [[column.text(item) for column in columns] for item in items]
+        return cls(name, caption, columns, rows, **rest)
 
     def cells(self, target: Target) -> tuple[list[TableColumn], list[list[str]]]:
         """Return the columns, and the texts of each row, that are shown on a screen or a page."""

@@ -238,13 +238,13 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
     blocks: list[Block] = [
         Section("Readings against the bands", [*shown[:1], *validation, *shown[1:]], folded=False)
     ]
-    loops, steps = tables.loops_table(result, numbers), tables.steps_table(result, numbers)
-    if loops is not None:
-        drawn = [pictures["loops"]] if "loops" in pictures else []
-        blocks.append(Section("Loops", [loops, *drawn, Glossary(LOOP_TERMS)], folded=False))
-    if steps is not None:
-        drawn = [pictures["steps"]] if "steps" in pictures else []
-        blocks.append(Section("Step responses", [steps, *drawn], folded=False))
+    if result.loops is not None:
+        measured = tables.loops_table(result.loops, numbers)
+        loops: list[Block] = [measured, pictures["loops"], Glossary(LOOP_TERMS)]
+        blocks.append(Section("Loops", loops, folded=False))
+    if result.steps:
+        steps: list[Block] = [tables.steps_table(result.steps, numbers), pictures["steps"]]
+        blocks.append(Section("Step responses", steps, folded=False))
     return [*blocks, Text(_moves(result), on="screen")]
 
 
@@ -266,10 +266,10 @@ def _chains(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> l
 def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> Iterator[Section]:
     priors = priors_table(JointPrior(result.parameters))
     yield Section("Priors and fixed values", [replace(priors, on="page")])
-    learned = tables.learned_table(result)
-    if learned is not None and result.learned is not None:
+    if result.learned is not None:
         remarks = [Text(str(finding)) for finding in result.learned.findings]
-        yield Section("What the record taught", [learned, *remarks])
+        table = tables.learned_table(result, result.learned)
+        yield Section("What the record taught", [table, *remarks])
     if result.replicated:
         note = (
             "Each number of the fitted readings, among those of records that posterior draws make "
@@ -279,8 +279,7 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
         checks = tables.replicated_tables(result)
         yield Section("Would the model make this record?", [*checks, Text(note, note=True)])
     if result.outcome.converged:
-        if "corner" in pictures:
-            yield Section("Posterior", [pictures["corner"]])
+        yield Section("Posterior", [pictures["corner"]])
         chains = [pictures[name] for name in ("trace", "ranks")]
         yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
     yield Section("Moves", [tables.moves_table(result)])

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from markupsafe import Markup
 
+from bwbayes.diagnosis.information import Learned
 from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import LEVELS
-from bwbayes.prediction.loops import MEASURES, Estimate
+from bwbayes.prediction.loops import MEASURES, Estimate, Loops
 from bwbayes.prediction.scores import Scores
-from bwbayes.prediction.steps import STEP_MEASURES
-from bwbayes.report.report import Table, TableColumn
+from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
+from bwbayes.report.report import Table, TableColumn, Target
 from bwbayes.report.result import Result
 from bwbayes.report.words import covered, digits, error_text, mark, symbol, unit_text
 
@@ -41,70 +42,60 @@ UNKNOWN = "–"
 def parameters_table(result: Result, numbers: Summary) -> Table:
     """Return the estimate of each free parameter."""
     estimates = numbers["parameters"]
-    rows = []
-    for parameter in result.free:
+    truth_on: Target = "nowhere"
+    if any("truth" in estimate for estimate in estimates.values()):
+        truth_on = "page"
+
+    def number(key: str) -> Callable[[Parameter], str]:
+        """Return what writes a number as exactly as it is known."""
+        return lambda p: digits(estimates[p.name][key], estimates[p.name]["sd"])
+
+    def truth(parameter: Parameter) -> str:
+        value = estimates[parameter.name].get("truth")
+        return UNKNOWN if value is None else f"{value:.6g}"
+
+    def ess(parameter: Parameter) -> str:
         estimate = estimates[parameter.name]
-        mean, sd, lower, upper = (
-            digits(estimate[key], estimate["sd"]) for key in ("mean", "sd", "lower_95", "upper_95")
-        )
-        rows.append(
-            (
-                parameter_words(parameter),
-                parameter.name,
-                f"{mean} ± {sd}",
-                mean,
-                sd,
-                f"{lower} to {upper}",
-                unit_text(parameter.unit),
-                f"{estimate['truth']:.6g}" if "truth" in estimate else UNKNOWN,
-                f"{min(estimate['ess_bulk'], estimate['ess_tail']):.0f}",
-                f"{estimate['rhat']:.3f}",
-            )
-        )
-    has_truth = any("truth" in estimates[parameter.name] for parameter in result.free)
+        return f"{min(estimate['ess_bulk'], estimate['ess_tail']):.0f}"
+
+    mean, sd, lower, upper = map(number, ("mean", "sd", "lower_95", "upper_95"))
     columns = (
         *name_columns("Parameter"),
-        TableColumn("Mean ± SD", on="page"),
-        TableColumn("Mean", on="screen"),
-        TableColumn("SD", on="screen"),
-        "95% interval",
-        "Unit",
-        TableColumn("Truth", on="page" if has_truth else "nowhere"),
-        TableColumn("ESS", on="screen"),
-        TableColumn("R-hat", on="screen"),
+        TableColumn("Mean ± SD", on="page", text=lambda p: f"{mean(p)} ± {sd(p)}"),
+        TableColumn("Mean", on="screen", text=mean),
+        TableColumn("SD", on="screen", text=sd),
+        TableColumn("95% interval", text=lambda p: f"{lower(p)} to {upper(p)}"),
+        TableColumn("Unit", text=lambda p: unit_text(p.unit)),
+        TableColumn("Truth", on=truth_on, text=truth),
+        TableColumn("ESS", on="screen", text=ess),
+        TableColumn("R-hat", on="screen", text=lambda p: f"{estimates[p.name]['rhat']:.3f}"),
     )
     records = [{"parameter": p.name, **estimates[p.name]} for p in result.free]
-    return Table("parameters", "Parameters", columns, rows, records=records, on="both")
+    return Table.of("parameters", "Parameters", result.free, columns, records=records, on="both")
 
 
 def sampling_table(result: Result, numbers: Summary) -> Table:
     """Return how well each free parameter was sampled; without convergence that alone."""
-    check, estimates = result.outcome.check, numbers["parameters"]
-    rows = []
-    for i, parameter in enumerate(result.free):
-        row = [
-            parameter_words(parameter),
-            f"{check.ess_bulk[i]:.0f}",
-            f"{check.ess_tail[i]:.0f}",
-            f"{check.rhat[i]:.4f}",
-        ]
-        if estimates:
-            estimate = estimates[parameter.name]
-            row += [f"{estimate['mcse_mean']:.2g}", digits(estimate["median"], estimate["sd"])]
-            row.append(unit_text(parameter.unit))
-        rows.append(row)
-    columns = ["Parameter", "ESS bulk", "ESS tail", "R\N{COMBINING CIRCUMFLEX ACCENT}"]
+    check, estimates = result.outcome.check, numbers["parameters"] or {}
+    agreement = "R\N{COMBINING CIRCUMFLEX ACCENT}"
     note = (
         "ESS: effective number of draws, in the bulk and in the tails; "
-        "R\N{COMBINING CIRCUMFLEX ACCENT}: agreement of the ensembles, 1 when they agree"
+        f"{agreement}: agreement of the ensembles, 1 when they agree"
     )
-    return Table(
-        "sampling",
-        "Sampling of each parameter",
-        [*columns, "MCSE", "Median", "Unit"] if estimates else columns,
-        rows,
-        note=f"{note}; MCSE: Monte Carlo standard error of the mean." if estimates else f"{note}.",
-    )
+    columns = ["Parameter", "ESS bulk", "ESS tail", agreement]
+    if estimates:
+        columns += ["MCSE", "Median", "Unit"]
+        note += "; MCSE: Monte Carlo standard error of the mean"
+    rows = []
+    for i, parameter in enumerate(result.free):
+        sizes = f"{check.ess_bulk[i]:.0f}", f"{check.ess_tail[i]:.0f}"
+        row = [parameter_words(parameter), *sizes, f"{check.rhat[i]:.4f}"]
+        if estimates:
+            estimate = estimates[parameter.name]
+            median = digits(estimate["median"], estimate["sd"])
+            row += [f"{estimate['mcse_mean']:.2g}", median, unit_text(parameter.unit)]
+        rows.append(row)
+    return Table("sampling", "Sampling of each parameter", columns, rows, note=f"{note}.")
 
 
 def moves_table(result: Result) -> Table:
@@ -123,27 +114,18 @@ def moves_table(result: Result) -> Table:
     return Table("moves", "Moves", ("Move", "Proposed to a walker", "Accepted"), rows, note=note)
 
 
-def learned_table(result: Result) -> Table | None:
+def learned_table(result: Result, learned: Learned) -> Table:
     """Return how far the record narrowed each parameter, and what its posterior depends on."""
-    if result.learned is None:
-        return None
     rows = []
     for parameter in result.free:
-        learned = result.learned.parameters[parameter.name]
-        rows.append(
-            (
-                parameter_words(parameter),
-                f"{learned.contraction:.2f}",
-                f"{learned.prior:.2f}",
-                f"{learned.likelihood:.2f}",
-                "the prior" if learned.prior_decides else "the readings",
-            )
-        )
-    columns = ("Parameter", "Contraction", "To the prior", "To the readings", "Decided by")
+        about = learned.parameters[parameter.name]
+        shares = (f"{share:.2f}" for share in (about.contraction, about.prior, about.likelihood))
+        decided = "the prior" if about.prior_decides else "the readings"
+        rows.append((parameter_words(parameter), *shares, decided))
     return Table(
         "taught",
         "What the record taught",
-        columns,
+        ("Parameter", "Contraction", "To the prior", "To the readings", "Decided by"),
         rows,
         note="Contraction: 1 - (posterior SD / prior SD)², in the prior's normal scores; near 1 "
         "the record decided, near 0 it told nothing. Sensitivity of the posterior to a small "
@@ -153,26 +135,25 @@ def learned_table(result: Result) -> Table | None:
 
 def replicated_tables(result: Result) -> list[Table]:
     """Return the numbers of each fitted record among those of replicated records."""
-    columns = ("Number", "Observed", "95 % of replicated", "Unit", "p", "Odd")
-    tables = []
-    for name, checked in result.replicated.items():
-        rows = []
-        for key, statistic in checked.statistics.items():
-            words, unit = STATISTICS[key]
-            rows.append(
-                (
-                    words,
-                    f"{statistic.observed:.4g}",
-                    f"{statistic.lower:.4g} to {statistic.upper:.4g}",
-                    unit_text(unit),
-                    f"{statistic.p:.3f}",
-                    "odd" if statistic.odd else "",
-                )
-            )
-        record = f" of {name}" if len(result.replicated) > 1 else ""
-        caption = f"Posterior predictive checks{record}"
-        tables.append(Table(f"replicated-{name}", caption, columns, rows))
-    return tables
+    columns = (
+        TableColumn("Number", text=lambda item: STATISTICS[item[0]][0]),
+        TableColumn("Observed", text=lambda item: f"{item[1].observed:.4g}"),
+        TableColumn(
+            "95 % of replicated", text=lambda item: f"{item[1].lower:.4g} to {item[1].upper:.4g}"
+        ),
+        TableColumn("Unit", text=lambda item: unit_text(STATISTICS[item[0]][1])),
+        TableColumn("p", text=lambda item: f"{item[1].p:.3f}"),
+        TableColumn("Odd", text=lambda item: "odd" if item[1].odd else ""),
+    )
+    return [
+        Table.of(
+            f"replicated-{name}",
+            f"Posterior predictive checks{f' of {name}' if len(result.replicated) > 1 else ''}",
+            checked.statistics.items(),
+            columns,
+        )
+        for name, checked in result.replicated.items()
+    ]
 
 
 def scores_table(
@@ -185,45 +166,41 @@ def scores_table(
 
     Parameters
     ----------
-    scores, verdicts
-        By the bands' names, in their order.
-    titles
-        The bands' titles on the page.
+    scores, verdicts, titles
+        By the bands' names, in their order; the titles are for the page.
     records
         The rows of the CSV.
     """
-    rows = []
-    for name, score in scores.items():
-        coverage = [covered(score, "sensor", level).removesuffix(" %") for level in LEVELS]
-        plain = (score.coverage["sensor"] or {}).values()
-        rows.append(
-            (
-                titles[name],
-                name,
-                mark(verdicts[name].status) if name in verdicts else UNKNOWN,
-                error_text(score),
-                f"{100 * score.nrmse:.2f}%",
-                f"{score.max_error_um:.2f} µm",
-                f"{score.width_um[95]:.2f} µm",
-                f"{', '.join(coverage)}%",
-                "/".join(f"{100 * share:.1f}" for share in plain),
-            )
-        )
-    levels = ", ".join(map(str, LEVELS))
-    return Table(
+
+    def coverage(name: str) -> str:
+        texts = (covered(scores[name], "sensor", level).removesuffix(" %") for level in LEVELS)
+        return f"{', '.join(texts)}%"
+
+    def plain_coverage(name: str) -> str:
+        shares = (scores[name].coverage["sensor"] or {}).values()
+        return "/".join(f"{100 * share:.1f}" for share in shares)
+
+    def status(name: str) -> str:
+        return mark(verdicts[name].status) if name in verdicts else UNKNOWN
+
+    levels = [str(level) for level in LEVELS]
+    return Table.of(
         "validation",
         "Band validation",
+        scores,
         (
-            *name_columns("Record"),
-            "Validation",
-            TableColumn("NRMSE", on="page"),
-            TableColumn("NRMSE", on="screen"),
-            "Max error",
-            "Width 95%",
-            TableColumn(f"Coverage of the {levels}% sensor bands", on="page"),
-            TableColumn(f"Coverage {'/'.join(map(str, LEVELS))}%", on="screen"),
+            TableColumn("Record", on="page", text=titles.__getitem__),
+            TableColumn("Record", on="screen"),
+            TableColumn("Validation", text=status),
+            TableColumn("NRMSE", on="page", text=lambda n: error_text(scores[n])),
+            TableColumn("NRMSE", on="screen", text=lambda n: f"{100 * scores[n].nrmse:.2f}%"),
+            TableColumn("Max error", text=lambda n: f"{scores[n].max_error_um:.2f} µm"),
+            TableColumn("Width 95%", text=lambda n: f"{scores[n].width_um[95]:.2f} µm"),
+            TableColumn(
+                f"Coverage of the {', '.join(levels)}% sensor bands", on="page", text=coverage
+            ),
+            TableColumn(f"Coverage {'/'.join(levels)}%", on="screen", text=plain_coverage),
         ),
-        rows,
         records=records,
         note="NRMSE: root mean square of measured minus mean, over the range of the measured "
         "displacement. ±: one standard error from a block bootstrap, because neighboring samples "
@@ -236,31 +213,28 @@ def other_scores_table(
     scores: Mapping[str, Scores], titles: Mapping[str, str], records: Sequence[Mapping[str, object]]
 ) -> Table:
     """Return the other scores: a column for each of the bands, rows where anything is known."""
-    columns = [_other_scores(score) for score in scores.values()]
+    columns_of = [_other_scores(score) for score in scores.values()]
     rows = [
         [row[0][0], *(text or UNKNOWN for _, text in row)]
-        for row in zip(*columns, strict=True)
+        for row in zip(*columns_of, strict=True)
         if any(text for _, text in row)
     ]
-    titled = ["Quantity", *(titles[name] for name in scores)]
-    return Table("scores", "Other scores", titled, rows, records=records)
+    columns = ["Quantity", *(titles[name] for name in scores)]
+    return Table("scores", "Other scores", columns, rows, records=records)
 
 
-def loops_table(result: Result, numbers: Summary) -> Table | None:
-    """Return what was measured of the loops, if anything."""
-    if not result.outcome.converged or result.loops is None:
-        return None
-    loops = {"Major": result.loops.major, "Minor": result.loops.minor}
+def loops_table(loops: Loops, numbers: Summary) -> Table:
+    """Return what was measured of the loops."""
     estimates = {
         f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V": loop.estimates
-        for name, loop in loops.items()
+        for name, loop in (("Major", loops.major), ("Minor", loops.minor))
     }
     note = (
         "Of the model driven slowly from turn to turn until the loop closes, without dynamics, "
         "creep and offset; from the posterior of the parameters alone, without the model's "
         "discrepancy."
     )
-    if not all(loop.closed for loop in loops.values()):
+    if not (loops.major.closed and loops.minor.closed):
         note += (
             " Some of the models' loops had not closed after a thousand cycles and are taken as "
             "they were."
@@ -269,13 +243,11 @@ def loops_table(result: Result, numbers: Summary) -> Table | None:
     return _measured("loops", "Measured loops", MEASURES, estimates, records, note)
 
 
-def steps_table(result: Result, numbers: Summary) -> Table | None:
-    """Return what was measured of the steps, if anything."""
-    if not result.outcome.converged or not result.steps:
-        return None
+def steps_table(steps: Mapping[str, StepResponse], numbers: Summary) -> Table:
+    """Return what was measured of the steps."""
     estimates = {
         f"{name}: {response.step.height:.4g} V for {response.step.held:.4g} s": response.estimates
-        for name, response in result.steps.items()
+        for name, response in steps.items()
     }
     note = (
         "To an ideal step from zero, demagnetized and at rest, from the posterior of the "
@@ -328,8 +300,9 @@ def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any
 
 
 def name_columns(title: str) -> tuple[TableColumn, TableColumn]:
-    """Return the column of the row headers: in words on a page, a bare name on a screen."""
-    return TableColumn(title, on="page"), TableColumn(title, on="screen")
+    """Return the columns of parameters' names: in words on a page, bare on a screen."""
+    bare = TableColumn(title, on="screen", text=lambda parameter: parameter.name)
+    return TableColumn(title, on="page", text=parameter_words), bare
 
 
 def parameter_words(parameter: Parameter) -> Markup:
