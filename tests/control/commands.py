@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -32,6 +33,7 @@ from bwbayes.record.teststand import LaserSensor, VirtualTestStand
 from bwbayes.record.waveforms import signal
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.sampler import first_chain, sample
+from tests.measured import keep
 
 __all__ = [
     "CONFIG",
@@ -47,6 +49,7 @@ __all__ = [
     "problem",
     "promised",
     "rms",
+    "study",
 ]
 
 CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
@@ -176,6 +179,21 @@ def off(held: dict[tuple[str, int], float], count: int) -> dict[tuple[str, int],
         (kind, level): (part - level / 100) / np.sqrt(level / 100 * (1 - level / 100) / count)
         for (kind, level), part in held.items()
     }
+
+
+def study(name: str, parts: Iterable[Mapping[tuple[str, int], float]]) -> dict[str, list[float]]:
+    """Keep, and return, what fits' commands held: the mean, and its standard errors off nominal."""
+    rows = list(parts)
+    figures = {}
+    for kind, level in rows[0]:
+        values = np.array([row[kind, level] for row in rows])
+        p, spread = level / 100, np.std(values, ddof=1)
+        if set(values) <= {0.0, 1.0}:
+            spread = np.sqrt(p * (1 - p))
+        off = (np.mean(values) - p) / spread * values.size**0.5
+        figures[f"{kind} {level}"] = [float(np.mean(values)), float(off)]
+    keep(name, figures)
+    return figures
 
 
 def rms(error: FloatArray) -> float:

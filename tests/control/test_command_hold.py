@@ -32,8 +32,8 @@ from tests.control.commands import (
     off,
     problem,
     promised,
+    study,
 )
-from tests.measured import keep
 
 RATE, SEEDS, PLAYS = 200.0, 40, 5
 
@@ -142,16 +142,7 @@ def parts(seed: int, hold: Hold) -> dict[tuple[str, int], float]:
 @pytest.mark.slow
 def test_forty_fits_to_measured_voltages_are_where_their_commands_say() -> None:
     """The 95 % bands of the error cover 93 to 97 %; all within three standard errors."""
-    held: dict[tuple[str, int], list[float]] = {}
-    for seed in range(SEEDS):
-        for key, part in parts(seed, "zero").items():
-            held.setdefault(key, []).append(part)
-    figures = {}
-    for (kind, level), values in held.items():
-        error = np.std(values, ddof=1) / SEEDS**0.5
-        off = (np.mean(values) - level / 100) / error
-        figures[f"{kind} {level}"] = [float(np.mean(values)), float(off)]
-    keep("compensation by a DAC", figures)
+    figures = study("compensation by a DAC", (parts(seed, "zero") for seed in range(SEEDS)))
     assert 0.93 <= figures["band 95"][0] <= 0.97, figures
     assert max(abs(error) for _, error in figures.values()) < 3.0, figures
 

@@ -26,8 +26,17 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import signal
-from tests.control.commands import about, compensated, drawn, inside, off, problem, promised, rms
-from tests.measured import keep
+from tests.control.commands import (
+    about,
+    compensated,
+    drawn,
+    inside,
+    off,
+    problem,
+    promised,
+    rms,
+    study,
+)
 
 # Displacement per volt of the paper's signals when they are asked for, and the sd of the smoothing
 # of those that jump, s.
@@ -187,17 +196,6 @@ def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> Non
     assert any("errors are those to the reference as requested" in one for one in command.remarks)
 
 
-def test_the_probability_of_a_limit_is_that_of_the_largest_error(asked: Reference) -> None:
-    of, source = problem(), np.random.default_rng(3)
-    command = compensated(of, asked, about(of, 0.02, 200, source), limit=4.0)
-    compensated_share, linear_share = (
-        command.summary[name]["probability_below_limit"]
-        for name in ("compensated", "uncompensated")
-    )
-    assert 0 < compensated_share == np.mean(command.compensated.largest <= 4.0)
-    assert compensated_share > linear_share
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_shapes_begin_at_rest_and_reach_their_amplitude(shape: str) -> None:
     made_shape = shaped(shape, 1e-3, 40.0, 1.0, middle=20.0, periods=3)
@@ -253,22 +251,13 @@ def test_what_is_out_of_reach_is_said_with_its_place_and_time() -> None:
 @pytest.mark.slow
 def test_forty_seeds_of_the_stand_are_where_their_commands_say() -> None:
     """Fit, compensate, run the stand with its discrepancy; three standard errors."""
-    held: dict[tuple[str, int], list[float]] = {}
-    for seed in range(40):
+
+    def part(seed: int) -> dict[tuple[str, int], float]:
         of = problem.__wrapped__("process", 1000.0, seed)
         asked = shaped("triangle", 1e-3, 40.0, 0.5, periods=8)
         command = compensated(of, asked, drawn(of, seed))
         error = reached(asked, command.voltage, "process", 10_000 + seed)
-        truth = error + np.asarray(asked.displacement)
-        for key, part in inside(command, truth).items():
-            held.setdefault(key, []).append(part)
-    figures = {}
-    for (kind, level), parts in held.items():
-        p, values = level / 100, np.array(parts)
-        spread = np.std(values, ddof=1)
-        if kind == "rms":
-            spread = np.sqrt(p * (1 - p))
-        off = (np.mean(values) - p) / spread * 40**0.5
-        figures[f"{kind} {level}"] = [float(np.mean(values)), float(off)]
-    keep("compensation", figures)
+        return inside(command, error + np.asarray(asked.displacement))
+
+    figures = study("compensation", map(part, range(40)))
     assert max(abs(error) for _, error in figures.values()) < 3.0, figures

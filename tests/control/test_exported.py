@@ -101,21 +101,6 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["bouc-wen with all", "linear, second-order, creep"])
-def test_the_frequency_response_is_that_of_the_system(name: str) -> None:
-    actuator = cases.actuator(name, "zero")
-    theta = cases.theta(actuator, 2, name)
-    turns = np.linspace(0.01, 3.1, 50)
-    response = SampledModel.of(actuator, theta).frequency_response(turns)
-    for row, values in zip(response, theta, strict=True):
-        system = SampledModel.of(actuator, values[np.newaxis]).linear
-        z = np.exp(1j * turns)
-        eye = np.eye(len(system.A))
-        each = [system.C @ np.linalg.solve(one * eye - system.A, system.B) + system.D for one in z]
-        # Together, as if nothing grew with the voltage.
-        np.testing.assert_allclose(row, np.sum(each, axis=(1, 2)), rtol=1e-10)
-
-
 @pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, gain"])
 def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     made = of(name, "first")
@@ -135,14 +120,6 @@ def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     system = made.linear
     for matrix in "ABCD":
         np.testing.assert_array_equal(numbers["state_space"][matrix], getattr(system, matrix))
-
-
-def test_an_exponent_says_in_what_units_beta_and_gamma_are() -> None:
-    units = [
-        [of(name, "first").numbers()["parameters"][one]["unit"] for one in ("beta", "gamma")]
-        for name in ("bouc-wen, second-order", "bouc-wen, n = 1.7, lag")
-    ]
-    assert [["1/V"] * 2, ["um^(1-n)/V"] * 2] == units
 
 
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)])

@@ -5,45 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Hold
 from bwbayes.model.registry import HYSTERESIS, made
 from tests.control import cases
 
 every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
-
-
-def stepped(model: SampledModel, voltage: FloatArray) -> FloatArray:
-    """Return the displacement (models, samples) of all models along one voltage."""
-    state = model.begin(np.full(model.models, voltage[0]))
-    rows = []
-    for one in voltage:
-        displacement, state = model.forward(state, np.full(model.models, one))
-        rows.append(displacement)
-    return np.stack(rows, axis=1)
-
-
-@pytest.mark.parametrize("name", ["bouc-wen with all", "maxwell-slip with all"])
-@pytest.mark.parametrize("hold", cases.HOLDS)
-def test_steps_are_the_simulation_and_their_inverse_leads_back(name: str, hold: Hold) -> None:
-    """To 1e-12 and 1e-11 of the range; every actuator is tried as C, which holds the same steps."""
-    actuator = cases.actuator(name, hold)
-    theta, voltage = cases.theta(actuator, 3, name), cases.drive(600)
-    model = SampledModel.of(actuator, theta)
-    expected = actuator.displacement(theta, voltage, from_rest=True)
-    expected -= theta[:, [actuator.parameters.index("offset")]]
-    reference = stepped(model, voltage)
-    np.testing.assert_allclose(reference, expected, rtol=0, atol=1e-12 * 140)
-    back, forth = model.begin(np.full(3, voltage[0])), model.begin(np.full(3, voltage[0]))
-    late = int(hold == "zero")
-    for t in range(200):
-        command, back = model.inverse(back, reference[:, t + late], cases.SPAN)
-        np.testing.assert_allclose(command, voltage[t], rtol=0, atol=1e-8)
-        displacement, forth = model.forward(forth, command)
-        np.testing.assert_allclose(displacement, reference[:, t], rtol=0, atol=1e-11 * 140)
 
 
 @every_actuator
@@ -74,14 +42,6 @@ def test_operators_without_a_step_are_refused(name: str) -> None:
     column = {one.name: np.ones(1) for one in operator.parameters}
     with pytest.raises(InputError, match=r"no step of bounded time .* such as bouc-wen"):
         operator.step(column)
-
-
-def test_a_model_that_turns_back_has_no_inverse() -> None:
-    actuator = Actuator("none")
-    theta = cases.theta(actuator)
-    theta[0, actuator.parameters.index("d")] = 0.4
-    with pytest.raises(InputError, match="more than one voltage"):
-        require_inverse(SampledModel.of(actuator, theta), cases.SPAN)
 
 
 def test_dynamics_whose_inverse_runs_away_have_none() -> None:
