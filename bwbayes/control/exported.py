@@ -133,37 +133,22 @@ class Exported:
             keep_trailing_newline=True,
             finalize=lambda value: to_c_number(value) if isinstance(value, float) else value,
         )
+        environment.filters["plain"] = _plain
         actuator, step = self.model.actuator, self.model.step
-        held = actuator.hold == "zero"
-        remembered = step.demagnetized()[0]
+        remembered = step.demagnetized()[0].tolist()
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
-        parts += ["polynomial gain"] if actuator.gain else []
-        parts += ["creep"] if actuator.creep else []
+        parts += ["polynomial gain"] * bool(actuator.gain) + ["creep"] * bool(actuator.creep)
+        lengths = {"parameters": step.parameters.shape[1], "memory": len(remembered)}
         return environment.get_template("actuator.c.j2").render(
-            title=f"Model of {_plain(self.name)}",
-            parts=f"Parts: {_plain(', '.join(parts))}.",
-            warnings=[_plain(line) for text in self.standing.said for line in wrap(text, 92)],
-            version=_plain(version("bwbayes")),
-            interval=actuator.interval,
-            between="voltage is held" if held else "voltage's drive goes straight",
-            held=held,
-            low=self.limits.low,
-            high=self.limits.high,
-            hysteresis=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
+            **self.numbers(),
+            parts_line=f"Parts: {', '.join(parts)}.",
+            warnings=[line for text in self.standing.said for line in wrap(text, 92)],
+            held=actuator.hold == "zero",
+            hysteresis_is=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
             parameters_are=to_ascii(type(step).parameters.__doc__ or ""),
-            parameters=[*map(to_c_number, step.parameters[0].tolist())],
-            remembered=remembered.tolist(),
-            functions=c_functions(
-                type(step).move,
-                {"parameters": step.parameters.shape[1], "memory": remembered.size},
-                "actuator_",
-            ),
-            sections=self._sections,
-            gain=self._gain,
-            growth=float(self.model.creep_growth[0]),
-            zero=float(self.model.zero[0]),
-            inverse=self.without_inverse is None,
-            without_inverse=_plain(self.without_inverse or ""),
+            parameter_row=[*map(to_c_number, step.parameters[0].tolist())],
+            remembered=remembered,
+            functions=c_functions(type(step).move, lengths, "actuator_"),
             close=resolution(self.limits),
             newton=NEWTON_ROUNDS,
             bisection=BISECTION_ROUNDS,
