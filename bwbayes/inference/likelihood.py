@@ -25,38 +25,16 @@ from bwbayes.inference.state_space import LOG_TWO_PI
 from bwbayes.model.actuator import Actuator
 from bwbayes.shown import brief
 
-__all__ = ["Likelihood", "LinearStart", "Moments", "Score", "batches"]
-
-# Models simulated together: enough to share the loop over turns, few enough for the memory.
-BATCH = 64
-ELEMENTS = 1 << 23
-CACHED = 1 << 16
-
-# Beside numbers as large as this a one is next to lost to rounding.
-LOST = 1e12
-
-# Part of a sum of squares that rounding may take away.
-ROUNDING = 1e-15
-
-# What is below exp(-50) of its size adds nothing.
-FORGOTTEN = 50.0
+__all__ = ["Likelihood", "LinearStart", "Score", "batches"]
 
 
-def batches(models: int, samples: int, elements: int = ELEMENTS) -> Iterator[slice]:
-    """Cut a number of models into batches of so many elements, by default what memory holds."""
-    size = min(max(elements // samples, 1), BATCH)
-    return (slice(i, min(i + size, models)) for i in range(0, models, size))
+def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:
+    """Cut a number of models into batches of so many elements, by default what memory holds.
 
-
-class Moments(NamedTuple):
-    """What the density needs of whitened series: the residual, then the unknowns' responses.
-
-    ``products`` (models, 1 + unknowns, 1 + unknowns) are Σ zᵢ zⱼ, ``log_determinant`` (models,) is
-    that of the noise's covariance.
+    Of 64 at most: enough to share the loop over turns.
     """
-
-    products: FloatArray
-    log_determinant: FloatArray
+    size = min(max(elements // samples, 1), 64)
+    return (slice(i, min(i + size, models)) for i in range(0, models, size))
 
 
 class LinearStart(NamedTuple):
@@ -92,18 +70,6 @@ class Score(NamedTuple):
         pull = self.pull[:, :, np.newaxis]
         squares: FloatArray = np.sum(pull * np.linalg.solve(self.information, pull), axis=(1, 2))
         return squares
-
-    @property
-    def sizes(self) -> FloatArray:
-        """The best size of each shape, if it is the only one, (models, shapes)."""
-        sizes: FloatArray = self.pull / np.einsum("mii->mi", self.information)
-        return sizes
-
-    @property
-    def nats(self) -> FloatArray:
-        """What each shape alone adds to the log density at its best size, (models, shapes)."""
-        nats: FloatArray = self.pull * self.sizes / 2
-        return nats
 
 
 @dataclass(frozen=True)
@@ -176,23 +142,7 @@ class Likelihood:
             log p = −½ (|z₀ − Z μ|² + μᵀ P⁻¹ μ + log det V + log det(1 + P Zᵀ Z) + n log 2π),
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
         """
-        products, log_determinant = self.moments(theta)
-        sd = self.start_sd(theta)
-        scaled = products[:, 1:, 1:] * sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
-        precision = np.eye(sd.shape[1]) + scaled
-        pull = sd * products[:, 1:, 0]
-        covariance, log_volume = _inverse(precision)
-        mean = np.einsum("mij,mj->mi", covariance, pull)
-        squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
-        # Less cannot be told of a difference: where noise is next to none and an unknown without
-        # bounds, what rounding left was a place more probable than any that is possible.
-        size = np.abs(pull)
-        terms = np.einsum("mi,mij,mj->m", size, np.abs(covariance), size)
-        squares = np.maximum(squares, ROUNDING * (products[:, 0, 0] + terms))
-        logs = log_determinant + log_volume
-        density = -0.5 * (squares + logs + self.readings.rows.size * LOG_TWO_PI)
-        covariance *= sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
-        return LinearStart(density, squares, sd * mean, covariance)
+        return self._integrated(theta, *self._products(theta))[0]
 
     def score(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
@@ -206,61 +156,43 @@ class Likelihood:
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
         at θ, if it is given.
         """
-        scores = []
-        for batch in batches(len(theta), self.readings.rows.size, CACHED):
-            simulated = None if displacement is None else displacement[batch]
-            series, log_determinant = self._whitened(theta[batch], shapes, simulated)
-            products = np.einsum("mit,mjt->mij", series, series)
-            sd = self.start_sd(theta[batch])
-            first = 1 + sd.shape[1]
-            prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
-            precision = np.eye(sd.shape[1]) + prior * products[:, 1:first, 1:first]
-            inverse, log_volume = _inverse(precision)
-            others = products[:, 1:first]
-            # Of all products what the unknowns do not explain.
-            free = products - np.einsum("mui,muv,mvj->mij", others, inverse * prior, others)
-            logs = log_determinant + log_volume + self.readings.rows.size * LOG_TWO_PI
-            density = -0.5 * (free[:, 0, 0] + logs)
-            scores.append(Score(free[:, first:, 0], free[:, first:, first:], density))
-        return Score(*(np.concatenate(values) for values in zip(*scores, strict=True)))
+        products, log_determinant = self._with_numpy(theta, shapes, displacement)
+        start, unexplained = self._integrated(theta, products, log_determinant)
+        return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], start.log_density)
 
-    def _whitened(
-        self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Whiten residual, unknowns' responses and shapes: (models, series, readings).
+    def _integrated(
+        self, theta: FloatArray, products: FloatArray, log_determinant: FloatArray
+    ) -> tuple[LinearStart, FloatArray]:
+        """Integrate the unknowns out of products (models, series, series) of whitened series.
 
-        Beside them the log determinant (models,) of the noise's covariance.
+        These are the residual, the unknowns' responses and any others; what the unknowns do not
+        explain of the products of residual and others is returned too.
         """
-        readings = self.readings
-        model, noise = self.table.actuator(theta), self.table.noise(theta)
-        if displacement is None:
-            displacement = self._simulated(model)[:, readings.where]
-        responses = self._responses(model, noise)
-        audible = responses.shape[2]
-        series = np.zeros((len(theta), 1 + responses.shape[1] + len(shapes), readings.rows.size))
-        series[:, 0] = readings.values - displacement
-        series[:, 1 : 1 + responses.shape[1], :audible] = responses
-        series[:, 1 + responses.shape[1] :] = shapes
-        return self.whiten(noise, series)
-
-    def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.
-
-        ``noise`` is (models, parameters of the noise).
-        """
-        if self.engine == "numba" and self.noise.states:
-            from bwbayes.inference import compiled  # noqa: PLC0415  # as in `moments`
-
-            return compiled.whiten(self.spaced, noise, series, self.readings.skipped)
-        return self.spaced.whiten(noise, series, self.readings.skipped)
+        sd = self.start_sd(theta)
+        end = 1 + sd.shape[1]
+        prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
+        pull = sd[:, :, np.newaxis] * products[:, 1:end]
+        covariance, log_volume = _inverse(np.eye(end - 1) + prior * products[:, 1:end, 1:end])
+        mean = np.einsum("mij,mj->mi", covariance, pull[:, :, 0])
+        squares = products[:, 0, 0] - np.sum(mean * pull[:, :, 0], axis=1)
+        # Less cannot be told of a difference: where noise is next to none and an unknown without
+        # bounds, what rounding left was a place more probable than any that is possible.
+        size = np.abs(pull[:, :, 0])
+        terms = np.einsum("mi,mij,mj->m", size, np.abs(covariance), size)
+        squares = np.maximum(squares, 1e-15 * (products[:, 0, 0] + terms))
+        logs = log_determinant + log_volume + self.readings.rows.size * LOG_TWO_PI
+        start = LinearStart(-0.5 * (squares + logs), squares, sd * mean, prior * covariance)
+        series = [0, *range(end, products.shape[1])]
+        across = pull[:, :, series]
+        explained = np.einsum("mui,muv,mvj->mij", across, covariance, across)
+        return start, products[:, series][:, :, series] - explained
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
-        unknowns = 0 if self.from_rest else self.actuator.unknowns
         gain = self.actuator.typical_slope(self.table.actuator(theta), self.voltage)
-        sd = np.repeat((gain * self.half_range)[:, np.newaxis], unknowns, axis=1)
+        sd = np.repeat((gain * self.half_range)[:, np.newaxis], self.unknowns, axis=1)
         if self.offset_sd:
-            sd = np.concatenate([np.full((len(sd), 1), self.offset_sd), sd], axis=1)
+            sd[:, 0] = self.offset_sd
         return sd
 
     @property
@@ -269,9 +201,9 @@ class Likelihood:
         return self.noise.at(self.actuator.interval * self.readings.stride)
 
     @property
-    def unknown(self) -> bool:
-        """Tell whether anything is unknown of the start."""
-        return bool(self.offset_sd) or not (self.from_rest or self.actuator.unknowns == 0)
+    def unknowns(self) -> int:
+        """How many numbers are unknown of the start: the offset, if any, then the dynamics'."""
+        return int(self.offset_sd > 0) + (0 if self.from_rest else self.actuator.unknowns)
 
     def simulate(
         self, model: FloatArray, voltage: FloatArray, unrest: FloatArray | None = None
@@ -290,74 +222,71 @@ class Likelihood:
                 return state.to(voltage.size)
         return self.actuator.advance(model, voltage, None, unrest, from_rest=self.from_rest)[0]
 
-    def _simulated(self, model: FloatArray) -> FloatArray:
-        """Displacement (models, samples), um, up to the last reading, the dynamics at rest."""
-        voltage = self.voltage[: self.readings.samples]
-        return self.actuator.displacement(model, voltage, from_rest=self.from_rest)
+    def _products(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return Σ zᵢ zⱼ (models, series, series) of whitened residual and responses.
 
-    def moments(self, theta: FloatArray) -> Moments:
-        """Whiten the residual and the unknowns' responses at θ (models, parameters)."""
-        if self.engine == "numba":
-            # Here, because numba may not be installed, and takes half a second to load.
-            from bwbayes.inference import compiled  # noqa: PLC0415
+        Beside them the log determinant (models,) of the noise's covariance.
+        """
+        if self.engine == "numpy":
+            return self._with_numpy(theta, np.empty((0, self.readings.rows.size)))
+        # Here, because numba may not be installed, and takes half a second to load.
+        from bwbayes.inference import compiled  # noqa: PLC0415
 
-            return Moments(
-                *compiled.moments(
-                    theta,
-                    self.voltage[: self.readings.samples],
-                    self.values,
-                    self.skipped,
-                    self.actuator,
-                    self.spaced,
-                    int(self.offset_sd > 0),
-                    0 if self.from_rest else self.actuator.unknowns,
-                    from_rest=self.from_rest,
-                )
-            )
-        pieces = batches(len(theta), self.readings.samples)
-        parts = [self._moments(theta[batch]) for batch in pieces]
-        return Moments(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-    def _moments(self, theta: FloatArray) -> Moments:
-        """Do it with NumPy for one batch of models."""
-        readings, spaced = self.readings, self.spaced
-        model, noise = self.table.actuator(theta), self.table.noise(theta)
-        residual = readings.values - self._simulated(model)[:, readings.where]
-        responses = self._responses(model, noise)
-        audible = responses.shape[2]
-        white, log_determinant = spaced.whiten(noise, residual[:, np.newaxis], readings.skipped)
-        pulls, _ = spaced.whiten(noise, responses, readings.skipped[:audible])
-        return Moments(
-            _products([white[:, 0], *np.moveaxis(pulls, 1, 0)], audible), log_determinant
+        return compiled.moments(
+            theta,
+            self.voltage[: self.readings.samples],
+            self.values,
+            self.skipped,
+            self.actuator,
+            self.spaced,
+            int(self.offset_sd > 0),
+            self.unknowns - int(self.offset_sd > 0),
+            from_rest=self.from_rest,
         )
 
-    def _responses(self, model: FloatArray, noise: FloatArray) -> FloatArray:
-        """Unknowns' responses (models, unknowns, readings), as long as the noise hears of them.
+    def _with_numpy(
+        self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Do the same with NumPy, with shapes (shapes, readings) as further series.
 
-        An offset stays; a free response dies out with the dynamics, and the noise's filter forgets
-        it.
+        ``displacement`` is as in :meth:`score`.
         """
-        rows = self.readings.rows
-        sections = self.actuator.sections(self.actuator.columns(model))
-        unknowns = 0 if self.from_rest else sections.unknowns
-        if self.offset_sd:
-            audible = rows.size
-        elif unknowns:
-            nothing = np.exp(-FORGOTTEN)
-            slowest = np.log(max(float(np.max(sections.remembered)), nothing))
-            decay = np.log(max(float(np.max(self.spaced.decay(noise))), nothing))
-            forgotten = FORGOTTEN + rows * slowest < 0
-            forgotten &= FORGOTTEN + np.arange(rows.size) * decay < 0
-            audible = int(np.argmax(forgotten)) if forgotten[-1] else rows.size
-        else:
-            audible = 0
-        free = sections.free_responses(int(rows[audible - 1]) + 1 if audible and unknowns else 0)
-        parts = [
-            free[:, :unknowns, rows[:audible]] if unknowns else np.empty((len(model), 0, audible))
-        ]
-        if self.offset_sd:
-            parts.insert(0, np.ones((len(model), 1, audible)))
-        return np.concatenate(parts, axis=1)
+        readings, n_series = self.readings, 1 + self.unknowns + len(shapes)
+        # Shapes are many: a model's series are to stay in the cache.
+        elements = 1 << 16 if len(shapes) else 1 << 23
+        results = []
+        for batch in batches(len(theta), readings.samples * n_series, elements):
+            model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
+            if displacement is None:
+                voltage = self.voltage[: readings.samples]
+                simulated = self.actuator.displacement(model, voltage, from_rest=self.from_rest)
+                moved = simulated[:, readings.where]
+            else:
+                moved = displacement[batch]
+            residual = (readings.values - moved)[:, np.newaxis]
+            offsets = np.ones((len(model), int(self.offset_sd > 0), readings.rows.size))
+            parts = [residual, offsets]
+            if not self.from_rest:
+                sections = self.actuator.sections(self.actuator.columns(model))
+                parts.append(sections.free_responses(readings.samples)[..., readings.where])
+            parts.append(np.broadcast_to(shapes, (len(model), *shapes.shape)))
+            series = np.concatenate(parts, axis=1)
+            white, log_determinant = self.whiten(noise, series)
+            # Sums, not dot products: a linear algebra library may split those over threads.
+            results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
+        products, determinants = zip(*results, strict=True)
+        return np.concatenate(products), np.concatenate(determinants)
+
+    def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.
+
+        ``noise`` is (models, parameters of the noise).
+        """
+        if self.engine == "numba" and self.noise.states:
+            from bwbayes.inference import compiled  # noqa: PLC0415  # as for the products
+
+            return compiled.whiten(self.spaced, noise, series, self.readings.skipped)
+        return self.spaced.whiten(noise, series, self.readings.skipped)
 
 
 def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -365,7 +294,8 @@ def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     if matrices.shape[1] == 1:
         # Which is most records: the library would take longer over it than over all the readings.
         return 1 / matrices, np.log(matrices[:, 0, 0])
-    lost = np.max(matrices, axis=(1, 2), initial=0.0) > LOST
+    # Beside numbers as large as this the one is next to lost to rounding.
+    lost = np.max(matrices, axis=(1, 2), initial=0.0) > 1e12
     if not lost.any():
         return np.linalg.inv(matrices), np.linalg.slogdet(matrices)[1]
     # Eigenvalues that are rounding beside the largest are taken for the one that was lost.
@@ -377,14 +307,3 @@ def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     inverse[lost] = (vectors / values[:, np.newaxis]) @ np.swapaxes(vectors, 1, 2)
     log_determinant[lost] = np.sum(np.log(values), axis=1)
     return inverse, log_determinant
-
-
-def _products(series: list[FloatArray], audible: int) -> FloatArray:
-    """Σ zᵢ zⱼ (models, series, series); all series but the first (models, readings) are shorter."""
-    products = np.empty((len(series[0]), len(series), len(series)))
-    for i, first in enumerate(series):
-        for j, second in enumerate(series[: i + 1]):
-            # Sums, not dot products: a linear algebra library may split those over threads.
-            product = np.sum(first**2 if i == j else first * second[:, :audible], axis=1)
-            products[:, i, j] = products[:, j, i] = product
-    return products

@@ -127,19 +127,6 @@ class DiscrepancyNoise(Noise):
         """Return σ² (1 − exp(−2t/τ)), alone."""
         return _alone(-(theta[:, 1] ** 2) * np.expm1(-2 * readings * self.interval / theta[:, 2]))
 
-    def decay(self, theta: FloatArray) -> FloatArray:
-        """Return φ s²/(p + s²), with φ = exp(−Δ/τ) and p the predicted variance in the long run.
-
-        That is the positive root of p² + p (1 − φ²)(s² − σ²) = (1 − φ²) σ² s².
-        """
-        sensor, process, time = theta.T
-        fresh = -np.expm1(-2 * self.interval / time)
-        half = fresh * (sensor**2 - process**2) / 2
-        root = np.sqrt(half**2 + fresh * (process * sensor) ** 2)
-        p = np.maximum(root - half, 0)
-        decay: FloatArray = np.exp(-self.interval / time) * sensor**2 / (p + sensor**2)
-        return decay
-
 
 def _alone(values: FloatArray) -> FloatArray:
     """Return matrices (..., 2, 2) of the first state alone."""

@@ -228,7 +228,7 @@ class Posterior:
         dataset = self.only if record is None else self.datasets[number]
         likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
         model = dataset.table.actuator(theta)
-        unrest = likelihood.start(theta).mean if likelihood.unknown else None
+        unrest = likelihood.start(theta).mean if likelihood.unknowns else None
         voltage = dataset.voltage[: dataset.training[-1].stop]
 
         for batch in batches(len(theta), voltage.size):

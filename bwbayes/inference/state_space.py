@@ -91,14 +91,6 @@ class Noise(ABC):
     def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
         """Return Q (models, 2, 2), um², without taking differences of nearly equal numbers."""
 
-    def decay(self, theta: FloatArray) -> FloatArray:
-        """Return what the filter keeps of an error over a reading, at most, (models,).
-
-        By default what the discrepancy keeps of itself.
-        """
-        kept: FloatArray = np.abs(np.linalg.eigvals(self.transition(theta))).max(axis=1)
-        return kept
-
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy and sd of the sensor, each (models,), um."""
         return theta[:, 1], theta[:, 0]

@@ -84,15 +84,6 @@ class Recursion:
         """How many numbers say in which state the dynamics are."""
         return int(self.free.shape[1])
 
-    @property
-    def remembered(self) -> FloatArray:
-        """Largest part (models,) of a free response that is left after a sample, below one."""
-        taps = np.zeros((self.denominator.shape[0], 3))
-        taps[:, : self.denominator.shape[1]] = self.denominator
-        root = np.sqrt(taps[:, 1] ** 2 - 4 * taps[:, 2] + 0j)
-        largest: FloatArray = np.max(np.abs([taps[:, 1] + root, taps[:, 1] - root]), axis=0) / 2
-        return largest
-
     def at_rest(self) -> FloatArray:
         """Return the state (models, taps - 1) of a filter at rest at zero."""
         return np.zeros((self.numerator.shape[0], self.numerator.shape[1] - 1))
@@ -131,11 +122,6 @@ class Sections:
     def unknowns(self) -> int:
         """How many numbers say in which state the sections are."""
         return sum(recursion.unknowns for recursion in self.recursions)
-
-    @property
-    def remembered(self) -> FloatArray:
-        """Largest part (models,) of a free response that is left after a sample, below one."""
-        return np.asarray(np.max([recursion.remembered for recursion in self.recursions], axis=0))
 
     @property
     def taps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
