@@ -228,7 +228,7 @@ def pareto_k(log_weights: FloatArray) -> float:
         if log_weights.size and np.ptp(log_weights) < EQUAL:
             return 0.0
     try:
-        shape = float(_statistics().psislw(-np.unique(log_weights))[1])
+        shape = float(_arviz().psislw(-np.unique(log_weights))[1])
     except (ValueError, IndexError):  # nothing
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
@@ -249,7 +249,7 @@ def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     finite = np.isfinite(log_weights).all()
     if not finite or (log_weights.size and np.ptp(log_weights) < EQUAL):
         return np.full(log_weights.size, 1 / log_weights.size), 0.0 if finite else np.inf
-    smoothed, shape = _statistics().psislw(-log_weights)
+    smoothed, shape = _arviz().psislw(-log_weights)
     weights = np.exp(smoothed - np.max(smoothed))
     return weights / np.sum(weights), float(shape) if np.isfinite(shape) else np.inf
 
@@ -278,19 +278,16 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     rank the draws three times more. And of the mean of the draws as they are: those of a heavy
     tail are worth another number.
     """
-    statistics, means = _statistics(), np.mean(values, axis=2)
+    # A comparison would take what is not a number for a draw beyond the tail.
+    tails = [np.where(np.isnan(scores), np.nan, scores <= ndtri(p)) for p in TAIL]
+    means = np.mean(values, axis=2)
+    series = (scores, *tails, as_chains(values), means.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        cap = statistics.ess(means.T, method="mean") * np.var(values) / np.var(means)
-        bulk = statistics.ess(scores, method="mean")
-        # A comparison would take what is not a number for a draw beyond the tail.
-        tails = [
-            statistics.ess(np.where(np.isnan(scores), np.nan, scores <= ndtri(p)), method="mean")
-            for p in TAIL
-        ]
-        mean = statistics.ess(as_chains(values), method="mean")
+        bulk, low, high, mean, cap = (_arviz().ess(s, method="mean") for s in series)
+        cap *= np.var(values) / np.var(means)
     # np.minimum keeps a nan of either.
-    bulk, tail, mean = np.minimum([bulk, np.min(tails), mean], cap).tolist()
-    return bulk, tail, mean
+    least: list[float] = np.minimum([bulk, np.minimum(low, high), mean], cap).tolist()
+    return least[0], least[1], least[2]
 
 
 def _rhat(scores: Sequence[FloatArray], ensembles: int) -> float:
@@ -300,16 +297,12 @@ def _rhat(scores: Sequence[FloatArray], ensembles: int) -> float:
     calls rank, which would rank the draws once more.
     """
     superchain = np.repeat(np.arange(ensembles), len(scores[0]) // ensembles)
-    statistics = _statistics()
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return float(
-            np.max(
-                [
-                    statistics.rhat_nested(ranked, superchain_ids=superchain, method="split")
-                    for ranked in scores
-                ]
-            )
-        )
+        rhats = [
+            _arviz().rhat_nested(ranked, superchain_ids=superchain, method="split")
+            for ranked in scores
+        ]
+    return float(np.max(rhats))
 
 
 def as_chains(values: FloatArray) -> FloatArray:
@@ -329,31 +322,16 @@ def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     chains = as_chains(values)
     with np.errstate(invalid="ignore"):
-        scores, median = _normal_scores(chains.ravel())
-        folded, _ = _normal_scores(np.abs(chains.ravel() - median))
-    return scores.reshape(chains.shape), folded.reshape(chains.shape)
-
-
-def _normal_scores(draws: FloatArray) -> tuple[FloatArray, float]:
-    """Return the scores of draws (count,) and their median, by one sorting: half the time of both.
-
-    All nan if any of them is.
-    """
-    order = np.argsort(draws)
-    ordered = draws[order]
-    if np.isnan(ordered[-1]):  # nan sorts last
-        return np.full(draws.size, np.nan), np.nan
-    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    equal = np.diff(first, append=draws.size)
-    rank = first + 0.5 * (equal + 1)
-    scores = np.empty(draws.size)
-    scores[order] = np.repeat(ndtri((rank - 3 / 8) / (draws.size + 1 / 4)), equal)
-    return scores, float(np.mean(ordered[[(draws.size - 1) // 2, draws.size // 2]]))
+        folded = np.abs(chains - np.median(chains))
+    scores, folded_scores = (
+        ndtri((scipy.stats.rankdata(draws).reshape(chains.shape) - 3 / 8) / (chains.size + 1 / 4))
+        for draws in (chains, folded)
+    )
+    return scores, folded_scores
 
 
 def times(draws: FloatArray, thin: int = 1) -> FloatArray:
     """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
-    # One parameter at a time: the spectra of all would be many times as large as the draws.
     columns = np.moveaxis(draws, -1, 0)
     # A thinned series does not tell times below its own step.
     return thin * np.array([autocorrelation_time(as_chains(values)) for values in columns])
@@ -362,37 +340,17 @@ def times(draws: FloatArray, thin: int = 1) -> FloatArray:
 def autocorrelation_time(chains: FloatArray) -> float:
     """Integrated autocorrelation time, in steps, of chains (chains, steps) of one parameter.
 
-    As ``emcee.autocorr.integrated_time`` has it, from the mean of the chains' autocorrelations. It
-    is nan where it cannot be told, for instance where nothing moves.
+    It is nan where it cannot be told, for instance where nothing moves.
     """
-    from emcee.autocorr import auto_window  # noqa: PLC0415  # slow to load
+    from emcee.autocorr import integrated_time  # noqa: PLC0415  # slow to load
 
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        away = chains - np.mean(chains, axis=1, keepdims=True)
-        away /= np.sqrt(np.sum(away**2, axis=1, keepdims=True))
-        correlation = chains.shape[1] * _autocovariance(away)[0]
-    time = 2 * np.cumsum(correlation) - 1
-    windowed = float(time[auto_window(time, 5)])
-    return windowed if windowed > 0 else np.nan
+        time = float(integrated_time(chains.T[:, :, np.newaxis], tol=0, quiet=True)[0])
+    return time if time > 0 else np.nan
 
 
-def _statistics() -> Any:
-    """Return arviz's statistics, slow to load, whose autocovariance is all chains' average."""
+def _arviz() -> Any:
+    """Return arviz's statistics, which are slow to load."""
     from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # noqa: PLC0415
 
-    class Averaged(type(array_stats)):  # type: ignore[misc]  # arviz has no types
-        def autocov(self, ary: FloatArray, axis: int = -1) -> FloatArray:
-            assert axis in (-1, 1)
-            return _autocovariance(ary)
-
-    return Averaged()
-
-
-def _autocovariance(chains: FloatArray) -> FloatArray:
-    """Mean autocovariance (1, steps) of chains (chains, steps), by one transform back for all."""
-    steps = chains.shape[1]
-    padded = scipy.fft.next_fast_len(2 * steps, real=True)
-    spectrum = scipy.fft.rfft(chains - np.mean(chains, axis=1, keepdims=True), padded)
-    power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0, keepdims=True)
-    covariance: FloatArray = scipy.fft.irfft(power, padded)[:, :steps] / steps
-    return covariance
+    return array_stats
