@@ -9,8 +9,10 @@ of posterior to proposal bounded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy
@@ -25,6 +27,8 @@ __all__ = ["StudentMixture"]
 # Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
 CUTS = (0.5, 0.85)
 PARTS = len(CUTS) + 1
+
+_ARRAYS = ("weights", "centers", "factors", "freedom")
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,23 @@ class StudentMixture:
         split_shares = shares[modes] / np.bincount(modes)[modes]
         weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / PARTS
         return cls(weights, optima[modes], factors)
+
+    def arrays(self) -> dict[str, Any]:
+        """Return what it is made of, by name, to be written to a file."""
+        own = {name: value for name, value in vars(self).items() if name in _ARRAYS}
+        if self.bend is None:
+            return own
+        return own | {f"bend_{f.name}": getattr(self.bend, f.name) for f in fields(self.bend)}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, Any]) -> StudentMixture | None:
+        """Return the mixture that was written to a file as :meth:`arrays`, if any was."""
+        if "weights" not in arrays:
+            return None
+        bend = None
+        if "bend_bends" in arrays:
+            bend = QuadraticMap(**{f.name: arrays[f"bend_{f.name}"] for f in fields(QuadraticMap)})
+        return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend)
 
     @cached_property
     def _whitening(self) -> FloatArray:

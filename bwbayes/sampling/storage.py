@@ -20,6 +20,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,6 @@ import numpy as np
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.earlier import read_earlier
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -75,25 +75,13 @@ class ChainFile(Chain):
         InputError
             There is no room for it.
         """
-        draft = path.with_suffix(".partial")
-        created = cls(draft, point, chain.starts, block, attributes)
+        created = cls(path, point, chain.starts, block, attributes)
+        created.proposals = chain.proposals
         text = {"format": FORMAT, "block": block, "attributes": created._attributes}
-        shutil.rmtree(draft, ignore_errors=True)
-        try:
-            draft.mkdir()
-            created._write(
-                "start",
-                {"text": json.dumps(text)}
-                | {f"point_{field.name}": getattr(point, field.name) for field in fields(point)}
-                | {name: np.stack([getattr(s, name) for s in chain.starts]) for name in _STATE}
-                | _arrays_of(chain.proposals["pilot"]),
-            )
-            draft.rename(path)
-        except OSError as error:
-            raise _not_written(path, error) from None
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
-        created.path, created.proposals = path, chain.proposals
+        start = {"text": json.dumps(text)} | _arrays_of(chain.proposals["pilot"])
+        start |= {f"point_{field.name}": getattr(point, field.name) for field in fields(point)}
+        start |= {name: np.stack([getattr(s, name) for s in chain.starts]) for name in _STATE}
+        _create_folder(path, {"start": start})
         return created
 
     @classmethod
@@ -115,13 +103,9 @@ class ChainFile(Chain):
             raise InputError(f"{path}: the chain does not exist; run again")
         chain: ChainFile | None = None
         try:
-            if path.exists():
-                chain = cls._begun(path)
-                chain._read_blocks()
-            else:
-                read, point, block, attributes = read_earlier(earlier)
-                chain = cls(path, point, read.starts, block, attributes)
-                vars(chain).update(vars(read))
+            load = partial(_load, path) if path.exists() else _earlier_files(earlier).get
+            chain = cls._begun(path, load("start"))
+            chain._read_blocks(load)
         except Exception as error:  # a damaged file fails in whatever way its reader stumbles
             damage = one_line(str(error)) or type(error).__name__
             if chain is None:
@@ -160,7 +144,7 @@ class ChainFile(Chain):
         if check is not None:
             check(chain.attributes())
         if not path.exists():
-            return chain._written_anew()
+            _create_folder(path, _earlier_files(path.with_suffix(".h5")))
         for phase in PHASES:
             n_blocks = len(chain.history(phase))
             for file in path.glob(f"{phase}-[0-9]*"):
@@ -169,22 +153,6 @@ class ChainFile(Chain):
         if not chain.set_aside:
             (path / "set-aside.npz").unlink(missing_ok=True)
         return chain
-
-    def _written_anew(self) -> ChainFile:
-        """Write what was read of an earlier version's file as a folder."""
-        draft = self.path.with_suffix(".earlier")
-        shutil.rmtree(draft, ignore_errors=True)
-        written = self.create(draft, self, self.point, self.block, self._attributes)
-        for phase in PHASES[1:]:
-            written.freeze(phase, self.proposals[phase])
-        for phase in PHASES:
-            for blocks in self.history(phase):
-                written.append(phase, blocks)
-        if self.set_aside:
-            written.fall_back(self.set_aside, self.refit)
-        draft.rename(self.path)
-        written.path = self.path
-        return written
 
     def attributes(self) -> dict[str, str | int]:
         """Return what was run: config, versions, platform, seed, hash of the data."""
@@ -205,40 +173,25 @@ class ChainFile(Chain):
             "moves": np.stack([b.moves for b in blocks]),
             "random_state": np.stack([b.end.random_state for b in blocks]),
         }
-        self._write(_block_name(phase, len(self.history(phase))), arrays)
+        _write(self.path, _block_name(phase, len(self.history(phase))), arrays)
         super().append(phase, blocks)
 
     def freeze(self, phase: Phase, proposal: StudentMixture | None) -> None:
         """Fix the proposal of a phase, on the disk too."""
         if proposal is not None:
-            self._write(f"{phase}-proposal", _arrays_of(proposal))
+            _write(self.path, f"{phase}-proposal", _arrays_of(proposal))
         super().freeze(phase, proposal)
 
     def fall_back(self, blocks: int, refit: StudentMixture | None = None) -> None:
         """Set the first blocks of the sampling aside, on the disk too."""
-        self._write("set-aside", {"blocks": blocks} | _arrays_of(refit))
+        _write(self.path, "set-aside", {"blocks": blocks} | _arrays_of(refit))
         super().fall_back(blocks, refit)
 
-    def _write(self, name: str, arrays: Arrays) -> None:
-        """Write a file, whole or not at all."""
-        draft = self.path / f"{name}.partial"
-        try:
-            with draft.open("wb") as file:
-                np.savez(file, allow_pickle=False, **arrays)
-            draft.replace(self.path / f"{name}.npz")
-        except OSError as error:
-            draft.unlink(missing_ok=True)
-            raise _not_written(self.path, error) from None
-
-    def _arrays(self, name: str) -> Arrays | None:
-        """Read a file; None if there is none."""
-        path = self.path / f"{name}.npz"
-        return _load(path) if path.exists() else None
-
     @classmethod
-    def _begun(cls, path: Path) -> ChainFile:
+    def _begun(cls, path: Path, arrays: Arrays | None) -> ChainFile:
         """Return the chain of a folder without its blocks."""
-        arrays = _load(path / "start.npz")
+        if arrays is None:
+            raise LookupError("it has no start")
         text = json.loads(str(arrays["text"]))
         if text["format"] != FORMAT:
             raise ValueError(f"its format is {text['format']}, this version reads {FORMAT}")
@@ -247,32 +200,69 @@ class ChainFile(Chain):
         states = zip(*(arrays[name] for name in _STATE), strict=True)
         starts = [EnsembleState(*state) for state in states]
         begun = cls(path, PointFit(**point), starts, text["block"], text["attributes"])
-        begun.proposals["pilot"] = _proposal_of(arrays)
+        begun.proposals["pilot"] = StudentMixture.of_arrays(arrays)
         return begun
 
-    def _read_blocks(self) -> None:
+    def _read_blocks(self, load: Callable[[str], Arrays | None]) -> None:
         """Read what is there, in its order; the set aside last, since it is of blocks."""
         for phase in PHASES:
-            if (arrays := self._arrays(f"{phase}-proposal")) is not None:
-                Chain.freeze(self, phase, _proposal_of(arrays))
+            if (arrays := load(f"{phase}-proposal")) is not None:
+                Chain.freeze(self, phase, StudentMixture.of_arrays(arrays))
             for number in count():
-                if (arrays := self._arrays(_block_name(phase, number))) is None:
+                if (arrays := load(_block_name(phase, number))) is None:
                     break
                 Chain.append(self, phase, _blocks_of(arrays))
-        aside = self._arrays("set-aside")
+        aside = load("set-aside")
         # Blocks are lost from the end: then all that are left count again.
         if aside is not None and aside["blocks"] <= len(self.history("sampling")):
-            Chain.fall_back(self, int(aside["blocks"]), _proposal_of(aside))
+            Chain.fall_back(self, int(aside["blocks"]), StudentMixture.of_arrays(aside))
 
 
 _STATE = ("coordinates", "log_density", "random_state")
-_MIXTURE = ("weights", "centers", "factors", "freedom")
-_BEND = fields(QuadraticMap)
 
 
-def _load(path: Path) -> Arrays:
+def _load(folder: Path, name: str) -> Arrays | None:
+    """Read a file; None if there is none."""
+    path = folder / f"{name}.npz"
+    if not path.exists():
+        return None
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def _earlier_files(path: Path) -> dict[str, Arrays]:
+    """Return the files that a chain of an earlier version would be today."""
+    files: dict[str, Arrays] = {**read_earlier(path)}
+    start = dict(files["start"])
+    text = {"format": FORMAT, "block": start.pop("block"), "attributes": start.pop("attributes")}
+    return files | {"start": {"text": json.dumps(text)} | start}
+
+
+def _write(folder: Path, name: str, arrays: Arrays) -> None:
+    """Write a file, whole or not at all."""
+    draft = folder / f"{name}.partial"
+    try:
+        with draft.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        draft.replace(folder / f"{name}.npz")
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise _not_written(folder, error) from None
+
+
+def _create_folder(path: Path, files: Mapping[str, Arrays]) -> None:
+    """Write a folder of files, whole or not at all."""
+    draft = path.with_suffix(".partial")
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        draft.mkdir()
+        for name, arrays in files.items():
+            _write(draft, name, arrays)
+        draft.rename(path)
+    except OSError as error:
+        raise _not_written(path, error) from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _block_name(phase: Phase, number: int) -> str:
@@ -295,23 +285,7 @@ def _blocks_of(arrays: Arrays) -> list[Block]:
 
 
 def _arrays_of(proposal: StudentMixture | None) -> dict[str, Any]:
-    """Return the arrays that a proposal is made of; none of none."""
-    if proposal is None:
-        return {}
-    arrays = {name: getattr(proposal, name) for name in _MIXTURE}
-    if proposal.bend is not None:
-        arrays |= {f"bend_{field.name}": getattr(proposal.bend, field.name) for field in _BEND}
-    return arrays
-
-
-def _proposal_of(arrays: Arrays) -> StudentMixture | None:
-    """Return the proposal that is made of arrays, if any."""
-    if "weights" not in arrays:
-        return None
-    bend = None
-    if "bend_bends" in arrays:
-        bend = QuadraticMap(**{field.name: arrays[f"bend_{field.name}"] for field in _BEND})
-    return StudentMixture(**{name: arrays[name] for name in _MIXTURE}, bend=bend)
+    return {} if proposal is None else proposal.arrays()
 
 
 def _not_written(path: Path, error: OSError) -> InputError:
