@@ -47,8 +47,7 @@ def test_the_unknown_start_is_integrated_out(
 
 @pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("offset", [0.0, 3.0])
-@pytest.mark.parametrize("noise", ["white", "discrepancy"])
-@pytest.mark.parametrize("missing", [0.0, 0.01])
+@pytest.mark.parametrize(("noise", "missing"), [("white", 0.0), ("discrepancy", 0.01)])
 def test_engines_agree_along_records_that_are_long_for_the_filter(
     parts: str, offset: float, noise: str, missing: float
 ) -> None:

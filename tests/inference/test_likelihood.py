@@ -140,20 +140,6 @@ def test_a_shape_takes_what_an_unknown_of_that_shape_would(
     )
 
 
-def test_a_shape_adds_half_of_what_it_takes() -> None:
-    """At its best size: by the log densities of readings with and without it."""
-    posterior = moving()
-    likelihood = replace(posterior.likelihood, offset_sd=3.0)
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 1))
-    readings = likelihood.readings
-    shape = np.exp(-np.arange(readings.rows.size) / 50)[np.newaxis]
-    score = likelihood.score(theta, shape)
-    less = replace(readings, values=readings.values - score.sizes[0, 0] * shape[0])
-    gained = replace(likelihood, readings=less).log_density(theta) - likelihood.log_density(theta)
-    np.testing.assert_allclose(gained, score.nats[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(score.together / 2, score.nats[:, 0], rtol=1e-9)
-
-
 def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
     posterior = moving()
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 70))
@@ -185,13 +171,6 @@ def test_missing_readings_are_left_out_and_nothing_else(
         assert abs(density - got[row]) < 1e-7 * (200 + abs(density))
 
 
-def test_a_record_cut_into_adjacent_windows_is_the_whole_record() -> None:
-    windows = tuple(slice(first, first + 5) for first in range(0, 200, 5))
-    whole, cut = moving(), moving(training=windows)
-    theta = whole.prior.theta(whole.prior.draw(np.random.default_rng(7), 5))
-    np.testing.assert_allclose(whole.log_likelihood(theta), cut.log_likelihood(theta), rtol=1e-12)
-
-
 def test_a_long_memory_is_not_cut_short() -> None:
     """A lag of two records' lengths, a discrepancy that hardly fades: both engines keep it."""
     posterior = moving(fixed={"lag": 4.0, "discrepancy_time": 50.0, "sensor_sd": 2.0})
@@ -202,16 +181,6 @@ def test_a_long_memory_is_not_cut_short() -> None:
         got = likelihood.log_density(theta)
         expected = [dense(likelihood, one)[0] for one in theta]
         np.testing.assert_allclose(got, expected, rtol=1e-7)
-
-
-def test_a_memory_is_kept_as_long_as_it_is_heard() -> None:
-    """A lag and a filter that forget within the record, to the last digit and not before."""
-    posterior = moving(fixed={"lag": 0.05, "discrepancy_sd": 0.3, "discrepancy_time": 0.1})
-    posterior = replace(posterior, engine="numpy")
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(13), 1))
-    theta[0, posterior.prior.names.index("sensor_sd")] = 0.1
-    expected, _, _ = dense(posterior.likelihood, theta[0])
-    np.testing.assert_allclose(posterior.log_likelihood(theta), expected, rtol=1e-9)
 
 
 def test_from_rest_means_a_path_from_zero_volts() -> None:

@@ -18,11 +18,10 @@ import pytest
 import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.innovations import Innovations
-from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise, WhiteNoise, noise_model
+from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.discrepancy_state import carried
@@ -226,26 +225,12 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None
     np.testing.assert_allclose(left.told(first, 51)[0][later - first], known, atol=1e-7)
 
 
-GAPS = (slice(0, 1), slice(10, 60), slice(90, 95), slice(130, 400), slice(440, 700))
-
-
-@pytest.mark.parametrize("training", [None, GAPS])
-@pytest.mark.parametrize("dynamics", ["none", "lag"])
-def test_engines_agree(dynamics: str, training: tuple[slice, ...] | None) -> None:
-    pytest.importorskip("numba")
-    posterior = short_posterior("smooth", 700, dynamics, {}, training=training)
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(4), 100))
-    slow, fast = (
-        replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
-    )
-    np.testing.assert_allclose(fast, slow, atol=1e-10 * 700, rtol=1e-10)
-
-
-@pytest.mark.parametrize("stride", [1, 3, 20])
-def test_engines_agree_on_an_offset_and_any_stride(stride: int) -> None:
+@pytest.mark.parametrize("stride", [1, 20])
+def test_engines_agree_on_an_offset_any_stride_and_gaps(stride: int) -> None:
     pytest.importorskip("numba")
     posterior = short_posterior("smooth", 700, "lag", {})
     reading = posterior.only.displacement.copy()
+    reading[80:160] = reading[np.random.default_rng(6).integers(700, size=30)] = np.nan
     reading[np.arange(700) % stride != 0] = np.nan
     posterior = posterior.altered(displacement=reading, from_rest=False)
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
@@ -331,13 +316,6 @@ def assert_same(expected: float, got: float, samples: int) -> None:
     assert abs(expected - got) <= 1e-10 * (samples + abs(expected))
 
 
-@pytest.mark.parametrize("sensor", SCALES)
-def test_white_noise_is_exact_at_extreme_values(sensor: float) -> None:
-    residual = sensor * np.random.default_rng(10).standard_normal((1, 1000))
-    expected = float(np.sum(norm.logpdf(residual / sensor) - np.log(sensor)))
-    assert_same(expected, WhiteNoise().log_density(np.array([[sensor]]), residual)[0], 1000)
-
-
 def test_exact_at_extreme_values() -> None:
     """Sds down to 1e-200 and times from 1e-6 to 1e9 samples, for residuals of the model's kind."""
     generator = np.random.default_rng(2)
@@ -356,37 +334,3 @@ def test_exact_at_extreme_values_for_a_residual_that_the_model_does_not_expect(
     expected = decimal_log_density(theta, residual)
     got = DiscrepancyNoise(1.0).log_density(np.array([theta]), residual[np.newaxis])[0]
     assert_same(expected, got, 10)
-
-
-@pytest.mark.parametrize("theta", [(1.0, 1e-9, 1e3), (1e-200, 1.0, 1e4), (0.3, 1.5, 500.0)])
-def test_long_series_lose_no_precision(theta: tuple[float, float, float]) -> None:
-    """By the sequential form of the density: each sample given those before it."""
-    samples = 20_000
-    residual = simulated(np.array(theta), samples, np.random.default_rng(4))
-    sensor, process, kept = theta[0] ** 2, theta[1] ** 2, np.exp(-1 / theta[2])
-    mean, variance, expected = 0.0, process, 0.0
-    for reading in residual:
-        total = variance + sensor
-        expected -= 0.5 * ((reading - mean) ** 2 / total + np.log(2 * np.pi * total))
-        mean, variance = mean + variance / total * (reading - mean), variance * sensor / total
-        mean, variance = kept * mean, kept**2 * variance - np.expm1(-2 / theta[2]) * process
-    got = DiscrepancyNoise(1.0).log_density(np.array([theta]), residual[np.newaxis])[0]
-    assert_same(expected, got, samples)
-
-
-@pytest.mark.parametrize("kind", ["white", "discrepancy", "smooth"])
-def test_rows_are_independent(kind: str) -> None:
-    """A model's density does not depend on its neighbors in the batch, but for rounding."""
-    generator = np.random.default_rng(7)
-    noise = noise_model(kind, 0.01)
-    theta = np.exp(generator.normal(size=(8, len(noise.declarations))))
-    residual = generator.standard_normal((8, 40))
-    together = noise.log_density(theta, residual)
-    alone = [noise.log_density(theta[[i]], residual[[i]])[0] for i in range(8)]
-    np.testing.assert_allclose(alone, together, rtol=1e-13)
-
-
-def test_white_noise_has_no_discrepancy() -> None:
-    slow, sensor = WhiteNoise().draw(np.array([[0.3]]), 500, np.random.default_rng(1))
-    np.testing.assert_array_equal(np.zeros(500), slow)
-    assert 0.25 < np.std(sensor) < 0.35

@@ -16,7 +16,7 @@ from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import ceiling
 from tests.declared import declared, joint, parameter
-from tests.inference.problems import TRUE_NOISE, joint_prior, short_posterior, single, truth
+from tests.inference.problems import joint_prior, single
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
 ALL = (*HYSTERESIS, "lag", "offset", "sensor_sd", "discrepancy_sd", "discrepancy_time")
@@ -253,10 +253,3 @@ def test_priors_that_meet_a_constraint_nowhere_are_refused(fixed: dict[str, floa
     prior = joint_prior(HYSTERESIS, RANGES, fixed)
     with pytest.raises(InputError, match=r"^priors: hardly any draw"):
         prior.draw(np.random.default_rng(8), 10_000)
-
-
-def test_the_default_prior_covers_the_ring_bender() -> None:
-    """The paper's actuator lies within two sds of every default prior."""
-    posterior = short_posterior(dynamics="lag", fixed={"exponent": 1.0, **TRUE_NOISE})
-    z = posterior.prior.unconstrain(truth(posterior)[:, [0, 1, 2, 3, 5, 6, 7]])
-    assert np.max(np.abs(z)) < 2, dict(zip(posterior.names, z[0], strict=True))

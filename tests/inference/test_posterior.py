@@ -90,17 +90,6 @@ def test_a_batch_is_its_rows(size: int) -> None:
     np.testing.assert_allclose(alone[1:], together[1:], rtol=1e-12)
 
 
-def test_fixed_parameters_take_their_value() -> None:
-    """The posterior with d fixed is the whole posterior at that d, up to d's prior."""
-    whole = short_posterior("white", 100)
-    fixed = short_posterior("white", 100, fixed={"initial": 0.0, "d": 0.71})
-    assert ("alpha", "beta", "gamma", "offset", "sensor_sd") == fixed.names
-    free = np.array([[0.36, 0.027, 0.017, 0.1, 0.3], [0.34, 0.03, 0.01, 0.0, 0.4]])
-    expected = whole.log_likelihood(whole.prior.theta(np.insert(free, 0, 0.71, axis=1)))
-    got = fixed.log_likelihood(fixed.prior.theta(free))
-    np.testing.assert_allclose(expected, got, rtol=1e-12)
-
-
 @dataclass(frozen=True)
 class BrokenNoise(WhiteNoise):
     """A likelihood that fails for every other model."""

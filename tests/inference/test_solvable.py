@@ -219,7 +219,9 @@ def test_the_point_fit_is_the_normal(free: tuple[str, ...], noise: str) -> None:
     np.testing.assert_allclose(known.covariance, point.covariance * np.outer(unit, unit), rtol=1e-3)
 
 
-@every_case
+@pytest.mark.parametrize(
+    ("free", "noise"), [CASES[0], pytest.param(*CASES[1], marks=pytest.mark.slow)]
+)
 def test_the_draws_are_from_the_normal(free: tuple[str, ...], noise: str) -> None:
     posterior = linear_posterior(free, noise)
     known, result = closed_form(posterior), sampled(posterior)

@@ -16,7 +16,8 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
-from tests.model.operators.slow import SPAN, drawn
+from tests.model.operators.slow import SPAN, drawn, run
+from tests.model.operators.test_memory import CASES, Case
 
 OPERATORS: dict[str, Operator] = {
     "bouc-wen": BoucWen(),
@@ -27,8 +28,6 @@ OPERATORS: dict[str, Operator] = {
     "duhem": Duhem(),
     "duhem with even terms": Duhem(odd=False),
 }
-
-every = pytest.mark.parametrize("name", OPERATORS)
 
 
 def models(operator: Operator, seed: int) -> dict[str, FloatArray]:
@@ -66,7 +65,7 @@ def assert_alike(name: str, voltage: FloatArray, seed: int, piece: int) -> None:
     assert (np.abs(got - expected) <= 2e-12 * size).all()
 
 
-@every
+@pytest.mark.parametrize("name", OPERATORS)
 @given(
     corners=st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, max_size=9),
     seed=st.integers(0, 9),
@@ -79,3 +78,25 @@ def test_stages_agree_on_any_path(
 ) -> None:
     place = np.linspace(0, len(corners) - 1, (len(corners) - 1) * samples + 1)
     assert_alike(name, np.interp(place, np.arange(len(corners)), corners), seed, piece)
+
+
+# Whole tens meet extrema, ends of the span and zero exactly.
+whole = st.integers(-17, 17).map(lambda k: 10.0 * k)
+tens = st.lists(whole, max_size=150).map(lambda volts: np.array([*volts, 100.0]))
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@settings(max_examples=25, deadline=None)
+@given(
+    voltage=tens.map(lambda volts: np.array([*volts, 100.0])),
+    low=st.integers(-16, 16),
+    high=st.integers(-16, 16),
+)
+def test_engines_agree_where_voltages_meet_exactly(
+    case: Case, voltage: FloatArray, low: int, high: int
+) -> None:
+    span = Span(10.0 * min(low, high), 10.0 * max(low, high))
+    column = {name: np.resize(values, LANES) for name, values in case.column.items()}
+    expected = run(case.operator, column, voltage, span)
+    got = compiled(case.operator, column, voltage, 64, span)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)

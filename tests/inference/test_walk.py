@@ -16,7 +16,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.inference.test_gain_and_creep import PARTS, WAYS
 from tests.inference.test_likelihood import moving
-from tests.inference.test_stages import OPERATORS, models
+from tests.inference.test_stages import models
 from tests.model.operators.slow import SPAN, paths
 from tests.model.operators.test_memory import CASES
 
@@ -57,14 +57,6 @@ def as_theta(actuator: Actuator, column: dict[str, FloatArray]) -> FloatArray:
     known |= {f"creep_{k}": np.array(0.01 * k) for k in (1, 2, 3)}
     known |= {"creep_growth": np.array(0.5)}
     return np.stack([np.resize(known[name], LANES) for name in actuator.parameters], axis=1)
-
-
-@pytest.mark.parametrize("name", OPERATORS)
-@pytest.mark.parametrize("path", paths())
-def test_operators_of_one_state_walk_as_with_numpy(name: str, path: str) -> None:
-    actuator = Actuator("lag", "first", 1e-3, OPERATORS[name], span=SPAN)
-    column = models(OPERATORS[name], 2)
-    assert_walks_as(actuator, as_theta(actuator, column), paths()[path], 1)
 
 
 @pytest.mark.parametrize("operator", [JilesAtherton(), DomainWall()])

@@ -64,26 +64,6 @@ def test_a_bend_changes_no_volume_but_by_its_factor(free: int, seed: int) -> Non
     assert determinant == pytest.approx(bend.log_volume, abs=1e-4)
 
 
-def slowly_bent(bend: QuadraticMap, z: FloatArray) -> FloatArray:
-    """QuadraticMap one place (free,) as the equation says, a term at a time."""
-    free = z.size
-    c, y, place = np.clip(z, -5, 5), z.copy(), 0
-    for k in range(min(free, LONGEST)):
-        for i in range(k + 1):
-            for j in range(k + 1, free):
-                y[j] += bend.bends[place, j] * (c[i] * c[k] - (i == k))
-            place += 1
-    return np.asarray(bend.center + bend.factor @ y)
-
-
-@pytest.mark.parametrize("free", [2, 5, 14])
-def test_it_is_its_equation(free: int) -> None:
-    bend = any_bend(free, 3)
-    z = 4 * np.random.default_rng(4).standard_normal((6, free))
-    expected = np.stack([slowly_bent(bend, one) for one in z])
-    np.testing.assert_allclose(bend.to_curved(z), expected, atol=1e-10 * np.max(np.abs(expected)))
-
-
 def test_a_ridge_is_straightened() -> None:
     bend = QuadraticMap.fitted(banana(4000))
     assert bend is not None

@@ -5,20 +5,16 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
-import emcee
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.sampling import diagnostics
 from bwbayes.sampling.diagnostics import (
     Check,
     as_chains,
-    autocorrelation_time,
     check,
     effective_draws,
     nested_rhat,
@@ -71,22 +67,6 @@ def test_effective_draws_predict_the_variance_of_ensemble_means() -> None:
     assert truth == pytest.approx(bulk, rel=0.3)
 
 
-def test_the_means_effective_draws_are_not_those_of_the_ranks() -> None:
-    """A lognormal of a Gaussian AR(1) series has an autocorrelation time of its own.
-
-    Of log x with autocorrelation φ^k, x has (exp(s² φ^k) − 1) / (exp(s²) − 1): times of 30 and 39
-    for φ = 0.95 and s = 1. The estimate, as arviz has it, is within a tenth in five seeds.
-    """
-    series = np.exp(autoregressive(0.95, 5000, (4, 16, 1), np.random.default_rng(17)))
-    result = check(series, np.full((100, 4, 16), 20), BLOCK)
-    kept = 0.95 ** np.arange(1, 2000)
-    time = 1 + 2 * np.sum(np.expm1(kept)) / np.expm1(1)
-    assert series.size / time == pytest.approx(result.ess_mean[0], rel=0.15)
-    assert result.ess_mean[0] > 1.15 * result.ess_bulk[0]
-    arvizs = array_stats.ess(as_chains(series[..., 0]), method="mean")
-    assert result.ess_mean[0] <= arvizs * (1 + 1e-12)
-
-
 def test_walkers_that_move_together_are_not_counted_as_many() -> None:
     """The cap by ensemble means: sixteen walkers on one path are worth one."""
     path = autoregressive(0.5, 2000, (4, 1), np.random.default_rng(6))
@@ -110,26 +90,6 @@ def test_rhat_and_effective_draws_are_arvizs() -> None:
     np.testing.assert_allclose(arvizs[:2], bulk[:2], rtol=1e-12)
     # The third series, whose ensembles disagree, is capped by their means.
     assert bulk[2] < arvizs[2]
-
-
-def test_effective_draws_of_the_tails_are_those_of_the_outer_twentieths() -> None:
-    """Draws that stay in a tail for long are few there, and hardly fewer in the body.
-
-    Arviz's estimate on the same draws differs by how it finds the quantile.
-    """
-    generator = np.random.default_rng(17)
-    draws = generator.standard_normal((2000, 4, 8))
-    for start_of_stay in range(0, 2000, 20):
-        away = generator.random((4, 8)) < 0.04
-        draws[start_of_stay : start_of_stay + 20, away] += 6
-
-    def arvizs(part: float) -> float:
-        chains = as_chains(draws)
-        return float(array_stats.ess(chains, method="tail", prob=(part, 1 - part)))
-
-    _, tail = effective_draws(draws)
-    assert arvizs(0.05) == pytest.approx(tail, rel=0.05)
-    assert arvizs(0.25) > 2 * tail
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -203,24 +163,3 @@ def test_pareto_k_of_what_is_not_a_number_is_not_trusted() -> None:
     log_weights = np.random.default_rng(14).standard_normal(1000)
     log_weights[3] = np.nan
     assert not pareto_k(log_weights) < 0.7
-
-
-def test_a_check_leaves_the_warnings_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even where its threads change them, as they do when two silence warnings side by side."""
-
-    def silencing(_: FloatArray) -> FloatArray:
-        warnings.simplefilter("ignore")
-        return np.ones(5)
-
-    monkeypatch.setattr(diagnostics, "_one_parameter", silencing)
-    before = list(warnings.filters)
-    check(good_draws(), moving(), BLOCK)
-    assert before == list(warnings.filters)
-
-
-@pytest.mark.parametrize(("steps", "walkers"), [(50, 8), (301, 5)])
-def test_the_autocorrelation_time_is_emcees(steps: int, walkers: int) -> None:
-    series = np.cumsum(np.random.default_rng(6).standard_normal((steps, walkers)), axis=0)
-    expected = emcee.autocorr.integrated_time(series[..., np.newaxis], tol=0, quiet=True)
-    assert expected[0] == pytest.approx(autocorrelation_time(series.T), rel=1e-9)
-    assert np.isnan(autocorrelation_time(np.ones((8, 100))))

@@ -142,18 +142,6 @@ def test_a_start_is_a_tight_cluster_far_from_the_optimum() -> None:
     np.testing.assert_array_equal(POSTERIOR.log_density(state.coordinates), state.log_density)
 
 
-def test_starts_of_different_ensembles_lie_apart() -> None:
-    """In nine dimensions random directions hardly ever agree."""
-    posterior, point = gaussian(9)
-    inverse = np.linalg.inv(point.covariance)
-    centers = [
-        np.mean(start(posterior, point, e, 18, seed).coordinates, axis=0)
-        for e, seed in enumerate(np.random.default_rng(3).spawn(6))
-    ]
-    apart = [one - two for i, one in enumerate(centers) for two in centers[:i]]
-    assert min(float(np.sqrt(way @ inverse @ way)) for way in apart) > 5
-
-
 def test_a_start_comes_nearer_where_the_density_is_zero() -> None:
     def walled(x: FloatArray) -> FloatArray:
         return np.where(np.max(np.abs(x), axis=1) < 2, 0.0, -np.inf)

@@ -168,13 +168,6 @@ def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
     assert_same_outcome(finished[1], outcome)
 
 
-def test_a_finished_chain_is_left_as_it_is(finished: tuple[Chain, Outcome]) -> None:
-    chain = copy.deepcopy(finished[0])
-    again = sample(POSTERIOR, PLAN, chain, PluggedExecutor(0))
-    assert_same_chain(finished[0], chain)
-    assert_same_outcome(finished[1], again)
-
-
 @pytest.mark.parametrize("walkers", [2, 4])
 def test_too_few_walkers_are_refused(walkers: int) -> None:
     with pytest.raises(
