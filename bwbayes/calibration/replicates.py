@@ -345,7 +345,7 @@ def _others(
     for name, other in experiment.others.items():
         like = other.like or posterior.table.records[0]
         simulated = other.simulated(source.alone(like), source.table.of(true, like), generator)
-        single, record_draws = posterior.alone(like), posterior.its(draws, like)
+        single, record_draws = posterior.alone(like), posterior.select_draws(draws, like)
         bands, window = other.predicted(single, record_draws, simulated.record, generator)
         for kind, level, share in covered([(bands, simulated, window)]):
             inside[f"{name} {kind} {level}"] = share

@@ -1,10 +1,9 @@
-"""The tables of a model's parameters: one order of θ's columns, and everybody asks by name.
+"""The table of a model's parameters: one order of θ's columns, and everybody asks by name.
 
-A :class:`ParameterTable` is that of one record: the actuator's parameters come first, then the
-noise's, each in the order in which their parts declare them. A :class:`JointTable` is that of
-several records that were measured on one actuator: what belongs to the actuator is there once, what
-belongs to a record (its initial state, its offset) once for each, side by side, and named after it:
-``offset[step_10]``. Of one record both are the same.
+The actuator's parameters come first, then the noise's, each in the order in which their parts
+declare them. Of several records that were measured on one actuator, what belongs to the actuator is
+there once; what belongs to a record (its initial state, its offset) is there once for each, side by
+side, and named after it: ``offset[step_10]``.
 """
 
 from __future__ import annotations
@@ -14,67 +13,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
-
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Scope
 from bwbayes.shown import brief
 
-__all__ = ["Column", "JointTable", "ParameterTable"]
-
-
-@dataclass(frozen=True)
-class ParameterTable:
-    """The parameters of an actuator and of a noise, in the order of θ's columns."""
-
-    __repr__ = brief
-
-    actuator_part: Actuator
-    noise_part: Noise
-
-    @cached_property
-    def declarations(self) -> tuple[Declaration, ...]:
-        """The parameters as their parts declare them."""
-        return (*self.actuator_part.declarations, *self.noise_part.declarations)
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of θ's columns."""
-        return tuple(declaration.name for declaration in self.declarations)
-
-    def of_scope(self, scope: Scope) -> tuple[str, ...]:
-        """Return the names of parameters of the actuator, or of one record."""
-        return tuple(d.name for d in self.declarations if d.scope == scope)
-
-    @property
-    def loop(self) -> tuple[str, ...]:
-        """Names of the parameters that shape the loop."""
-        return tuple(d.name for d in self.declarations if d.loop)
-
-    def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
-        """Return the columns (models,) of θ (models, parameters) by name."""
-        return dict(zip(self.names, theta.T, strict=True))
-
-    def actuator(self, theta: FloatArray) -> FloatArray:
-        """Return the columns of θ that the actuator takes, (models, its parameters)."""
-        return theta[:, : len(self.actuator_part.parameters)]
-
-    def noise(self, theta: FloatArray) -> FloatArray:
-        """Return the columns of θ that the noise takes, (models, its parameters)."""
-        return theta[:, len(self.actuator_part.parameters) :]
-
-    def replaced(self, theta: FloatArray, name: str, values: FloatArray) -> FloatArray:
-        """Return a copy of θ (models, parameters) with other values (models,) of one parameter."""
-        theta = theta.copy()
-        theta[:, self.names.index(name)] = values
-        return theta
+__all__ = ["Column", "ParameterTable"]
 
 
 class Column(NamedTuple):
-    """A column of a joint θ: its name, what its part declares, and whose it is.
+    """A column of θ: its name, what its part declares, and whose it is.
 
     ``record`` is empty for what all records share.
     """
@@ -85,15 +35,15 @@ class Column(NamedTuple):
 
 
 @dataclass(frozen=True)
-class JointTable:
-    """The parameters of one model and several records, in the order of θ's columns.
+class ParameterTable:
+    """The parameters of a model and its records, in the order of θ's columns.
 
     Parameters
     ----------
-    table
-        The parameters of one record: of all of them, for they have the same parts.
+    actuator_part, noise_part
+        The model's parts, which all records have.
     records
-        The records' names.
+        The records' names; of one alone, or none, all parameters have plain names.
     per_record, shared
         Parameters that each record has of its own, or that all share, whatever scope their part
         declares.
@@ -104,16 +54,20 @@ class JointTable:
         A parameter that no part has, or that is to be both.
     """
 
-    table: ParameterTable
-    records: tuple[str, ...]
+    __repr__ = brief
+
+    actuator_part: Actuator
+    noise_part: Noise
+    records: tuple[str, ...] = ()
     per_record: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        plain = [declaration.name for declaration in self.declarations]
         for key, names in (("per_record", self.per_record), ("shared", self.shared)):
             for name in names:
-                if name not in self.table.names:
-                    hint = suggestion(name, self.table.names)
+                if name not in plain:
+                    hint = suggestion(name, plain)
                     raise InputError(f"model.{key}: no part here has {name!r}; {hint}")
         repeated = [name for name in self.per_record if name in self.shared]
         if repeated:
@@ -123,22 +77,23 @@ class JointTable:
             )
 
     @cached_property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """The parameters of one record as their parts declare them."""
+        return (*self.actuator_part.declarations, *self.noise_part.declarations)
+
+    @cached_property
     def layout(self) -> tuple[Column, ...]:
         """The columns of θ, in their order."""
         return tuple(self._laid_out())
 
     def _laid_out(self) -> Iterator[Column]:
-        for declared in self.table.declarations:
-            if len(self.records) > 1 and self._is_own(declared):
+        for declared in self.declarations:
+            by_record = declared.scope == "record" and declared.name not in self.shared
+            if len(self.records) > 1 and (by_record or declared.name in self.per_record):
                 for record in self.records:
                     yield Column(f"{declared.name}[{record}]", declared, record)
             else:
                 yield Column(declared.name, declared, "")
-
-    def _is_own(self, declared: Declaration) -> bool:
-        if declared.scope == "record":
-            return declared.name not in self.shared
-        return declared.name in self.per_record
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -153,35 +108,49 @@ class JointTable:
     @property
     def physical(self) -> tuple[str, ...]:
         """Names of the parameters that are the actuator's parts', not the noise's."""
-        names = self.table.actuator_part.parameters
+        names = self.actuator_part.parameters
         return tuple(column.name for column in self.layout if column.declaration.name in names)
+
+    def of_scope(self, scope: Scope) -> tuple[str, ...]:
+        """Return the names of parameters of the actuator, or of one record."""
+        return tuple(c.name for c in self.layout if c.declaration.scope == scope)
 
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return the columns (models,) of θ (models, parameters) by name."""
         return dict(zip(self.names, theta.T, strict=True))
 
-    @cached_property
-    def _places(self) -> dict[str, IntArray]:
-        """Of each record, where its own θ's columns are in the joint one."""
-        places = {}
-        for record in self.records:
-            columns = {
-                column.declaration.name: index
-                for index, column in enumerate(self.layout)
-                if column.record in ("", record)
-            }
-            places[record] = np.array([columns[name] for name in self.table.names])
-        return places
+    def actuator(self, theta: FloatArray) -> FloatArray:
+        """Return the columns of one record's θ that the actuator takes, (models, parameters)."""
+        return theta[:, : len(self.actuator_part.parameters)]
 
-    def places(self, record: str) -> IntArray:
+    def noise(self, theta: FloatArray) -> FloatArray:
+        """Return the columns of one record's θ that the noise takes, (models, parameters)."""
+        return theta[:, len(self.actuator_part.parameters) :]
+
+    def replaced(self, theta: FloatArray, name: str, values: FloatArray) -> FloatArray:
+        """Return a copy of θ (models, parameters) with other values (models,) of one parameter."""
+        theta = theta.copy()
+        theta[:, self.names.index(name)] = values
+        return theta
+
+    @cached_property
+    def _columns_of(self) -> dict[str, list[int]]:
+        """Where each record's own θ has its columns in the joint one."""
+        return {
+            record: [i for i, column in enumerate(self.layout) if column.record in ("", record)]
+            for record in self.records
+        }
+
+    def columns_of(self, record: str) -> list[int]:
         """Return where the columns of a record's own θ are in the joint one."""
-        return self._places[record]
+        return self._columns_of[record]
 
     def of(self, theta: FloatArray, record: str) -> FloatArray:
         """Return θ of one record (models, its parameters) from the joint one."""
-        columns: FloatArray = theta[:, self._places[record]]
+        columns: FloatArray = theta[:, self._columns_of[record]]
         return columns
 
     def name_of(self, name: str, record: str) -> str:
         """Return the name of the column that is a record's parameter ``name``."""
-        return self.names[int(self._places[record][self.table.names.index(name)])]
+        plain = [declaration.name for declaration in self.declarations]
+        return self.names[self._columns_of[record][plain.index(name)]]

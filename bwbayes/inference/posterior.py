@@ -21,14 +21,14 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.noise import Noise
-from bwbayes.inference.parameter_table import JointTable, ParameterTable
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
 
-__all__ = ["Alone", "Dataset", "Posterior"]
+__all__ = ["Dataset", "Posterior", "RecordView"]
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Dataset:
         )
 
 
-class Alone(NamedTuple):
+class RecordView(NamedTuple):
     """One of a posterior's records: its own posterior, and its parameters of some draws.
 
     ``draws`` are (draws, free of that posterior), parameters in their own units.
@@ -145,7 +145,7 @@ class Posterior:
     datasets: tuple[Dataset, ...]
     prior: JointPrior
     engine: Engine = "numpy"
-    joint: JointTable | None = None
+    joint: ParameterTable | None = None
 
     def __post_init__(self) -> None:
         expected = self.table.names
@@ -153,10 +153,10 @@ class Posterior:
             raise InputError(f"prior: its parameters must be {', '.join(expected)}, in this order")
 
     @cached_property
-    def table(self) -> JointTable:
+    def table(self) -> ParameterTable:
         """The parameters in the order of θ's columns."""
         names = tuple(dataset.name for dataset in self.datasets)
-        return self.joint or JointTable(self.datasets[0].table, names)
+        return self.joint or replace(self.datasets[0].table, records=names)
 
     @property
     def only(self) -> Dataset:
@@ -283,8 +283,8 @@ class Posterior:
             return {self.only.name: self}
         posteriors = {}
         for dataset in self.datasets:
-            places = self.table.places(dataset.name)
-            parameters = (self.prior.parameters[column] for column in places.tolist())
+            columns = self.table.columns_of(dataset.name)
+            parameters = (self.prior.parameters[column] for column in columns)
             prior = JointPrior(
                 (replace(p, name=p.plain, record="") for p in parameters), self.prior.constraint
             )
@@ -295,14 +295,15 @@ class Posterior:
         """Return the posterior of one record alone, its parameters by their plain names."""
         return self._alone[record]
 
-    def its(self, draws: FloatArray, record: str) -> FloatArray:
+    def select_draws(self, draws: FloatArray, record: str) -> FloatArray:
         """Return the columns of draws (draws, free) that are free parameters of a record alone."""
         names = (self.table.name_of(name, record) for name in self.alone(record).names)
         columns = [self.names.index(name) for name in names]
         columns_of: FloatArray = draws[..., columns]
         return columns_of
 
-    def each(self, draws: FloatArray) -> Iterator[Alone]:
+    def each(self, draws: FloatArray) -> Iterator[RecordView]:
         """Yield the records one by one, with their parameters of draws (draws, free)."""
         for dataset in self.datasets:
-            yield Alone(dataset.name, self.alone(dataset.name), self.its(draws, dataset.name))
+            name = dataset.name
+            yield RecordView(name, self.alone(name), self.select_draws(draws, name))

@@ -113,7 +113,7 @@ def _extended(posterior: Posterior, creep: Creep) -> Posterior:
     )
     declared = {parameter.name: parameter for parameter in posterior.prior.parameters}
     declared |= {one.name: Parameter.of(one, creep.strength) for one in creep.parameters}
-    joint = replace(posterior.table, table=datasets[0].table)
+    joint = replace(posterior.table, actuator_part=datasets[0].actuator)
     prior = JointPrior((declared[name] for name in joint.names), posterior.prior.constraint)
     return Posterior(datasets, prior, posterior.engine, joint)
 

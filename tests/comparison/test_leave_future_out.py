@@ -20,7 +20,6 @@ from bwbayes.comparison.leave_future_out import (
     leave_future_out,
     log_ratios,
 )
-from bwbayes.inference.parameter_table import JointTable
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.test_solvable import (
@@ -129,7 +128,7 @@ def test_two_records_are_scored_given_the_beginnings_of_both() -> None:
         replace(posterior.only, training=(window,), name=name)
         for name, window in zip(names, WINDOWS, strict=True)
     )
-    table = JointTable(datasets[0].table, names, shared=("initial", "offset"))
+    table = replace(datasets[0].table, records=names, shared=("initial", "offset"))
     both = Posterior(datasets, posterior.prior, joint=table)
     part = scored(both, exact(posterior), {})[FUTURE]
     rows = [dataset.readings.rows for dataset in datasets]

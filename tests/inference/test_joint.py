@@ -18,7 +18,6 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
-from bwbayes.inference.parameter_table import JointTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
@@ -51,7 +50,7 @@ def joint(
     """Return the posterior of records with the default priors of the first."""
     first = datasets[0]
     names = tuple(one.name for one in datasets)
-    table = JointTable(first.table, names, per_record, shared)
+    table = replace(first.table, records=names, per_record=per_record, shared=shared)
     usual = posterior_of(first.voltage, first.displacement, first.actuator, "discrepancy", {})
     known = {p.name: p for p in usual.prior.parameters}
     parameters = []

@@ -98,7 +98,7 @@ def design(
     name = liveliest(problem)
     promises = rank(
         problem.posterior.alone(name),
-        problem.posterior.its(fit.flat_draws, name),
+        problem.posterior.select_draws(fit.flat_draws, name),
         signals,
         quantity,
         amplifier,

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import joined, ranges_of
 from bwbayes.inference.noise import NOISES
-from bwbayes.inference.parameter_table import Column, JointTable
+from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.creep import MOST_TIMES, Creep
@@ -39,7 +39,7 @@ __all__ = [
 
 
 def parameters_of(
-    config: Config, table: JointTable, contexts: Mapping[str, Context]
+    config: Config, table: ParameterTable, contexts: Mapping[str, Context]
 ) -> list[Parameter]:
     """Return the parameters that a model's parts declare, in the order of θ's columns.
 
@@ -50,7 +50,7 @@ def parameters_of(
     InputError
         The config says something of a parameter that the model does not have, or cannot have.
     """
-    declarations, columns = table.table.declarations, table.layout
+    declarations, columns = table.declarations, table.layout
     named = [replace(column.declaration, name=column.name) for column in columns]
     _require_known("parameters", config.parameters, [*declarations, *named])
     _require_known("truth", config.truth, [*declarations, *named, *every_declaration()])

@@ -48,7 +48,7 @@ from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
-from bwbayes.inference.parameter_table import JointTable, ParameterTable
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.distributions import Distribution
@@ -289,7 +289,7 @@ def _posterior(
             )
         )
     chosen = tuple(config.model.per_record), tuple(config.model.shared)
-    table = JointTable(datasets[0].table, tuple(records), *chosen)
+    table = ParameterTable(datasets[0].actuator, datasets[0].noise, tuple(records), *chosen)
     contexts = contexts_of(config, records, training)
     parameters = parameters_of(config, table, contexts)
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)

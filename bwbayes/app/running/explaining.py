@@ -59,7 +59,7 @@ def explained(
     posterior, record = problem.posterior, problem.records[name]
     scene = Scene.of(
         posterior.alone(name),
-        posterior.its(places, name),
+        posterior.select_draws(places, name),
         generator(problem.config.seed, f"explanations {record.sha256}"),
         [window for windows in problem.held_out(name).values() for window in windows],
         record.start,

@@ -279,7 +279,7 @@ def _reaching(
     if any(finding.kind in ("slow", "duration") for finding in beyond):
         source = generator(problem.config.seed, f"creep {record.sha256}")
         posterior, draws = with_creep(posterior, draws, record.duration, source)
-    return posterior.alone(of), posterior.its(draws, of)
+    return posterior.alone(of), posterior.select_draws(draws, of)
 
 
 def judged(
