@@ -232,17 +232,7 @@ class Likelihood:
         # Here, because numba may not be installed, and takes half a second to load.
         from bwbayes.inference import compiled  # noqa: PLC0415
 
-        return compiled.moments(
-            theta,
-            self.voltage[: self.readings.samples],
-            self.values,
-            self.skipped,
-            self.actuator,
-            self.spaced,
-            int(self.offset_sd > 0),
-            self.unknowns - int(self.offset_sd > 0),
-            from_rest=self.from_rest,
-        )
+        return compiled.products(self, theta)
 
     def _with_numpy(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None

@@ -19,14 +19,15 @@ MAIN = "import sys; from bwbayes.app.commands.cli import main; sys.argv[0] = 'bw
 # One model through all that is compiled.
 COMPILED = """
 import numpy as np
-from bwbayes.inference.compiled import moments
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.parameter_table import ParameterTable
+from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
-parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)
 record = np.sin(np.arange(9.0))
-theta = np.ones((1, len(ParameterTable(*parts).names)))
-moments(theta, record, record, 0 * record, *parts, 1, 0, from_rest=True)
+readings = Readings.of(record, [slice(0, 9)])
+parts = Actuator("lag", "first", 1e-3), DiscrepancyNoise(1e-3)
+likelihood = Likelihood(record, readings, *parts, "numba", True, 1.0, 1.0)
+likelihood.log_density(np.ones((1, len(likelihood.table.names))))
 """
 
 STARTS: Mapping[str, list[str]] = {

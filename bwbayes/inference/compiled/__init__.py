@@ -16,54 +16,30 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes, whitening
 from bwbayes.inference.compiled.motion import physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import Noise
-from bwbayes.inference.parameter_table import ParameterTable
-from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 
-__all__ = ["moments", "whiten"]
-
-# Elements (models x samples) of the drive that is worked out beforehand, at a time.
-LARGEST = 1 << 23
+__all__ = ["products", "whiten"]
 
 
-def moments(
-    theta: FloatArray,
-    voltage: FloatArray,
-    displacement: FloatArray,
-    skipped: FloatArray,
-    actuator: Actuator,
-    noise: Noise,
-    offset: int,
-    free: int,
-    *,
-    from_rest: bool,
-) -> tuple[FloatArray, FloatArray]:
-    """Return products and log determinants as :class:`~bwbayes.inference.likelihood.Moments` does.
+def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Σ zᵢ zⱼ of whitened series, and log determinants, as the NumPy likelihood does.
 
-    Parameters
-    ----------
-    theta
-        (models, parameters), those of the actuator and of the noise, inside the model's domain.
-    voltage, displacement
-        (samples,), V and um, from the record's first sample to its last reading.
-    skipped
-        (samples,) readings that are missing just before one; −1 where there is none.
-    actuator, noise
-        The model; the noise for the interval between readings.
-    offset, free
-        How many offsets and free responses of the dynamics are unknown.
-    from_rest
-        The record starts from rest.
+    At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
     """
-    table = ParameterTable(actuator, noise)
-    column, parameters = table.columns(theta), table.noise(theta)
+    actuator, noise, skipped = likelihood.actuator, likelihood.spaced, likelihood.skipped
+    voltage = likelihood.voltage[: likelihood.readings.samples]
+    offset = int(likelihood.offset_sd > 0)
+    free = likelihood.unknowns - offset
+    column = likelihood.table.columns(theta)
+    parameters = likelihood.table.noise(theta)
     usual, process, sensor, second, gaps, steps = _filtering(noise, parameters, skipped)
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
-    record, together = (voltage, displacement, gaps), shared(actuator, voltage)
-    for rows, stage in _staged(actuator, column, theta, voltage, from_rest=from_rest):
+    record, together = (voltage, likelihood.values, gaps), shared(actuator, voltage)
+    for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
         named = physics(actuator, column, equilibrium, voltage)
@@ -81,12 +57,12 @@ def moments(
             *together, *unknowns,
         )  # fmt: skip
     size = 1 + offset + free
-    products = np.empty((len(theta), size, size))
+    pairs = np.empty((len(theta), size, size))
     for i in range(size):
         for j in range(i + 1):
-            products[:, i, j] = products[:, j, i] = sums[i * (i + 1) // 2 + j]
+            pairs[:, i, j] = pairs[:, j, i] = sums[i * (i + 1) // 2 + j]
     typical = np.count_nonzero(skipped >= 0) * np.log(usual[3] + sensor)
-    return products, typical + sums[lanes.LOG_DETERMINANT]
+    return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
 def whiten(
@@ -120,10 +96,11 @@ def _filtering(
 
 
 def _staged(
-    actuator: Actuator, column: Values, theta: FloatArray, voltage: FloatArray, *, from_rest: bool
+    likelihood: Likelihood, column: Values, voltage: FloatArray
 ) -> Iterator[tuple[IntArray | slice, Stage]]:
     """Yield which models go together, and the stage that makes their drive."""
-    operator, others = actuator.hysteresis, np.arange(len(theta))
+    actuator, from_rest = likelihood.actuator, likelihood.from_rest
+    operator, others = actuator.hysteresis, np.arange(column["offset"].size)
     compiled = DRIVES.get(type(operator))
     if compiled is None:
         memory = actuator.begin(column, voltage, from_rest=from_rest)
@@ -131,7 +108,8 @@ def _staged(
         if stage is not None:
             yield slice(None), stage
             return
-    size = max(LARGEST // voltage.size, 1)
+    # Elements (models x samples) of the drive that is worked out beforehand, at a time.
+    size = max((1 << 23) // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
         values = {name: column[name][rows] for name in actuator.parameters}
         memory = actuator.begin(values, voltage, from_rest=from_rest)
