@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 
 import numpy as np
-from emcee.moves import MHMove, RedBlueMove
+from emcee.moves import RedBlueMove
 from numpy.typing import NDArray
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
@@ -81,11 +81,6 @@ def advance(
     its batch, to rounding where it does (a record's are worked out for groups of models, whose
     noise settles together). On a short record a call costs more than the models in it, so that
     four ensembles cost little more than one.
-
-    Raises
-    ------
-    InputError
-        A move that is neither emcee's ``RedBlueMove`` or ``MHMove`` nor an ``AmongPlaces``.
     """
     walks = [_walk(weighted, state, steps) for weighted, state in zip(moves, states, strict=True)]
     blocks: dict[int, Block] = {}
@@ -169,9 +164,7 @@ def _walk(moves: Weighted, state: EnsembleState, steps: int) -> _Walk:
     while True:
         move = moves[kind][0]
         following = None
-        if isinstance(move, RedBlueMove):
-            yield from _split_step(move, kind, path)
-        elif isinstance(move, AmongPlaces):
+        if isinstance(move, AmongPlaces):
             proposed, chances = [], []
             while following in (None, kind):
                 proposed.append(move.proposal.draw(random, move.places * len(path.here)))
@@ -180,13 +173,8 @@ def _walk(moves: Weighted, state: EnsembleState, steps: int) -> _Walk:
                     break
                 following = choose()
             yield from _independent_steps(move, kind, path, proposed, chances)
-        elif isinstance(move, MHMove):
-            places, factor = move.get_proposal(path.here, random)
-            density = yield places
-            accepted = np.log(random.rand(len(density))) < density - path.density + factor
-            path.step(kind, accepted, places, density)
         else:
-            raise InputError(f"moves: {type(move).__name__} is neither a RedBlueMove nor an MHMove")
+            yield from _split_step(move, kind, path)
         if path.is_complete:
             return path.block()
         kind = choose() if following is None else following

@@ -6,13 +6,10 @@ bring the pilot to the posterior, where half of its steps try places of the poin
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws, and bent as they
 are, proposes places independently of where a walker is, which mixes about ten times faster. The fit
 is frozen before the draws that count, and a seventh of the steps remain differential evolution and
-snooker, so that whatever the fit does not cover is reached, and left again. While a fit is still
-poor, half of the steps go only part of the way to its places (:func:`near`).
+snooker, so that whatever the fit does not cover is reached, and left again.
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 from emcee import moves
@@ -24,10 +21,8 @@ __all__ = [
     "AmongPlaces",
     "SnookerMove",
     "Weighted",
-    "near",
     "pilot_moves",
     "sampling_moves",
-    "spreading_moves",
 ]
 
 Weighted = list[tuple[moves.Move, float]]
@@ -100,50 +95,6 @@ class AmongPlaces(moves.Move):  # type: ignore[misc]  # emcee has no types
         return which, accepted, chosen
 
 
-def near(
-    mixture: StudentMixture, coordinates: FloatArray, random: np.random.RandomState
-) -> tuple[FloatArray, FloatArray]:
-    """Propose an autoregressive step within a component of a mixture q, as ``MHMove`` asks.
-
-    A proposal that was fitted to few draws covers little of a long, curved posterior: walkers take
-    one in twenty of its places. A step that goes only part of the way follows the proposal's own
-    bends and widths and is taken far more often, so walkers spread while q is still being learned.
-
-    In straight coordinates, from z, with a component j drawn with the probability that z is its,
-    its ν, μ and L, and p coordinates,
-
-        z' = μ + √(1 − β²) (z − μ) + β √λ L ξ,   λ = (ν + |L⁻¹(z − μ)|²) / χ²(ν + p),
-
-    ξ normal and log β uniform from log 0.2 to 0. Given j and λ, which are drawn from what z tells
-    of them, the step leaves a normal distribution as it is, there and back alike; so the mixture
-    is left as it is, and the log factor is that of an independent place, log q(x) − log q(x').
-
-    Notes
-    -----
-    For one component: K. Kamatani, Efficient strategy for the Markov chain Monte Carlo in
-    high-dimension with heavy-tailed target probability distribution, Bernoulli 24 (2018) 3711-3750.
-    """
-    (count, free), bend = coordinates.shape, mixture.bend
-    z = coordinates if bend is None else bend.to_straight(coordinates)
-    squares = mixture.squares(z)
-    logs = mixture.log_parts(squares)
-    ends = np.cumsum(np.exp(logs - np.max(logs, axis=0)), axis=0)
-    j = np.sum(random.random_sample(count) * ends[-1] >= ends, axis=0)
-    freedom = mixture.freedom
-    spread = np.sqrt(
-        (freedom + squares[j, np.arange(count)]) / random.chisquare(freedom + free, count)
-    )
-    beta = 0.2 ** random.random_sample(count)
-    normal = random.standard_normal((count, free)) * (beta * spread)[:, np.newaxis]
-    centers, retained = mixture.centers[j], np.sqrt(1 - beta**2)[:, np.newaxis]
-    proposed = centers + retained * (z - centers)
-    proposed += np.einsum("ijk,ik->ij", mixture.factors[j], normal)
-    if bend is not None:
-        proposed = bend.to_curved(proposed)
-    old, new = np.split(mixture.log_density(np.concatenate([coordinates, proposed])), 2)
-    return proposed, old - new
-
-
 def pilot_moves(proposal: StudentMixture | None = None, places: int = 1) -> Weighted:
     """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
     if proposal is None:
@@ -156,15 +107,3 @@ def sampling_moves(proposal: StudentMixture | None, places: int = 1) -> Weighted
     if proposal is None:
         return pilot_moves()
     return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (AmongPlaces(proposal, places), 0.85)]
-
-
-def spreading_moves(proposal: StudentMixture | None, places: int = 1) -> Weighted:
-    """Return moves and weights for tuning with a poor fit; as the pilot's without a proposal."""
-    if proposal is None:
-        return pilot_moves()
-    return [
-        (moves.DEMove(), 0.12),
-        (SnookerMove(), 0.03),
-        (AmongPlaces(proposal, places), 0.35),
-        (moves.MHMove(partial(near, proposal)), 0.5),
-    ]

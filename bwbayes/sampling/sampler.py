@@ -3,9 +3,8 @@
 The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
 by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
 draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on,
-each time with a new fit and twice as long, and with steps that go part of the way to such places: a
-long, curved posterior needs more draws to be seen whole, and walkers that spread. Pilot and tuning
-are thrown away. Then draws count, and the chain is judged
+each time with a new fit and twice as long: a long, curved posterior needs more draws to be seen
+whole. Pilot and tuning are thrown away. Then draws count, and the chain is judged
 (:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row find nothing wrong, the first
 on half the draws that are to be reached, the second on all of them and a fifth more than the first
 at least; or the budget of steps is used up.
@@ -50,7 +49,7 @@ from bwbayes.sampling.diagnostics import (
     times,
 )
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import pilot_moves, sampling_moves, spreading_moves
+from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -142,8 +141,7 @@ class _Sampling:
         """Advance every ensemble by a block, wherever the executor likes."""
         plan, chain = self.plan, self.chain
         proposal, ends = chain.proposal_in_use(phase), chain.ends
-        spreads = phase == "tuning" and chain.blocks(phase) >= TUNING_BLOCKS
-        make = pilot_moves if phase == "pilot" else spreading_moves if spreads else sampling_moves
+        make = pilot_moves if phase == "pilot" else sampling_moves
         futures = []
         for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
             # Moves of its own for each: some of emcee's write to themselves.

@@ -9,7 +9,7 @@ from dataclasses import replace
 import emcee
 import numpy as np
 import pytest
-from emcee.moves import DEMove, MHMove, StretchMove
+from emcee.moves import DEMove, StretchMove
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
@@ -64,22 +64,6 @@ def test_blocks_in_a_row_are_one_long_block(phase: str, cuts: tuple[int, ...]) -
     np.testing.assert_array_equal(whole.accepted, np.sum([b.accepted for b in blocks], axis=0))
     np.testing.assert_array_equal(whole.moves, np.sum([b.moves for b in blocks], axis=0))
     assert_same_state(whole.end, state)
-
-
-def test_acceptance_is_told_of_each_move_by_itself() -> None:
-    """A move that is never accepted between one that always is and one in between."""
-
-    def nowhere(x: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
-        return x + random.standard_normal(x.shape), np.full(len(x), -np.inf)
-
-    def stay(x: FloatArray, _: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
-        return x, np.zeros(len(x))
-
-    moves = [(MHMove(stay), 0.3), (MHMove(nowhere), 0.4), (DEMove(), 0.3)]
-    counts = alone(moves, begin(), 60).moves
-    assert counts[0, 0] == counts[0, 1] > 0
-    assert 0 == counts[1, 1] < counts[1, 0]
-    assert 0 < counts[2, 1] < counts[2, 0]
 
 
 EMCEES: dict[str, Callable[[], Weighted]] = {

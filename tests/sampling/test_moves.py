@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import emcee
 import numpy as np
 import pytest
-from emcee.moves import DEMove, MHMove, Move
+from emcee.moves import DEMove, Move
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,9 +24,7 @@ from bwbayes.sampling.moves import (
     AmongPlaces,
     SnookerMove,
     Weighted,
-    near,
     sampling_moves,
-    spreading_moves,
 )
 from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import ALARM, TARGETS, gaussian, target, worst_score
@@ -75,9 +72,7 @@ RIGHT: dict[str, Callable[[str], Weighted]] = {
     "snooker": lambda _: [(SnookerMove(), 1.0)],
     "a place": lambda name: [(AmongPlaces(fitted(name)), 1.0)],
     "one of several places": lambda name: [(AmongPlaces(TARGETS[name].proposal, 5), 1.0)],
-    "nearby": lambda name: [(MHMove(partial(near, fitted(name))), 1.0)],
     "those that sample": lambda name: sampling_moves(fitted(name)),
-    "those that spread": lambda name: spreading_moves(fitted(name)),
 }
 # Differential evolution that accepts too easily, moves without their factor, and steps that take
 # every place that was chosen: the best of two is no draw of the target.
@@ -85,7 +80,6 @@ WRONG: dict[str, Callable[[str], Weighted]] = {
     "differential evolution": lambda _: [(planted(DEMove(), eager), 1.0)],
     "snooker": lambda _: [(planted(SnookerMove(), forgotten), 1.0)],
     "one of several places": lambda name: [(Eager(TARGETS[name].proposal, 2), 1.0)],
-    "nearby": lambda name: [(planted(MHMove(partial(near, fitted(name))), forgotten), 1.0)],
 }
 
 
