@@ -142,7 +142,7 @@ class Likelihood:
             log p = −½ (|z₀ − Z μ|² + μᵀ P⁻¹ μ + log det V + log det(1 + P Zᵀ Z) + n log 2π),
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
         """
-        return self._integrated(theta, *self._products(theta))[0]
+        return self._integrated(theta, *self._products(theta))
 
     def score(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
@@ -157,35 +157,34 @@ class Likelihood:
         at θ, if it is given.
         """
         products, log_determinant = self._with_numpy(theta, shapes, displacement)
-        start, unexplained = self._integrated(theta, products, log_determinant)
+        start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
+        series = [0, *range(end, end + len(shapes))]
+        across = products[:, 1:end][:, :, series]
+        explained = np.einsum("mui,muv,mvj->mij", across, start.covariance, across)
+        unexplained = products[:, series][:, :, series] - explained
         return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], start.log_density)
 
     def _integrated(
         self, theta: FloatArray, products: FloatArray, log_determinant: FloatArray
-    ) -> tuple[LinearStart, FloatArray]:
+    ) -> LinearStart:
         """Integrate the unknowns out of products (models, series, series) of whitened series.
 
-        These are the residual, the unknowns' responses and any others; what the unknowns do not
-        explain of the products of residual and others is returned too.
+        These are the residual, the unknowns' responses and any others.
         """
         sd = self.start_sd(theta)
         end = 1 + sd.shape[1]
         prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
-        pull = sd[:, :, np.newaxis] * products[:, 1:end]
+        pull = sd * products[:, 1:end, 0]
         covariance, log_volume = _inverse(np.eye(end - 1) + prior * products[:, 1:end, 1:end])
-        mean = np.einsum("mij,mj->mi", covariance, pull[:, :, 0])
-        squares = products[:, 0, 0] - np.sum(mean * pull[:, :, 0], axis=1)
+        mean = np.einsum("mij,mj->mi", covariance, pull)
+        squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
         # Less cannot be told of a difference: where noise is next to none and an unknown without
         # bounds, what rounding left was a place more probable than any that is possible.
-        size = np.abs(pull[:, :, 0])
+        size = np.abs(pull)
         terms = np.einsum("mi,mij,mj->m", size, np.abs(covariance), size)
         squares = np.maximum(squares, 1e-15 * (products[:, 0, 0] + terms))
         logs = log_determinant + log_volume + self.readings.rows.size * LOG_TWO_PI
-        start = LinearStart(-0.5 * (squares + logs), squares, sd * mean, prior * covariance)
-        series = [0, *range(end, products.shape[1])]
-        across = pull[:, :, series]
-        explained = np.einsum("mui,muv,mvj->mij", across, covariance, across)
-        return start, products[:, series][:, :, series] - explained
+        return LinearStart(-0.5 * (squares + logs), squares, sd * mean, prior * covariance)
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
