@@ -1,82 +1,16 @@
-"""The posterior against a slow one: a scalar model, sample by sample, and dense matrices."""
+"""The posterior of a batch of models; :mod:`tests.test_reference_posteriors` has its numbers."""
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
-from math import exp
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
-from bwbayes.inference.posterior import Posterior
 from tests.inference.problems import INTERVAL, short_posterior, single
-
-
-def scalar_displacement(theta: dict[str, float], voltage: FloatArray) -> FloatArray:
-    """Equation (6) sample by sample, n = 1, and the lag by an integral over each interval."""
-    h = theta["initial"]
-    rest = theta["d"] * voltage[0] - h
-    x, drive = 0.0, 0.0
-    displacement = [rest + theta["offset"]]
-    for before, after in itertools.pairwise(voltage.tolist()):
-        sign, left = float(np.sign(after - before)), abs(after - before)
-        g = sign * h
-        if g < 0:
-            # Relax with beta - gamma until h crosses zero, or the interval ends.
-            rate = theta["beta"] - theta["gamma"]
-            travel = min(left, float(np.log(1 - g * rate / theta["alpha"]) / rate))
-            limit = theta["alpha"] / rate
-            g, left = limit + (g - limit) * exp(-rate * travel), left - travel
-        limit = theta["alpha"] / (theta["beta"] + theta["gamma"])
-        g = limit + (g - limit) * exp(-(theta["beta"] + theta["gamma"]) * left)
-        h = sign * g
-        slope = (theta["d"] * after - h - rest - drive) / INTERVAL
-        lag = theta["lag"]
-        # tau x' + x = drive + slope t has the particular solution drive + slope (t - tau).
-        kept = exp(-INTERVAL / lag)
-        x = drive + slope * (INTERVAL - lag) + (x - drive + slope * lag) * kept
-        drive += slope * INTERVAL
-        displacement.append(x + rest + theta["offset"])
-    return np.array(displacement)
-
-
-def dense_log_likelihood(posterior: Posterior, theta: FloatArray) -> float:
-    named = dict(zip(posterior.prior.names, theta.tolist(), strict=True))
-    residual = posterior.only.displacement - scalar_displacement(named, posterior.only.voltage)
-    rows = posterior.only.readings.rows
-    apart = np.abs(np.subtract.outer(rows, rows))
-    covariance = named["sensor_sd"] ** 2 * np.eye(rows.size)
-    if "discrepancy_sd" in named:
-        kept = np.exp(-INTERVAL * apart / named["discrepancy_time"])
-        covariance += named["discrepancy_sd"] ** 2 * kept
-    dense = stats.multivariate_normal(np.zeros(rows.size), covariance)
-    return float(dense.logpdf(residual[rows]))
-
-
-WINDOWS = (slice(5, 40), slice(70, 120))
-
-
-@pytest.mark.parametrize("noise", ["white", "discrepancy"])
-@pytest.mark.parametrize("training", [None, WINDOWS])
-def test_log_density_is_that_of_a_slow_computation(
-    noise: str, training: tuple[slice, ...] | None
-) -> None:
-    posterior = short_posterior(
-        "white" if noise == "white" else "discrepancy", 150, "lag", {}, training=training
-    )
-    draws = posterior.prior.draw(np.random.default_rng(1), 12)
-    z = posterior.prior.unconstrain(draws)
-    theta = posterior.prior.theta(draws)
-    expected = posterior.prior.constrain(z)[1] + [
-        dense_log_likelihood(posterior, row) for row in theta
-    ]
-    got = posterior.log_density(z)
-    assert np.max(np.abs(expected - got) / (150 + np.abs(expected))) < 1e-9
 
 
 @pytest.mark.parametrize("size", [1, 63, 64, 65, 130])
