@@ -7,12 +7,13 @@ evidence and information criteria.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.arrays import BoolArray
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import Part
 from bwbayes.diagnosis.standing import Standing
@@ -20,26 +21,7 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
 
-__all__ = ["Candidate", "Mean", "judged"]
-
-# The band whose coverage and width stand in the table.
-LEVEL = 95
-
-
-@dataclass(frozen=True)
-class Mean:
-    """What all held-out readings say together, each counting the same.
-
-    ``log_score`` in nats per reading, ``crps_um`` and ``width_um`` of the 95 % sensor band in um,
-    ``nrmse`` over the range of the readings; ``coverage`` of the 95 % sensor band with its error.
-    """
-
-    log_score: float
-    crps_um: float
-    nrmse: float
-    coverage: float
-    coverage_error: float
-    width_um: float
+__all__ = ["Candidate", "judged"]
 
 
 @dataclass(frozen=True)
@@ -92,58 +74,81 @@ class Candidate:
     @property
     def log_evidence(self) -> float:
         """Its log evidence, nats; −∞ if it is not known."""
-        finite = self.evidence is not None and np.isfinite(self.evidence.log_evidence)
-        return self.evidence.log_evidence if finite and self.evidence is not None else -np.inf
+        value = np.nan if self.evidence is None else self.evidence.log_evidence
+        return value if np.isfinite(value) else -np.inf
 
     @property
     def log_likelihood(self) -> float | None:
         """The largest among the draws, or at the MAP estimate, nats."""
         return None if self.evidence is None else self.evidence.max_log_likelihood
 
-    @property
-    def aic(self) -> float | None:
-        """Akaike's criterion 2 k − 2 log L, with :attr:`log_likelihood`."""
+    def criterion(self, penalty: float) -> float | None:
+        """Return penalty times k − 2 log L: Akaike's with 2, Schwarz's with the log of readings."""
         if self.log_likelihood is None:
             return None
-        return 2 * self.free - 2 * self.log_likelihood
+        return penalty * self.free - 2 * self.log_likelihood
 
-    @property
-    def bic(self) -> float | None:
-        """Schwarz's criterion k log n − 2 log L, with :attr:`log_likelihood`."""
-        if self.log_likelihood is None:
-            return None
-        return self.free * float(np.log(self.readings)) - 2 * self.log_likelihood
-
-    def log_score(self, parts: Iterable[str]) -> float:
+    def log_score(self, parts: Collection[str]) -> float:
         """Return the sum of its log scores of parts by their names, nats."""
         return sum(float(np.sum(self.parts[name].log_scores)) for name in parts)
 
     @property
-    def log_scores(self) -> FloatArray | None:
-        """Log scores (readings,) of all held-out readings, nats; None without any."""
-        scores = [
-            bands.log_score[judged(bands)] for bands in self.held_out if bands.log_score is not None
-        ]
-        return np.concatenate(scores) if scores else None
+    def mean(self) -> dict[str, float] | None:
+        """What all held-out readings say together, each counting the same; None without any.
 
-    @property
-    def mean(self) -> Mean | None:
-        """Return what the held-out readings say together; None without any."""
-        if self.log_scores is None:
-            return None
-        scores: Sequence[Scores] = [self.scores[bands.name] for bands in self.held_out]
+        ``log_score`` in nats per reading, ``crps_um`` and ``width_um`` of the 95 % sensor band in
+        um, ``nrmse`` over the range of the readings; ``coverage`` of the 95 % sensor band with its
+        error.
+        """
         counts = np.array([np.sum(judged(bands)) for bands in self.held_out], dtype=np.float64)
-        parts = counts / counts.sum()
-        sensor = [score.coverage["sensor"] or {} for score in scores]
-        errors = [score.coverage_error["sensor"] or {} for score in scores]
-        return Mean(
-            log_score=float(np.mean(self.log_scores)),
-            crps_um=float(parts @ [score.crps_um for score in scores]),
-            nrmse=float(np.sqrt(parts @ np.square([score.nrmse for score in scores]))),
-            coverage=float(parts @ [coverage[LEVEL] for coverage in sensor]),
-            coverage_error=float(np.sqrt(parts**2 @ np.square([error[LEVEL] for error in errors]))),
-            width_um=float(parts @ [score.width_um[LEVEL] for score in scores]),
+        if not counts.sum():
+            return None
+        shares, scores = counts / counts.sum(), [self.scores[b.name] for b in self.held_out]
+        log_scores = [np.mean(np.asarray(b.log_score)[judged(b)]) for b in self.held_out]
+        covered, errors = (
+            np.array([dict(values["sensor"] or {})[95] for values in several])
+            for several in ([s.coverage for s in scores], [s.coverage_error for s in scores])
         )
+        return {
+            "log_score": float(shares @ log_scores),
+            "crps_um": float(shares @ [score.crps_um for score in scores]),
+            "nrmse": float(np.sqrt(shares @ np.square([score.nrmse for score in scores]))),
+            "coverage": float(shares @ covered),
+            "coverage_error": float(np.sqrt(shares**2 @ np.square(errors))),
+            "width_um": float(shares @ [score.width_um[95] for score in scores]),
+        }
+
+    def numbers(self, voting: Collection[str]) -> dict[str, Any]:
+        """Return what ``comparison.json`` holds of it; ``voting`` are the parts that decide."""
+        evidence = self.evidence
+        keys = ("log_evidence", "error", "log_prior_mass", "prior_share")
+        values = [None if evidence is None else getattr(evidence, key) for key in keys]
+        names = ("log_evidence", "log_evidence_error", *keys[2:])
+        return {
+            "model": self.model,
+            "converged": self.converged,
+            "screened": self.screened,
+            "stop_reason": self.stop_reason,
+            "free": self.free,
+            "readings": self.readings,
+            "validation": None if self.standing is None else self.standing.status,
+            "held_out": self.mean,
+            "windows": {name: scores.numbers for name, scores in self.scores.items()},
+            "parts": {
+                name: {
+                    "log_score": float(np.sum(section.log_scores)),
+                    "readings": section.readings,
+                    "independent": section.worth,
+                    "joint": section.joint,
+                    "votes": name in voting,
+                }
+                for name, section in self.parts.items()
+            },
+            **dict(zip(names, values, strict=True)),
+            "log_likelihood": self.log_likelihood,
+            "aic": self.criterion(2.0),
+            "bic": self.criterion(float(np.log(self.readings))),
+        }
 
 
 def judged(bands: Bands) -> BoolArray:

@@ -1,19 +1,19 @@
-"""Models compared: their numbers, what is recommended, and how they are shown and kept.
+"""Models compared: their numbers, what is recommended, and how they are shown.
 
 What :func:`~bwbayes.comparison.recommendation.recommend` returns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.diagnosis.standing import Standing
+from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -21,13 +21,27 @@ from bwbayes.report.report import (
     Section,
     Table,
     TableColumn,
+    Target,
     kind_of,
     standing_banner,
 )
 from bwbayes.report.words import mark
-from bwbayes.shown import head
 
 __all__ = ["Comparison", "Difference"]
+
+# The columns of the models' table: title, text with the numbers of a model, and where it is shown.
+COLUMNS: tuple[tuple[str, str, Target], ...] = (
+    ("Free", "{free}", "both"),
+    ("Log score", "{log_score:.1f}", "both"),
+    ("CRPS", "{held_out[crps_um]:.4f} µm", "page"),
+    ("NRMSE", "{held_out[nrmse]:.2%}", "both"),
+    ("95% covers", "{held_out[coverage]:.1%} ± {held_out[coverage_error]:.1%}", "both"),
+    ("95% width", "{held_out[width_um]:.3g} µm", "page"),
+    ("Log evidence", "{log_evidence:.2f} ± {log_evidence_error:.2f}", "both"),
+    ("Priors' share", "{prior_share:.1f}", "both"),
+    ("AIC", "{aic:.1f}", "page"),
+    ("BIC", "{bic:.1f}", "page"),
+)
 
 
 @dataclass(frozen=True)
@@ -47,8 +61,8 @@ class Difference:
         return -self.value > self.limit
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Product):
     """Models compared on the same readings.
 
     Attributes
@@ -57,31 +71,33 @@ class Comparison:
         The models: the best first, what has not converged last.
     voting
         The parts whose log scores decide; none if the log evidence does.
-    best
-        The best by that, to which the differences are; None if nothing has converged.
     differences
-        By model, the model less the best, nats.
+        By model that has converged, the model less the best, nats; the best first.
+    tied
+        Models that cannot be told apart from the recommended one.
     recommended
         The model recommended; None if nothing has converged.
-    tied
-        Models that cannot be told apart from it.
-    lines
-        The recommendation in words, a line each.
-    caveats
-        What speaks against it, a line each.
+    lines, caveats
+        The recommendation in words, and what speaks against it, a line each.
     facts
         What was compared: subjects, and what is said of each.
     """
 
+    NAME: ClassVar[str] = "comparison"
+
     candidates: tuple[Candidate, ...]
-    voting: tuple[str, ...]
-    best: str | None
-    differences: Mapping[str, Difference]
-    recommended: str | None
-    tied: tuple[str, ...]
-    lines: tuple[str, ...]
-    caveats: tuple[str, ...]
-    facts: tuple[tuple[str, str], ...] = ()
+    voting: tuple[str, ...] = ()
+    differences: Mapping[str, Difference] = field(default_factory=dict)
+    recommended: str | None = None
+    tied: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
+    caveats: tuple[str, ...] = ()
+    facts: Sequence[tuple[str, str]] = ()
+
+    @property
+    def best(self) -> str | None:
+        """The best by what decides; None if nothing has converged."""
+        return next(iter(self.differences), None)
 
     @property
     def measure(self) -> str:
@@ -113,36 +129,8 @@ class Comparison:
         }
 
     def _model_numbers(self, model: Candidate) -> dict[str, Any]:
-        evidence, difference = model.evidence, self.differences.get(model.name)
-        return {
-            "model": model.model,
-            "converged": model.converged,
-            "screened": model.screened,
-            "stop_reason": model.stop_reason,
-            "free": model.free,
-            "readings": model.readings,
-            "validation": None if model.standing is None else model.standing.status,
-            "held_out": None if model.mean is None else vars(model.mean),
-            "windows": {name: scores.numbers for name, scores in model.scores.items()},
-            "parts": {
-                name: {
-                    "log_score": float(np.sum(section.log_scores)),
-                    "readings": section.readings,
-                    "independent": section.worth,
-                    "joint": section.joint,
-                    "votes": name in self.voting,
-                }
-                for name, section in model.parts.items()
-            },
-            "log_evidence": None if evidence is None else evidence.log_evidence,
-            "log_evidence_error": None if evidence is None else evidence.error,
-            "log_prior_mass": None if evidence is None else evidence.log_prior_mass,
-            "prior_share": None if evidence is None else evidence.prior_share,
-            "log_likelihood": model.log_likelihood,
-            "aic": model.aic,
-            "bic": model.bic,
-            "difference": None if difference is None else vars(difference),
-        }
+        difference = self.differences.get(model.name)
+        return model.numbers(self.voting) | {"difference": difference and vars(difference)}
 
     def to_pandas(self) -> Any:
         """Return a pandas.DataFrame with a row for each model, as ``comparison.csv`` has them."""
@@ -154,19 +142,6 @@ class Comparison:
         frame = pd.json_normalize(rows, sep="_").set_index("name")
         # What is nested has columns of its own, but where it is missing.
         return frame.drop(columns=["held_out", "difference"], errors="ignore")
-
-    def save(self, folder: str | Path) -> Path:
-        """Write page, table and numbers to a folder, as ``bwbayes compare`` does; return it.
-
-        Raises
-        ------
-        InputError
-            The folder cannot be written.
-        """
-        from bwbayes.report.saving import save  # noqa: PLC0415  # slow to load
-
-        save(self.report(), Path(folder), "comparison")
-        return Path(folder)
 
     def report(self) -> Report:
         """Return what is recommended, what speaks against it, and the numbers, to be shown."""
@@ -191,11 +166,23 @@ class Comparison:
         )
 
     def _models_table(self) -> Table:
+        rows = []
+        for model in self.candidates:
+            status = "–" if model.standing is None else mark(model.standing.status)
+            if not model.converged:
+                status = "only screened" if model.screened else "not converged"
+            numbers = self._model_numbers(model)
+            if self.voting and model.converged:
+                numbers["log_score"] = model.log_score(self.voting)
+            texts = [_text(text, numbers) for _, text, _ in COLUMNS]
+            if model.screened and model.evidence is not None:
+                texts[6] = f"about {model.evidence.log_evidence:.0f}"
+            rows.append((model.name, status, *texts))
         return Table(
             "models",
             "Models",
-            MODEL_COLUMNS,
-            [(model.name, *_model_texts(model, self.voting)) for model in self.candidates],
+            ("Model", "Validation", *(TableColumn(title, on=on) for title, _, on in COLUMNS)),
+            rows,
             records=self.to_pandas().reset_index().to_dict("records"),
             note="Log score: joint log density of the later readings, each given all before it, "
             "summed over the parts that vote; nats. CRPS, NRMSE, coverage and width on what was "
@@ -213,7 +200,7 @@ class Comparison:
             f"Differences to {self.best}",
             ("Model", self.measure.capitalize(), *parts, "Log evidence"),
             [
-                (name, *self._difference_texts(self[name], parts))
+                (name, *self._difference_texts(self[name], self[str(self.best)], parts))
                 for name in self.differences
                 if name != self.best
             ],
@@ -224,74 +211,21 @@ class Comparison:
             on="both",
         )
 
-    def _difference_texts(self, model: Candidate, parts: tuple[str, ...]) -> tuple[str, ...]:
-        assert self.best is not None
-        best, difference = self[self.best], self.differences[model.name]
-        texts = [f"{difference.value:+.3g} ± {difference.error:.2g}"]
+    def _difference_texts(
+        self, model: Candidate, best: Candidate, parts: tuple[str, ...]
+    ) -> list[str]:
+        texts = ["{value:+.3g} ± {error:.2g}".format_map(vars(self.differences[model.name]))]
         for name in parts:
-            if name not in model.parts:
-                texts.append("–")
-                continue
-            gain = np.sum(model.parts[name].log_scores - best.parts[name].log_scores)
-            texts.append(f"{gain:+.3g}" if name in self.voting else f"({gain:+.3g})")
+            gain = model.log_score([name]) - best.log_score([name]) if name in model.parts else None
+            text = "{gain:+.3g}" if name in self.voting else "({gain:+.3g})"
+            texts.append(_text(text, {"gain": gain}))
         advantage = model.log_evidence - best.log_evidence
-        return (*texts, f"{advantage:+.3g}" if np.isfinite(advantage) else "–")
-
-    def __repr__(self) -> str:
-        return head(str(self))
-
-    def __str__(self) -> str:
-        from bwbayes.report.screen import as_text  # noqa: PLC0415  # slow to load
-
-        return as_text(self.report())
-
-    def _repr_html_(self) -> str:
-        from bwbayes.report.page import fragment  # noqa: PLC0415  # slow to load
-
-        return fragment(self.report())
+        return [*texts, f"{advantage:+.3g}" if np.isfinite(advantage) else "–"]
 
 
-MODEL_COLUMNS = (
-    "Model",
-    "Validation",
-    "Free",
-    "Log score",
-    TableColumn("CRPS", on="page"),
-    "NRMSE",
-    "95% covers",
-    TableColumn("95% width", on="page"),
-    "Log evidence",
-    "Priors' share",
-    TableColumn("AIC", on="page"),
-    TableColumn("BIC", on="page"),
-)
-
-
-def _model_texts(model: Candidate, voting: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a text for each of the columns but the first; a dash where nothing is known."""
-    mean, evidence = model.mean, model.evidence
-    held_out: tuple[str, ...] = ("–",) * 4
-    if mean is not None:
-        held_out = (
-            f"{mean.crps_um:.4f} µm",
-            f"{mean.nrmse:.2%}",
-            f"{mean.coverage:.1%} ± {mean.coverage_error:.1%}",
-            f"{mean.width_um:.3g} µm",
-        )
-    from_evidence: tuple[str, ...] = ("–",) * 4
-    if evidence is not None:
-        value, error = evidence.log_evidence, evidence.error
-        from_evidence = (
-            f"about {value:.0f}" if model.screened else f"{value:.2f} ± {error:.2f}",
-            f"{evidence.prior_share:.1f}",
-            f"{model.aic:.1f}",
-            f"{model.bic:.1f}",
-        )
-    status = "–" if model.standing is None else mark(model.standing.status)
-    return (
-        "only screened" if model.screened else status if model.converged else "not converged",
-        str(model.free),
-        f"{model.log_score(voting):.1f}" if voting and model.converged else "–",
-        *held_out,
-        *from_evidence,
-    )
+def _text(text: str, numbers: Mapping[str, Any]) -> str:
+    """Fill in numbers; a dash where they are not known."""
+    try:
+        return text.format_map(numbers)
+    except (KeyError, TypeError):
+        return "–"

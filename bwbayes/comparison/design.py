@@ -14,7 +14,6 @@ hundred. A fit, which trusts the noise model, may look surer than was promised o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
@@ -75,136 +74,79 @@ def promises(
     K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10
     (1995) 273-304: c-optimality, averaged over the posterior.
     """
-    asker = _Asker.of(posterior, draws, generator)
-    if isinstance(target, str) and target not in asker.names:
-        hint = suggestion(target, asker.names)
+    dataset, prior = posterior.only, posterior.prior
+    declared = [d.name for d in dataset.actuator.declarations if d.scope == "actuator"]
+    names = [name for name in declared if name in prior.free_names]
+    if isinstance(target, str) and target not in names:
+        hint = suggestion(target, names)
         raise InputError(f"design: {target!r} is not a free parameter of the actuator; {hint}")
-    before, gradients = asker.known(target)
-    scores: list[Promise] = []
+    columns = [prior.free_names.index(name) for name in names]
+    coordinates = prior.unconstrain(draws[:: max(len(draws) // 4000, 1)])
+    covariance = np.atleast_2d(np.cov(coordinates[:, columns], rowvar=False))
+    chosen = coordinates[
+        generator.choice(len(coordinates), min(40, len(coordinates)), replace=False)
+    ]
+    noise = dataset.table.noise(prior.theta(prior.constrain(chosen)[0]))
+    steps = 0.01 * np.sqrt(np.diag(covariance))
+
+    def derivatives(position: FloatArray, quantity: str | FloatArray) -> FloatArray:
+        """Return those (coordinates, ...) of a parameter, or of the displacement on a voltage."""
+        moved = np.tile(position, (2 * len(columns), 1))
+        rows = np.arange(len(columns))
+        moved[rows, columns] += steps
+        moved[len(columns) + rows, columns] -= steps
+        theta = prior.theta(prior.constrain(moved)[0])
+        theta = dataset.table.replaced(theta, "initial", np.zeros(len(theta)))
+        if isinstance(quantity, str):
+            values = theta[:, [dataset.table.names.index(quantity)]]
+        else:
+            models = dataset.table.actuator(theta)
+            values = posterior.likelihood.actuator.displacement(models, quantity, from_rest=True)
+        above, below = np.split(values, 2)
+        return np.asarray((above - below) / (2 * steps[:, np.newaxis]))
+
+    gradients = [derivatives(position, target) for position in chosen]
+    before = [_mean_sd(gradient, covariance) for gradient in gradients]
+    offset_sd = next(
+        (
+            float(p.prior.frozen.std())
+            for p in prior.free
+            if p.name == "offset" and p.prior is not None
+        ),
+        0.0,
+    )
+    scores = []
     for name, voltage in candidates.items():
-        why = amplifier.refuses(voltage, posterior.only.actuator.interval)
-        if why:
-            scores.append(Promise(name, np.nan, np.nan, why))
+        refused = amplifier.refuses(voltage, dataset.actuator.interval)
+        if refused:
+            scores.append(Promise(name, np.nan, np.nan, refused))
             continue
-        remaining = np.array(
-            [
-                _spread(gradient, asker.after(information)) / sd
-                for gradient, information, sd in zip(
-                    gradients, asker.information(voltage), before, strict=True
-                )
-            ]
-        )
-        error = (
-            float(np.std(remaining, ddof=1) / np.sqrt(remaining.size))
-            if remaining.size > 1
-            else np.inf
-        )
-        scores.append(Promise(name, float(np.mean(remaining)), error))
+        once, _ = stretches_once(voltage, np.arange(voltage.size))
+        remaining = []
+        for position, sd, gradient in zip(chosen, noise, gradients, strict=True):
+            series = np.concatenate([derivatives(position, voltage), np.ones((1, voltage.size))])
+            (white,), _ = dataset.noise.whiten(sd[np.newaxis], series[np.newaxis])
+            information = (white * once) @ white.T
+            after = _updated(covariance, information, offset_sd)
+            remaining.append(_mean_sd(gradient, after))
+        shares = np.array(remaining) / before
+        error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
+        scores.append(Promise(name, float(np.mean(shares)), error))
     return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
 
 
-def _spread(gradient: FloatArray, covariance: FloatArray) -> float:
+def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:
     """Mean over columns g of √(gᵀ Σ g), for gradients (coordinates, targets)."""
     variances = np.einsum("it,ij,jt->t", gradient, covariance, gradient)
     return float(np.mean(np.sqrt(np.maximum(variances, 0))))
 
 
-@dataclass(frozen=True)
-class _Asker:
-    """A posterior made linear at some draws.
-
-    ``places`` (draws, free) are their coordinates, ``columns`` those of the actuator's parameters
-    among them, ``names`` their names, ``covariance`` what is known of them, ``steps`` those of
-    their derivatives, ``offset_sd`` the prior sd of the new record's offset, um.
-    """
-
-    posterior: Posterior
-    places: FloatArray
-    columns: tuple[int, ...]
-    names: tuple[str, ...]
-    covariance: FloatArray
-    steps: FloatArray
-    offset_sd: float
-
-    @classmethod
-    def of(cls, posterior: Posterior, draws: FloatArray, generator: np.random.Generator) -> _Asker:
-        """Choose the draws, and see what is known."""
-        dataset, prior = posterior.only, posterior.prior
-        names = [
-            d.name
-            for d in dataset.actuator.declarations
-            if d.scope == "actuator" and d.name in prior.free_names
-        ]
-        columns = tuple(prior.free_names.index(name) for name in names)
-        coordinates = prior.unconstrain(draws[:: max(len(draws) // 4000, 1)])
-        covariance = np.atleast_2d(np.cov(coordinates[:, columns], rowvar=False))
-        chosen = generator.choice(len(coordinates), min(40, len(coordinates)), replace=False)
-        offset_sd = 0.0
-        for parameter in prior.free:
-            if parameter.name == "offset" and parameter.prior is not None:
-                offset_sd = float(parameter.prior.frozen.std())
-        steps = 0.01 * np.sqrt(np.diag(covariance))
-        return cls(
-            posterior, coordinates[chosen], columns, tuple(names), covariance, steps, offset_sd
-        )
-
-    def _theta(self, position: FloatArray) -> FloatArray:
-        """Return θ (2 coordinates, parameters), steps to either side of a place (free,)."""
-        count = len(self.columns)
-        moved = np.repeat(position[np.newaxis], 2 * count, axis=0)
-        rows = np.arange(count)
-        moved[rows, self.columns] += self.steps
-        moved[count + rows, self.columns] -= self.steps
-        prior, table = self.posterior.prior, self.posterior.only.table
-        theta = prior.theta(prior.constrain(moved)[0])
-        return table.replaced(theta, "initial", np.zeros(len(theta)))
-
-    def _slopes(self, values: FloatArray) -> FloatArray:
-        """Return derivatives (coordinates, ...) from values (2 coordinates, ...) at either side."""
-        plus, minus = np.split(values, 2)
-        slopes: FloatArray = ((plus - minus).T / (2 * self.steps)).T
-        return slopes
-
-    def _displacement(self, position: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return derivatives (coordinates, samples) of the displacement along a voltage."""
-        dataset = self.posterior.only
-        model = dataset.table.actuator(self._theta(position))
-        actuator = self.posterior.likelihood.actuator
-        return self._slopes(actuator.displacement(model, voltage, from_rest=True))
-
-    def known(self, target: str | FloatArray) -> tuple[list[float], list[FloatArray]]:
-        """Return the spread before, and the target's gradients, at each draw."""
-        if isinstance(target, str):
-            column = self.posterior.only.table.names.index(target)
-            gradients = [
-                self._slopes(self._theta(position)[:, [column]]) for position in self.places
-            ]
-        else:
-            gradients = [self._displacement(position, target) for position in self.places]
-        return [_spread(gradient, self.covariance) for gradient in gradients], gradients
-
-    def information(self, voltage: FloatArray) -> list[FloatArray]:
-        """Return the Fisher information (coordinates, coordinates) of a candidate, at each draw."""
-        dataset, prior = self.posterior.only, self.posterior.prior
-        noise = dataset.table.noise(prior.theta(prior.constrain(self.places)[0]))
-        once, _ = stretches_once(voltage, np.arange(voltage.size))
-        matrices = []
-        for position, sd in zip(self.places, noise, strict=True):
-            slopes = self._displacement(position, voltage)
-            series = np.concatenate([slopes, np.ones((1, voltage.size))])
-            (white,), _ = dataset.noise.whiten(sd[np.newaxis], series[np.newaxis])
-            products = (white * once) @ white.T
-            if self.offset_sd:
-                offset_row, level = products[:-1, -1], products[-1, -1] + self.offset_sd**-2
-                matrices.append(products[:-1, :-1] - np.outer(offset_row, offset_row) / level)
-            else:
-                matrices.append(products[:-1, :-1])
-        return matrices
-
-    def after(self, information: FloatArray) -> FloatArray:
-        """Return the covariance that would be left."""
-        # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
-        factor = np.linalg.cholesky(self.covariance)
-        inner = np.eye(len(factor)) + factor.T @ information @ factor
-        covariance: FloatArray = factor @ linalg.solve(inner, factor.T, assume_a="pos")
-        return covariance
+def _updated(covariance: FloatArray, information: FloatArray, offset_sd: float) -> FloatArray:
+    """Return the covariance that would be left; the last row of the information is the offset's."""
+    products, offset = information[:-1, :-1], information[:-1, -1]
+    if offset_sd:
+        products = products - np.outer(offset, offset) / (information[-1, -1] + offset_sd**-2)
+    # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
+    factor = np.linalg.cholesky(covariance)
+    inner = np.eye(len(factor)) + factor.T @ products @ factor
+    return np.asarray(factor @ linalg.solve(inner, factor.T, assume_a="pos"))

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import overload
+from typing import ClassVar, overload
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.inverse.limits import Limits
+from bwbayes.record.record import Record
+from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -58,7 +60,7 @@ class Promise:
 
 
 @dataclass(frozen=True)
-class Design(Sequence[Promise]):
+class Design(Product, Sequence[Promise]):
     """What to measure next, from a run: a sequence of its promises.
 
     Attributes
@@ -79,6 +81,7 @@ class Design(Sequence[Promise]):
         What each candidate promises, the best first; the first is not refused.
     """
 
+    NAME: ClassVar[str] = "design"
     __repr__ = brief
 
     run: str
@@ -122,6 +125,11 @@ class Design(Sequence[Promise]):
             if promise.left - best.left < 2 * float(np.hypot(promise.error, best.error))
         ]
 
+    def records(self) -> dict[str, Record]:
+        """Return the best signal as a record that a signal generator can play."""
+        best = self.signals[self.best.name]
+        return {"best": Record(best, None, self.interval, voltage_is="command")}
+
     def numbers(self) -> dict[str, object]:
         """Return what ``design.json`` holds."""
         return {
@@ -138,25 +146,29 @@ class Design(Sequence[Promise]):
 
         best, amplifier = self.best, self.amplifier
         feasible = [promise for promise in self.promises if not promise.refused]
-        remaining, error = (
-            np.array([getattr(promise, key) for promise in feasible]) for key in ("left", "error")
-        )
         names = [promise.name for promise in feasible]
-        refused = [
-            f"{promise.name} {promise.refused}" for promise in self.promises if promise.refused
-        ]
+        remaining, error = np.array([(p.left, p.error) for p in feasible]).T
         lines = [f"{self.left} after one more record of it: {best.left:.1%} ± {best.error:.1%}"]
         if self.alike:
             lines.append(f"not to be told apart from it: {', '.join(self.alike)}")
-        limits = f"{amplifier.low:.4g} to {amplifier.high:.4g} V"
-        if np.isfinite(amplifier.rate):
-            limits += f", at most {amplifier.rate:.4g} V/s"
+        limits = amplifier.low, amplifier.high
+        rate = f", at most {amplifier.rate:.4g} V/s" if np.isfinite(amplifier.rate) else ""
+        facts = [
+            ("Run", self.run),
+            ("To be known better", self.left.replace(" left", "")),
+            ("Amplifier", "{:.4g} to {:.4g} V".format(*limits) + rate),
+            ("Sampling interval", f"{self.interval:g} s"),
+        ]
+        signal = self.signals[best.name]
         return Report(
             title="What to measure next",
             banners=[
                 *standing_banner(self.standing),
                 Banner(kind_of(self.standing), f"Best: {best.name}", lines),
-                *remarks_banner(refused, "What the amplifier cannot make"),
+                *remarks_banner(
+                    [f"{p.name} {p.refused}" for p in self.promises if p.refused],
+                    "What the amplifier cannot make",
+                ),
             ],
             blocks=[
                 self._table(),
@@ -172,28 +184,9 @@ class Design(Sequence[Promise]):
                     "The best signal",
                     "Its voltage, as best.csv has it for the signal generator; dotted, the "
                     "amplifier's limits.",
-                    partial(
-                        draw_signal,
-                        best.name,
-                        self.signals[best.name],
-                        self.interval,
-                        (amplifier.low, amplifier.high),
-                    ),
+                    partial(draw_signal, best.name, signal, self.interval, limits),
                 ),
-                Section(
-                    "Request",
-                    [
-                        Facts(
-                            [
-                                ("Run", self.run),
-                                ("To be known better", self.left.replace(" left", "")),
-                                ("Amplifier", limits),
-                                ("Sampling interval", f"{self.interval:g} s"),
-                            ]
-                        )
-                    ],
-                    folded=False,
-                ),
+                Section("Request", [Facts(facts)], folded=False),
             ],
             numbers=self.numbers(),
         )
@@ -203,11 +196,11 @@ class Design(Sequence[Promise]):
         for promise in self.promises:
             voltage = self.signals[promise.name]
             fastest = float(np.max(np.abs(np.diff(voltage)))) / self.interval
+            numbers = (promise.left, promise.error)
             rows.append(
                 (
                     promise.name,
-                    "–" if promise.refused else f"{promise.left:.1%}",
-                    "–" if promise.refused else f"{promise.error:.1%}",
+                    *("–" if promise.refused else f"{number:.1%}" for number in numbers),
                     f"{voltage.min():.4g} V",
                     f"{voltage.max():.4g} V",
                     f"{fastest:,.0f} V/s",

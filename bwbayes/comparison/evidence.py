@@ -9,6 +9,7 @@ known: what both cover bridges the unknown integral to the known one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -26,12 +27,12 @@ __all__ = ["Bridge", "Evidence", "bridge", "evidence", "log_prior_mass", "screen
 MAX_DRAWS = 20_000
 
 
-@dataclass(frozen=True)
-class Bridge:
-    """The log of an unknown integral, nats, and its standard error."""
+class Bridge(NamedTuple):
+    """The log of an unknown integral, nats, its standard error, and effective draws behind it."""
 
     log_integral: float
     error: float
+    effective: float
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def evidence(
     random = np.random.RandomState(generator.integers(2**32))
     places = proposal.draw(random, 10_000)
     at_places = posterior.log_density(places) - proposal.log_density(places)
-    bridged, effective = bridge(at_draws, at_places)
+    bridged = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)
     log_evidence = bridged.log_integral + constant - mass
@@ -118,7 +119,7 @@ def evidence(
         log_evidence,
         float(np.hypot(bridged.error, mass_error)),
         mass,
-        effective,
+        bridged.effective,
         float(np.mean(log_likelihood)) - log_evidence,
         float(np.max(log_likelihood)),
     )
@@ -140,7 +141,7 @@ def screening_evidence(
     return Evidence(log_evidence, np.inf, mass, 0.0, share, float(log_likelihood))
 
 
-def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
+def bridge(at_draws: FloatArray, at_places: FloatArray) -> Bridge:
     """Bridge from a known integral to an unknown one: the ratio r = ∫p / ∫q.
 
     With weights w = p/q at draws of p and at places from q, the optimal bridge solves
@@ -157,11 +158,6 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
     at_places
         (N,) log p − log q at independent draws of q; −∞ where p is zero.
 
-    Returns
-    -------
-    tuple[Bridge, float]
-        log r with its error, and the effective draws behind the numerator's mean.
-
     Notes
     -----
     X.-L. Meng and W. H. Wong, Statistica Sinica 6 (1996) 831-860; S. Frühwirth-Schnatter,
@@ -176,15 +172,10 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> tuple[Bridge, float]:
         share = effective / (effective + places.size)
         log_r, ends = _fixed_point(draws, places, share, log_r)
         effective = _effective(np.exp(ends[0] - np.max(ends[0])))
-    variance = sum(
-        np.var(end) / np.mean(end) ** 2 / count
-        for end, count in (
-            (np.exp(ends[0] - np.max(ends[0])), effective),
-            (np.exp(ends[1] - np.max(ends[1])), places.size),
-        )
-    )
-    error = float(np.sqrt(variance))
-    return Bridge(log_r + shift, error if np.isfinite(error) else np.inf), effective
+    scaled = [np.exp(end - np.max(end)) for end in ends]
+    variances = [np.var(end) / np.mean(end) ** 2 for end in scaled]
+    error = float(np.sqrt(variances[0] / effective + variances[1] / places.size))
+    return Bridge(log_r + shift, error if np.isfinite(error) else np.inf, effective)
 
 
 def _fixed_point(

@@ -35,9 +35,8 @@ FUTURE = "later training"
 # Blocks of a part.
 BLOCKS = 10
 
-# Draws of a posterior that enter the ratios. Where what is left of them at the far end is worth
-# fewer than the second number, that end is sampled as well.
-DRAWS, MIN_EFFECTIVE = 500, 100.0
+# Draws of a posterior that enter the ratios.
+DRAWS = 500
 
 
 @dataclass(frozen=True)
@@ -102,47 +101,53 @@ def leave_future_out(
         earlier one has not converged, and without a part that has no readings.
     """
     parts: dict[str, Part] = {}
-    training = {dataset.name: dataset.training for dataset in posterior.datasets}
+    datasets = {dataset.name: dataset for dataset in posterior.datasets}
+    training = {name: dataset.training for name, dataset in datasets.items()}
     if future:
-        later = {
-            dataset.name: dataset.readings.rows[dataset.readings.rows.size // 2 :]
-            for dataset in posterior.datasets
-        }
-        edges = {name: _edges(rows) for name, rows in later.items()}
-        path = [
-            posterior.trained({name: cut(training[name], edges[name][k]) for name in edges})
-            for k in range(BLOCKS)
-        ]
-        path.append(posterior)
+        rows = {name: dataset.readings.rows for name, dataset in datasets.items()}
+        later = {name: readings[readings.size // 2 :] for name, readings in rows.items()}
+        path = _path(posterior, dict.fromkeys(training, ()), training, later)
         earlier = _fitted(path[0], plan, flat, rng, executor)
         if earlier is not None:
             parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng)
-    later_windows = [
-        (record, name, windows)
-        for record, named in held_out.items()
-        for name, windows in named.items()
-    ]
-    for record, name, windows in later_windows:
-        displacement = next(d.displacement for d in posterior.datasets if d.name == record)
-        rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
-        rows = rows[np.isfinite(displacement[rows])]
-        if not rows.size:
-            continue
-        before = training
-        training = training | {record: _merged(training[record], windows)}
-        path = [
-            posterior.trained(before | {record: _merged(before[record], cut(windows, edge))})
-            for edge in _edges(rows)
-        ]
-        path.append(posterior.trained(training))
-        part = _scored(path, {0: flat}, {record: rows}, rng)
-        if part.effective < MIN_EFFECTIVE:
-            longer = _fitted(path[-1], plan, flat, rng, executor)
-            if longer is not None:
-                part = _scored(path, {0: flat, BLOCKS: longer}, {record: rows}, rng)
-                flat = longer
-        parts[name] = part
+    for record, named in held_out.items():
+        for name, windows in named.items():
+            window_rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
+            later = {record: window_rows[np.isfinite(datasets[record].displacement[window_rows])]}
+            if not later[record].size:
+                continue
+            path = _path(posterior, training, {record: windows}, later)
+            training = {dataset.name: dataset.training for dataset in path[-1].datasets}
+            part = _scored(path, {0: flat}, later, rng)
+            # What is left of the draws at the far end is worth too few: that end is sampled too.
+            if part.effective < 100:
+                longer = _fitted(path[-1], plan, flat, rng, executor)
+                if longer is not None:
+                    part = _scored(path, {0: flat, BLOCKS: longer}, later, rng)
+                    flat = longer
+            parts[name] = part
     return parts
+
+
+def _path(
+    posterior: Posterior,
+    training: Mapping[str, tuple[slice, ...]],
+    added: Mapping[str, tuple[slice, ...]],
+    rows: Mapping[str, IntArray],
+) -> list[Posterior]:
+    """Return the posteriors on the way from training windows to those and added ones.
+
+    ``rows`` are the later readings in the added windows; each step adds a block of them.
+    """
+    path = []
+    for k in range(BLOCKS + 1):
+        windows = dict(training)
+        for name, later in rows.items():
+            end = int(later[k * later.size // BLOCKS]) if k < BLOCKS else added[name][-1].stop
+            known = training[name] + cut(added[name], end)
+            windows[name] = tuple(sorted(known, key=lambda window: window.start))
+        path.append(posterior.trained(windows))
+    return path
 
 
 def bands_part(bands: Bands, judged: BoolArray) -> Part | None:
@@ -223,17 +228,13 @@ def _scored(
     counts = {number: len(flat) for number, flat in chosen.items()}
     log_z, effective = log_ratios(log_likelihood, counts)
     likeliest = theta[np.argmax(log_likelihood[-1]), np.newaxis]
-    several = len(path[-1].datasets) > 1
     worth = 0.0
     for dataset in path[-1].datasets:
         if dataset.name in rows:
-            record_rows = rows[dataset.name]
-            simulated = path[-1].simulate(
-                likeliest, record_rows, dataset.name if several else None
-            )[0]
-            worth += record_rows.size / _correlation_time(
-                dataset.displacement[record_rows] - simulated
-            )
+            name = dataset.name if len(path[-1].datasets) > 1 else None
+            simulated = path[-1].simulate(likeliest, rows[dataset.name], name)[0]
+            residual = dataset.displacement[rows[dataset.name]] - simulated
+            worth += residual.size / _correlation_time(residual)
     readings = sum(record_rows.size for record_rows in rows.values())
     return Part(np.diff(log_z), readings, worth, effective=float(np.min(effective)))
 
@@ -259,15 +260,6 @@ def _fitted(
     if not sample(posterior, short, chain, executor).converged:
         return None
     return draws(posterior, chain).reshape(-1, len(posterior.names))
-
-
-def _edges(rows: IntArray) -> list[int]:
-    """Return the rows where blocks begin."""
-    return [int(rows[k * rows.size // BLOCKS]) for k in range(BLOCKS)]
-
-
-def _merged(windows: tuple[slice, ...], others: tuple[slice, ...]) -> tuple[slice, ...]:
-    return tuple(sorted((*windows, *others), key=lambda window: window.start))
 
 
 def _correlation_time(residual: FloatArray) -> float:

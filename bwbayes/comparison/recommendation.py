@@ -26,18 +26,24 @@ __all__ = ["difference", "recommend"]
 MIN_WORTH = 5
 
 
-def recommend(candidates: Sequence[Candidate]) -> Comparison:
-    """Compare models that were fitted to the same readings; their names differ."""
+def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] = ()) -> Comparison:
+    """Compare models that were fitted to the same readings; their names differ.
+
+    ``facts`` are subjects of the comparison, and what is said of each.
+    """
     usable = [candidate for candidate in candidates if candidate.converged]
-    unusable = tuple(candidate for candidate in candidates if not candidate.converged)
-    unconverged = tuple(
+    unusable = sorted(
+        (candidate for candidate in candidates if not candidate.converged),
+        key=lambda candidate: -candidate.log_evidence,
+    )
+    unconverged = [
         f"{candidate.name} has not converged ({candidate.stop_reason}) and is not judged"
         for candidate in unusable
         if not candidate.screened
-    )
+    ]
     if not usable:
         none = ("no model has converged, so none is recommended",)
-        return Comparison(tuple(candidates), (), None, {}, None, (), none, unconverged)
+        return Comparison(tuple(unusable), lines=none, caveats=tuple(unconverged), facts=facts)
     worth = {
         name: max(candidate.parts[name].worth for candidate in usable)
         for name in usable[0].parts
@@ -48,40 +54,36 @@ def recommend(candidates: Sequence[Candidate]) -> Comparison:
     def value(candidate: Candidate) -> float:
         return candidate.log_score(voting) if voting else candidate.log_evidence
 
+    def below(candidate: Candidate, best: Candidate) -> Difference:
+        return difference(candidate, best, voting) if voting else _less_probable(candidate, best)
+
     counted = [_count_independent(candidate, worth) for candidate in usable]
     ordered = sorted(counted, key=lambda candidate: -value(candidate))
-    best = ordered[0]
-    differences = {
-        candidate.name: difference(candidate, best, voting)
-        if voting
-        else _evidence_difference(candidate, best)
-        for candidate in ordered
-    }
+    differences = {candidate.name: below(candidate, ordered[0]) for candidate in ordered}
     near = [candidate for candidate in ordered if not differences[candidate.name].worse]
     tied = near
     if voting and all(_is_known(candidate) for candidate in near):
         top = max(near, key=lambda candidate: candidate.log_evidence)
-        tied = [candidate for candidate in near if not _evidence_difference(candidate, top).worse]
+        tied = [candidate for candidate in near if not _less_probable(candidate, top).worse]
     recommended = min(tied, key=lambda candidate: (candidate.free, -value(candidate)))
-    others = tuple(candidate.name for candidate in tied if candidate is not recommended)
     comparison = Comparison(
-        (*ordered, *sorted(unusable, key=lambda candidate: -candidate.log_evidence)),
+        (*ordered, *unusable),
         voting,
-        best.name,
         differences,
         recommended.name,
-        others,
-        (),
-        (),
+        tuple(candidate.name for candidate in tied if candidate is not recommended),
+        facts=facts,
     )
-    lines = tuple(_summarize(comparison, recommended, ordered, near))
-    without_vote = (
+    without_vote = [
         f"{name} is worth {independent:.1f} independent readings only and has no vote"
         for name, independent in worth.items()
         if name not in voting
+    ]
+    return replace(
+        comparison,
+        lines=tuple(_summarize(comparison)),
+        caveats=(*_list_caveats(comparison), *without_vote, *unconverged),
     )
-    caveats = (*_list_caveats(comparison, recommended, ordered), *without_vote, *unconverged)
-    return replace(comparison, lines=lines, caveats=caveats)
 
 
 def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> Difference:
@@ -119,7 +121,7 @@ def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Cand
     return replace(candidate, parts=parts)
 
 
-def _evidence_difference(candidate: Candidate, best: Candidate) -> Difference:
+def _less_probable(candidate: Candidate, best: Candidate) -> Difference:
     """Return the log evidence of a model less that of the best; odds of 20 to 1 count."""
     if candidate is best:
         return Difference(0.0, 0.0, 0.0)
@@ -136,70 +138,63 @@ def _is_known(candidate: Candidate) -> bool:
 
 
 def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def _summarize(
-    comparison: Comparison,
-    recommended: Candidate,
-    ordered: Sequence[Candidate],
-    near: Sequence[Candidate],
-) -> Iterator[str]:
+def _summarize(comparison: Comparison) -> Iterator[str]:
     """Say what is recommended, and why."""
+    recommended, tied = comparison[str(comparison.recommended)], comparison.tied
     screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
-    if comparison.tied:
-        names = _listed([recommended.name, *comparison.tied])
+    if tied:
+        names = _listed([recommended.name, *tied])
         yield f"{names} cannot be told apart; the plainest of them is {recommended.name}"
-    elif len(ordered) > 1 or screened:
+    elif len(comparison.differences) > 1 or screened:
         yield f"{recommended.name} is recommended"
     else:
         yield f"{recommended.name} is the only model that has converged"
     if not recommended.hysteresis:
         yield "the record shows no hysteresis: a model without any does as well"
-    elif any(not comparison[name].hysteresis for name in comparison.tied):
+    elif any(not comparison[name].hysteresis for name in tied):
         yield "whether there is any hysteresis cannot be told"
-    worse = [candidate for candidate in ordered if candidate not in near]
+    worse = [name for name, value in comparison.differences.items() if value.worse]
     if worse:
-        nearest = comparison.differences[worse[0].name]
-        which = f"{worse[0].name} " if len(worse) > 1 else ""
+        nearest = comparison.differences[worse[0]]
+        which = f"{worse[0]} " if len(worse) > 1 else ""
         yield (
-            f"by the {comparison.measure} {_listed([candidate.name for candidate in worse])} "
-            f"{'is' if len(worse) == 1 else 'are'} worse, "
-            f"{which}by {-nearest.value:.3g} ± {nearest.error:.2g} nats"
+            f"by the {comparison.measure} {_listed(worse)} {'is' if len(worse) == 1 else 'are'} "
+            f"worse, {which}by {-nearest.value:.3g} ± {nearest.error:.2g} nats"
         )
-    tied = (recommended.name, *comparison.tied)
-    less_probable = [candidate for candidate in near if candidate.name not in tied]
-    if less_probable:
-        top = max(comparison[name].log_evidence for name in tied)
-        margin = top - max(candidate.log_evidence for candidate in less_probable)
+    others = [n for n in comparison.differences if n not in (*worse, recommended.name, *tied)]
+    if others:
+        evidence = {name: comparison[name].log_evidence for name in comparison.differences}
+        margin = max(evidence[name] for name in (recommended.name, *tied)) - max(
+            evidence[name] for name in others
+        )
         yield (
-            f"the {comparison.measure} does not tell "
-            f"{_listed([candidate.name for candidate in less_probable])} apart, "
+            f"the {comparison.measure} does not tell {_listed(others)} apart, "
             f"but the log evidence is lower by {margin:.1f} nats or more"
         )
     if screened:
         yield f"only screened, as too far behind at the MAP estimate: {_listed(screened)}"
 
 
-def _list_caveats(
-    comparison: Comparison, recommended: Candidate, ordered: Sequence[Candidate]
-) -> Iterator[str]:
+def _list_caveats(comparison: Comparison) -> Iterator[str]:
     """Say what speaks against the recommendation."""
-    best = ordered[0]
-    if recommended is not best:
-        lost = comparison.differences[recommended.name]
+    recommended = comparison[str(comparison.recommended)]
+    if recommended.name != comparison.best:
+        behind = comparison.differences[recommended.name]
         yield (
-            f"{best.name} has the best {comparison.measure}, "
-            f"by {-lost.value:.2g} ± {lost.error:.2g} nats"
+            f"{comparison.best} has the best {comparison.measure}, "
+            f"by {-behind.value:.2g} ± {behind.error:.2g} nats"
         )
     yield from comparison.standing.said
     if not comparison.voting:
         yield "the evidence decides alone, which takes priors and noise at their word"
-    top = max(ordered, key=lambda candidate: candidate.log_evidence)
-    against = _evidence_difference(recommended, top)
-    if comparison.voting and _is_known(top) and against.worse:
-        assert top.evidence is not None
-        assert recommended.evidence is not None
+        return
+    converged = [comparison[name] for name in comparison.differences]
+    top = max(converged, key=lambda candidate: candidate.log_evidence)
+    against = _less_probable(recommended, top)
+    if top.evidence and recommended.evidence and _is_known(top) and against.worse:
         share = recommended.evidence.prior_share - top.evidence.prior_share
         yield (
             f"the log evidence is for {top.name}, by {-against.value:.1f} nats, "

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -19,8 +18,8 @@ from bwbayes.control.references import Reference
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.record.io.formats import write_record
 from bwbayes.record.record import Record
+from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -38,8 +37,6 @@ from bwbayes.shown import brief
 __all__ = ["Choice", "Compensation", "Errors", "Played", "planned"]
 
 Choice = Literal["mean", "expected"]
-
-FILES = ("command.csv", "compensation.json", "compensation.csv", "compensation.html")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +90,7 @@ class Played(Errors):
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation:
+class Compensation(Product):
     """A command that makes a displacement, and its predicted errors.
 
     ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
@@ -103,6 +100,8 @@ class Compensation:
     ``between`` how far the displacement leaves straight lines there, um. ``standing`` is how the
     validation of the run came out that all of this builds on.
     """
+
+    NAME: ClassVar[str] = "compensation"
 
     reference: Reference
     command: Choice
@@ -136,6 +135,10 @@ class Compensation:
         return planned(
             self.voltage, self.reference, self.hold, f"command for {self.reference.name}"
         )
+
+    def records(self) -> dict[str, Record]:
+        """Return the command by the name of its file."""
+        return {"command": self.record}
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -193,22 +196,6 @@ class Compensation:
         return drawn(
             control.draw_command, self.reference.name, self.asked, self._commands, self.limit
         )
-
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write all files to a folder, and return them.
-
-        Raises
-        ------
-        InputError
-            A file that exists, unless it may be replaced, or that cannot be written.
-        """
-        from bwbayes.report.saving import refuse_existing, save  # noqa: PLC0415  # slow to load
-
-        folder = Path(folder)
-        refuse_existing([folder / name for name in FILES], overwrite=overwrite)
-        files = save(self.report(), folder, "compensation")
-        write_record(self.record, folder / "command.csv")
-        return [folder / "command.csv", *files]
 
     def report(self) -> Report:
         """Return the predicted error beside that of a linear command, with pictures."""

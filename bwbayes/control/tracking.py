@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
+from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -45,7 +46,7 @@ LEFT = math.sqrt(0.5)
 
 
 @dataclass(frozen=True)
-class Tracking:
+class Tracking(Product):
     """How well four controllers follow, for every draw.
 
     ``rms`` and ``largest`` error, um, and the share of samples ``limited`` by the amplifier are
@@ -55,6 +56,7 @@ class Tracking:
     draws, and ``name`` what it is called.
     """
 
+    NAME: ClassVar[str] = "track"
     __repr__ = brief
 
     gains: Gains

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 import bwbayes as bw
+from bwbayes.app.commands import cli
 from bwbayes.app.running.folder import RunFolder
 from tests.app import small
 
@@ -35,3 +39,43 @@ def copy(run: Path, tmp_path: Path) -> RunFolder:
 def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare the time that pictures take, where they are not what is tested."""
     monkeypatch.setattr("bwbayes.app.running.figure_worker.drawings", lambda _: {})
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command said, and its exit status."""
+
+    status: int
+    out: str
+    err: str
+
+    def assert_refused(self, *texts: str) -> None:
+        """Require status 2 and one line that has these texts."""
+        assert (2, "") == (self.status, self.out)
+        assert re.fullmatch(r"bwbayes: [^\n]+\n", self.err), self.err
+        for text in texts:
+            assert text in self.err
+
+
+Type = Callable[..., Said]
+
+
+@pytest.fixture
+def bwbayes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Type:
+    """Return a function that runs a command line in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def typed(*arguments: object) -> Said:
+        monkeypatch.setattr("sys.argv", ["bwbayes", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        printed = capsys.readouterr()
+        assert isinstance(end.value.code, int)
+        return Said(end.value.code, printed.out, printed.err)
+
+    return typed

@@ -28,6 +28,7 @@ from bwbayes.report.outputs import write_summary
 from bwbayes.report.page import render
 from bwbayes.report.result import summary
 from tests.app import small
+from tests.app.conftest import Type
 from tests.app.specimens import CONFIG, POPULATION, record, specimens
 
 COUNT = 3
@@ -112,21 +113,15 @@ def test_a_records_run_is_what_the_run_command_makes(
 
 
 def test_the_command_says_which_records_were_refused_and_ends_with_2(
-    given: Path, whole: Path, tmp_path: Path
+    bwbayes: Type, given: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    arguments = ["records", "--config", "small.toml", "--no-pictures", "--workers", "1"]
-    out = tmp_path / "batch"
-    done = subprocess.run(
-        small.command("campaign", *arguments, "--out", out),
-        cwd=given,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert 2 == done.returncode, done.stderr
-    assert "REFUSED: broken: broken.csv:2:" in done.stderr
-    assert "4 records: 1 refused, 3 passed" in done.stdout
-    assert_same_end(whole, out)
+    monkeypatch.chdir(given)
+    options = "--config", "small.toml", "--no-pictures", "--workers", "1"
+    said = bwbayes("campaign", "records", *options, "--out", tmp_path / "batch")
+    assert 2 == said.status, said.err
+    assert "REFUSED: broken: broken.csv:2:" in said.err
+    assert "4 records: 1 refused, 3 passed" in said.out
+    assert_same_end(whole, tmp_path / "batch")
 
 
 def test_a_finished_campaign_fits_nothing_again(
@@ -134,13 +129,13 @@ def test_a_finished_campaign_fits_nothing_again(
 ) -> None:
     shutil.copytree(whole, tmp_path / "batch")
     asked: list[list[str]] = []
-    fit = module._fit
+    batch = module.batch
 
-    def noted(folder: CampaignFolder, origin: Any, missing: list[Path], *rest: Any) -> Any:
-        asked.append([path.stem for path in missing])
-        return fit(folder, origin, missing, *rest)
+    def noted(call: Any, tasks: list[tuple[Path, Any]], *rest: Any, **options: Any) -> Any:
+        asked.append([file.stem for file, *_ in tasks])
+        return batch(call, tasks, *rest, **options)
 
-    monkeypatch.setattr(module, "_fit", noted)
+    monkeypatch.setattr(module, "batch", noted)
     ended(begun(given, tmp_path / "batch"))
     assert [["broken"]] == asked
     assert_same_end(whole, tmp_path / "batch")
@@ -275,30 +270,30 @@ def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> No
         "walkers": 12,
     }
     keys |= {"block": 20, "pilot_steps": 60, "parameters": tomllib.loads(CONFIG)["parameters"]}
-    made = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
-    assert ["r0", "r1", "r2"] == list(made.table.index)
-    assert {"d", "alpha"} == set(made.population.parameters)
-    assert {"d", "alpha"} == set(made.population.to_pandas().index)  # type: ignore[attr-defined]
-    assert ({}, {}) == (made.short, made.outliers)
-    assert made.fit("r1").converged
+    batch = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
+    assert ["r0", "r1", "r2"] == list(batch.table.index)
+    assert {"d", "alpha"} == set(batch.population.parameters)
+    assert {"d", "alpha"} == set(batch.population.to_pandas().index)  # type: ignore[attr-defined]
+    assert ({}, {}) == (batch.short, batch.outliers)
+    assert batch.fit("r1").converged
     # A specimen that was not measured is less sure than one that was.
     planned = replace(record(9), displacement=None)
-    bands = made.predict(planned, from_rest=True)
-    own = made.fit("r1").predict(planned, from_rest=True)
+    bands = batch.predict(planned, from_rest=True)
+    own = batch.fit("r1").predict(planned, from_rest=True)
     wide, narrow = (
         np.mean(b.upper["parameter", 95] - b.lower["parameter", 95]) for b in (bands, own)
     )
     assert wide > 5 * narrow
-    assert "3 records: 3 passed" == repr(made)
-    assert made.plot().axes
+    assert "3 records: 3 passed" == repr(batch)
+    assert batch.plot().axes
 
 
 def test_python_warns_of_what_is_short(tmp_path: Path) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records/broken.csv").write_text(BROKEN)
     with pytest.warns(InputWarning, match="broken: refused: broken.csv:2"):
-        made = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
+        batch = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
     with pytest.raises(InputError, match="no population: a population needs 3 records or more"):
-        _ = made.population
+        _ = batch.population
     with pytest.raises(InputError, match="either config or keys"):
         bw.campaign(tmp_path / "records", config="x.toml", dynamics="none")

@@ -6,7 +6,7 @@ import csv
 import json
 import re
 import warnings
-from collections.abc import Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,17 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands import cli
 from bwbayes.app.commands.studies import compare as compare_command
+from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.limits import USUAL_MODELS
+from bwbayes.app.config.models import models_of
 from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.problem.problem import resolve
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record
 from bwbayes.sampling.storage import ChainFile
+from tests.app.conftest import Type
 
 CONFIG = """\
 seed = 3
@@ -40,6 +44,15 @@ ess = 200
 window = [4.0, 6.0]
 """
 
+KEYS: dict[str, Any] = {
+    "dynamics": "none",
+    "noise": "white",
+    "from_rest": True,
+    "ess": 200,
+    "train": (0, 4),
+    "validation": {"later": (4, 6)},
+}
+
 
 def measured(alpha: float = 0.36) -> Record:
     """Return a record of 300 readings of a Bouc-Wen actuator, from rest."""
@@ -50,115 +63,73 @@ def measured(alpha: float = 0.36) -> Record:
     return Record.from_arrays(voltage, displacement, interval=0.02)
 
 
-def fitted(record: Record, hysteresis: str, **keys: Any) -> Fit:
-    keys = {"train": (0, 4), "validation": {"later": (4, 6)}} | keys
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # bands of a wrong model do not hold
-        return bw.fit(
-            record,
-            hysteresis=hysteresis,
-            name=hysteresis,
-            dynamics="none",
-            noise="white",
-            from_rest=True,
-            ess=200,
-            progress=False,
-            workers=1,
-            **keys,
-        )
-
-
 @pytest.fixture(scope="module")
 def fits() -> tuple[Fit, Fit]:
-    record = measured()
-    return fitted(record, "bouc-wen"), fitted(record, "linear")
-
-
-def run(arguments: Sequence[str], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr("sys.argv", ["bwbayes", "compare", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
+    """Return fits of Bouc-Wen and of a straight line, whose bands do not hold."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        bouc_wen, linear = (
+            bw.fit(measured(), hysteresis=name, name=name, progress=False, workers=1, **KEYS)
+            for name in ("bouc-wen", "linear")
+        )
+    return bouc_wen, linear
 
 
 def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> None:
-    one, other = fits
-    made = other.compare(one, future=False, workers=1)
-    assert made.recommended == "bouc-wen"
-    assert made.tied == ()
-    assert "bouc-wen is recommended" in repr(made)
-    frame = made.to_pandas()
+    """By a method, and at the top; fits of one name by number."""
+    bouc_wen, linear = fits
+    comparison = linear.compare(bouc_wen, future=False, workers=1)
+    assert comparison.recommended == "bouc-wen"
+    assert comparison.tied == ()
+    assert "bouc-wen is recommended" in repr(comparison)
+    frame = comparison.to_pandas()
     assert list(frame.index) == ["bouc-wen", "linear"]
     assert frame.loc["bouc-wen", "held_out_nrmse"] == pytest.approx(
-        one.bands["later"].scores.nrmse  # type: ignore[union-attr]
+        bouc_wen.bands["later"].scores.nrmse  # type: ignore[union-attr]
     )
-    folder = made.save(tmp_path / "out")
-    said = json.loads((folder / "comparison.json").read_text())
-    assert said["recommended"] == "bouc-wen"
-    assert said["models"]["linear"]["difference"]["value"] < 0
+    folder = tmp_path / "out"
+    again = bw.compare(*fits, future=False, workers=1, folder=folder)
+    assert again.to_pandas().equals(frame)
+    numbers = json.loads((folder / "comparison.json").read_text())
+    assert numbers["recommended"] == "bouc-wen"
+    assert numbers["models"]["linear"]["difference"]["value"] < 0
     with (folder / "comparison.csv").open(encoding="utf-8") as file:
         assert [row["name"] for row in csv.DictReader(file)] == ["bouc-wen", "linear"]
     page = (folder / "comparison.html").read_text(encoding="utf-8")
-    for line in (*made.lines, *made.caveats):
+    for line in (*comparison.lines, *comparison.caveats):
         assert escape(line) in page
-    evidence = said["models"]["bouc-wen"]["log_evidence"]
-    assert f"{evidence:.2f}" in page
-
-
-KEYS: dict[str, Any] = {
-    "dynamics": "none",
-    "noise": "white",
-    "from_rest": True,
-    "ess": 200,
-    "seed": 3,
-    "train": (0, 4),
-    "validation": {"later": (4, 6)},
-    "parameters": {"gamma": {"fixed": 0.0172}},
-}
+    assert f"{numbers['models']['bouc-wen']['log_evidence']:.2f}" in page
+    with pytest.raises(InputError, match=r"comparison\.json: exists"):
+        comparison.save(folder)
+    same = bw.compare(bouc_wen, bouc_wen, future=False, workers=1)
+    assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
 
 
 @pytest.mark.slow
 def test_models_of_a_record_are_compared(tmp_path: Path) -> None:
     """Named in one text or in a list, with nothing left or a folder, and its runs: the same."""
-    record = measured()
+    keys = KEYS | {"seed": 3, "parameters": {"gamma": {"fixed": 0.0172}}}
     few: dict[str, Any] = {"future": False, "screen": False, "workers": 1, "progress": False}
-    made = bw.compare(record, models="linear; bouc-wen", **few, **KEYS)
-    assert ("bouc-wen", ["bouc-wen", "linear"]) == (
-        made.recommended,
-        sorted(made.to_pandas().index),
-    )
-    kept = bw.compare(
-        record, models=["linear", "bouc-wen"], folder=tmp_path / "kept", **few, **KEYS
-    )
-    assert made.to_pandas().equals(kept.to_pandas())
-    numbers = json.loads((tmp_path / "kept/comparison.json").read_text())
-    assert numbers["recommended"] == "bouc-wen"
+    first = bw.compare(measured(), models="linear; bouc-wen", **few, **keys)
+    assert "bouc-wen" == first.recommended
+    assert {"bouc-wen", "linear"} == set(first.to_pandas().index)
+    out = tmp_path / "out"
+    second = bw.compare(measured(), models=["linear", "bouc-wen"], folder=out, **few, **keys)
+    assert first.to_pandas().equals(second.to_pandas())
     with pytest.raises(InputError, match=r"comparison\.json: exists"):
-        bw.compare(record, folder=tmp_path / "kept", **few, **KEYS)
-    folders = [tmp_path / "kept" / name for name in ("linear", "bouc-wen")]
+        bw.compare(measured(), folder=out, **few, **keys)
+    folders = [out / name for name in ("linear", "bouc-wen")]
     # The recommended one is finished.
     assert [False, True] == [(folder / "report.html").is_file() for folder in folders]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # its bands do not hold
         bw.resume(folders[0], progress=False)
-    again = bw.compare(*folders, future=False, workers=1)
-    assert "failed" == again["linear"].standing.status  # type: ignore[union-attr]
-    assert (
-        made.to_pandas()
-        .drop(columns="validation")
-        .equals(again.to_pandas().drop(columns="validation"))
-    )
+    third = bw.compare(*folders, future=False, workers=1)
+    assert "failed" == third["linear"].standing.status  # type: ignore[union-attr]
+    without_validation = (c.to_pandas().drop(columns="validation") for c in (first, third))
+    assert next(without_validation).equals(next(without_validation))
     mixed = bw.compare([str(folders[0]), bw.open_run(folders[1])], future=False, workers=1)
-    assert again.to_pandas().equals(mixed.to_pandas())
-
-
-def test_fits_are_compared_at_the_top(fits: tuple[Fit, Fit], tmp_path: Path) -> None:
-    made = bw.compare(*fits, future=False, workers=1, folder=tmp_path / "out")
-    assert made.to_pandas().equals(fits[0].compare(fits[1], future=False, workers=1).to_pandas())
-    assert (tmp_path / "out/comparison.html").is_file()
-    same = bw.compare(fits[0], fits[0], future=False, workers=1)
-    assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
+    assert third.to_pandas().equals(mixed.to_pandas())
 
 
 def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
@@ -176,6 +147,24 @@ def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
     ):
         with pytest.raises(InputError, match=re.escape(line)):
             bw.compare(*given, **options)
+
+
+@pytest.mark.parametrize(
+    ("record", "keys", "line"),
+    [
+        (measured(0.35), {}, "different records, or in different units"),
+        (measured(), {"train": (0, 3)}, "fitted to different windows"),
+        (measured(), {"validation": {}}, r"differ in what is held out \(later\)"),
+    ],
+)
+def test_other_readings_are_refused(
+    fits: tuple[Fit, Fit], record: Record, keys: dict[str, Any], line: str
+) -> None:
+    """Before anything is worked out, so that it does not matter what the draws are of."""
+    config, records = config_of(record, KEYS | keys)
+    other = replace(fits[1], problem=resolve(config, Path(), records))
+    with pytest.raises(InputError, match=line):
+        fits[0].compare(other)
 
 
 def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
@@ -196,99 +185,62 @@ def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
         linear.design("beta")
 
 
-def test_other_records_windows_and_held_out_parts_are_refused(
-    fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    one, _ = fits
-    with pytest.raises(InputError, match="different records, or in different units"):
-        one.compare(fitted(measured(0.35), "linear"))
-    record = one.problem.record
-    other = fitted(record, "linear", train=(0, 3))
-    with pytest.raises(InputError, match="fitted to different windows"):
-        one.compare(other)
-    other = fitted(record, "linear", validation={})
-    with pytest.raises(InputError, match=r"differ in what is held out \(later\)"):
-        one.compare(other)
-    # As a command: one line, and status 2.
-    paths = [str(one.save(tmp_path / "a")), str(other.save(tmp_path / "b"))]
-    assert run(paths, monkeypatch) == 2
-
-
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (["a"], "give two runs or more, or a CONFIG"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
         (["a", "b", "--models", "linear"], "goes with one CONFIG"),
         (["a", "a"], "the same run is there twice"),
         (["a", "b"], "a: no run here"),
-        (["{config}", "--models", "liner"], "did you mean linear"),
-        (["{config}", "--models", "linear; linear"], "is there twice"),
+        (["c.toml", "--models", "linear; linear"], "is there twice"),
     ],
 )
-def test_what_cannot_be_compared_is_one_line_and_status_2(
-    arguments: list[str],
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+def test_a_wrong_command_is_one_line(
+    bwbayes: Type, tmp_path: Path, arguments: list[str], text: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
-    assert run([one.format(config="c.toml") for one in arguments], monkeypatch) == 2
-    printed = capsys.readouterr().err
-    assert said in printed
-    assert printed.count("\n") == 1
+    bwbayes("compare", *arguments).assert_refused(text)
 
 
 def test_a_config_alone_is_run_with_the_usual_models(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    bwbayes: Type, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """At least six, with and without hysteresis; the help names each."""
+    """With and without hysteresis; the help names each."""
     (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
-    asked: list[dict[str, Any]] = []
 
-    def noted(*given: Any, **_: Any) -> Any:
-        asked.append(given[2])
-        raise InputError("that is enough")
+    def refused(*given: Any, **_: Any) -> Any:
+        raise InputError(", ".join(given[2]))
 
-    monkeypatch.setattr("bwbayes.app.jobs.compare.compare_models", noted)
-    assert run([str(tmp_path / "c.toml")], monkeypatch) == 2
-    (models,) = asked
-    assert len(models) >= 6
-    assert {"linear", "bouc-wen"} <= {one.hysteresis for one in models.values()}
-    said = next(str(vars(o)["help"]) for o in compare_command.params if o.name == "models")
-    assert all(name in said for name in models)
+    monkeypatch.setattr("bwbayes.app.jobs.compare.compare_models", refused)
+    bwbayes("compare", "c.toml").assert_refused(", ".join(USUAL_MODELS.split("; ")))
+    config, _ = config_of(measured(), {})
+    operators = [model.hysteresis for model in models_of(USUAL_MODELS, config.model).values()]
+    assert len(operators) >= 6
+    assert {"linear", "bouc-wen"} <= {*operators}
+    (models,) = (option for option in compare_command.params if option.name == "models")
+    assert USUAL_MODELS in str(vars(models)["help"])
 
 
-def test_a_config_is_run_with_each_model_and_gone_on_with(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_config_is_run_with_each_model_and_gone_on_with(bwbayes: Type, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
-    record = measured()
-    assert record.displacement is not None
-    rows = np.column_stack([record.time, record.voltage, record.displacement])
-    np.savetxt(
-        "record.csv", rows, delimiter=",", header="time_s,voltage_V,displacement_um", comments=""
-    )
-    models = ["--models", "linear; bouc-wen", "--no-future", "--workers", "1"]
-    arguments = ["c.toml", *models, "--out", "out"]
-    assert run(arguments, monkeypatch) == 0
-    shown = capsys.readouterr().out
-    assert re.search(r"bouc-wen is recommended", shown)
+    bw.write_record(measured(), tmp_path / "record.csv")
+    options = "--models", "linear; bouc-wen", "--no-future", "--workers", "1", "--out", "out"
+    said = bwbayes("compare", "c.toml", *options)
+    assert 0 == said.status
+    assert "bouc-wen is recommended" in said.out
     # gamma is stated, and the linear model has none, which is far behind.
-    assert "only screened" in shown
+    assert "only screened" in said.out
     assert (tmp_path / "out/linear/chain").is_dir()
     assert not (tmp_path / "out/linear/summary.json").exists()
     before = ChainFile.read(tmp_path / "out/bouc-wen/chain").coordinates("sampling")
-    assert run(arguments, monkeypatch) == 2
-    assert "comparison.json: exists" in capsys.readouterr().err
+    bwbayes("compare", "c.toml", *options).assert_refused("comparison.json: exists")
     (tmp_path / "out/comparison.json").unlink()
-    assert run(arguments, monkeypatch) == 0
+    assert 0 == bwbayes("compare", "c.toml", *options).status
     after = ChainFile.read(tmp_path / "out/bouc-wen/chain").coordinates("sampling")
     np.testing.assert_array_equal(before, after)
     (tmp_path / "c.toml").write_text(CONFIG.replace("seed = 3", "seed = 4"), encoding="utf-8")
     (tmp_path / "out/comparison.json").unlink()
-    assert run(arguments, monkeypatch) == 2
-    assert "holds another run" in capsys.readouterr().err
+    said = bwbayes("compare", "c.toml", *options)
+    assert 2 == said.status
+    assert "holds another run" in said.err

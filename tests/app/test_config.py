@@ -33,11 +33,8 @@ def refused(text: str) -> str:
     [
         ("sead = 1\n" + RECORD, "sead", "seed"),
         ('[recrod]\nfile = "a.csv"\n', "recrod", "record"),
-        (RECORD + "decimat = 2", "record.decimat", "decimate"),
         ("[record]\nsignal = {amplitud = 1.0}", "record.signal.amplitud", "amplitude"),
         (RECORD + "[stand]\nsample_rat = 50.0", "stand.sample_rat", "sample_rate"),
-        (RECORD + "[model]\ndynamic = 'lag'", "model.dynamic", "dynamics"),
-        (RECORD + "[sampling]\nwalker = 20", "sampling.walker", "walkers"),
         (RECORD + "[parameters.d]\nfixd = 1.0", "parameters.d.fixd", "fixed"),
         (RECORD + "[parameters.signal]\nfixd = 1.0", "parameters.signal.fixd", "fixed"),
         (RECORD + "[validation.a]\nwindw = [1.0, 2.0]", "validation.a.windw", "window"),
@@ -82,7 +79,6 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
             "validation.a: lead_in_from is for another record; give file or signal",
         ),
         (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
-        (RECORD + "[validation.training]\nsignal = 'step10'", "'training' is taken"),
         (RECORD + "[validation.training-2]\nsignal = 'step10'", "'training-2' is taken"),
         ("seed = 9223372036854775808\n" + RECORD, "seed"),
         (f"seed = 0x{5000 * 'f'}\n{RECORD}", "seed: "),
@@ -102,56 +98,40 @@ def test_no_error_shows_the_name_of_a_class() -> None:
 
 @pytest.mark.parametrize(
     ("table", "key", "text"),
-    [
-        ("model", "gain", "quadratic"),
-        ("model", "per_record", "sensor_sd"),
-        ("model", "shared", "offset"),
-        ("model", "terms", "b3"),
-        ("stand.model", "gain", "cubic"),
-        ("stand.model", "terms", "b4"),
-        ("record", "remarks", "noted"),
-    ],
+    [("model", "gain", "quadratic"), ("model", "terms", "b3"), ("record", "remarks", "noted")],
 )
 def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
     """In a config and as a keyword."""
     head = RECORD if table == "record" else f"{RECORD}[{table}]\n"
-    alone, listed = (parse(f"{head}{key} = {one}\n", "") for one in (f'"{text}"', f'["{text}"]'))
+    alone, listed = (parse(f"{head}{key} = {v}\n", "") for v in (f'"{text}"', f'["{text}"]'))
     assert alone == listed
-    if not table.startswith("stand"):
-        record = Record(np.arange(20.0), np.arange(20.0), 0.1)
-        by_keyword, by_list = (config_of(record, {key: one})[0] for one in (text, [text]))
-        assert by_keyword == by_list
+    record = Record(np.arange(20.0), np.arange(20.0), 0.1)
+    by_keyword, by_list = (config_of(record, {key: value})[0] for value in (text, [text]))
+    assert by_keyword == by_list
 
 
 @pytest.mark.parametrize(
     ("text", "path"),
     [
         ("seed = '1'\n" + RECORD, "seed"),
-        ("seed = -1\n" + RECORD, "seed"),
         ("name = ''\n" + RECORD, "name"),
         ("record = 3", "record"),
         (RECORD + "start = 1979-05-27", "record.start"),
         (RECORD + "train = [1.0, 2.0, 3.0]", "record.train"),
-        (RECORD + "train = []", "record.train"),
-        (RECORD + "decimate = 0", "record.decimate"),
         (RECORD + "voltage_is = 'both'", "record.voltage_is"),
         (
             "[record]\nsignal = {amplitude = -1.0, frequency = 1.0, duration = 1.0}",
             "record.signal.amplitude",
         ),
-        ("[record]\nsignal = {amplitude = 1.0, duration = 1.0}", "record.signal"),
         (
             "[record]\nsignal = {shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0, "
             "duration = 1.0}",
             "record.signal",
         ),
-        (RECORD + "[model]\nhold = 'second'", "model.hold"),
         (RECORD + "[parameters.d]\nprior = 'normal'", "parameters.d.prior"),
         (RECORD + "[parameters.d]\nprior = {distribution = 3}", "parameters.d"),
         (RECORD + "[parameters.d]\nfixed = 1.0\nprior = {distribution = 'beta'}", "parameters.d"),
         (RECORD + "[sampling]\nwalkers = 7", "sampling.walkers"),
-        (RECORD + "[sampling]\ness = 0", "sampling.ess"),
-        (RECORD + "[validation.a]\nwindow = [1.0, 2.0, 3.0]", "validation.a.window"),
         (RECORD + "[validation.'a/b']\nwindow = [1.0, 2.0]", "validation.a/b"),
         (RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in = 0.0", "validation.a.lead_in"),
         (RECORD + "[truth]\nd = 'large'", "truth.d"),
@@ -164,19 +144,17 @@ def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
     assert said.endswith("; correct the config")
 
 
-@pytest.mark.parametrize("value", ["nan", "-inf"])
 @pytest.mark.parametrize(
     "text",
     [
-        RECORD + "train = [[0.0, {}]]",
-        "[record]\nsignal = {{amplitude = 1.0, frequency = 1.0, duration = {}}}",
-        RECORD + "[parameters.d]\nfixed = {}",
-        RECORD + "[parameters.d]\nprior = {{distribution = 'normal', mean = {}, sd = 1.0}}",
-        RECORD + "[sampling]\ness = {}",
+        RECORD + "train = [[0.0, nan]]",
+        "[record]\nsignal = {amplitude = 1.0, frequency = 1.0, duration = nan}",
+        RECORD + "[parameters.d]\nfixed = -inf",
+        RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan, sd = 1.0}",
     ],
 )
-def test_number_that_is_not_finite_is_refused(text: str, value: str) -> None:
-    assert "finite" in refused(text.format(value))
+def test_number_that_is_not_finite_is_refused(text: str) -> None:
+    assert "finite" in refused(text)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +189,6 @@ def test_unknown_key_of_any_length_is_one_short_line() -> None:
     [
         (b"", "record: "),
         (b"\xff\xfe[\0r\0", "is not UTF-8 text"),
-        (b"\x89HDF\r\n\x1a\n", "is not UTF-8 text"),
     ],
 )
 def test_unusable_file_is_named(tmp_path: Path, content: bytes, why: str) -> None:

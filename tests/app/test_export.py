@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.products import export as command
-from bwbayes.app.fit.fitted import converged
-from bwbayes.app.jobs.export import FILES, export
+from bwbayes.app.jobs.export import FILES
 from bwbayes.errors import InputError
+from tests.app.conftest import Type
 
 
-def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
-    made = export(converged(run), tmp_path / "new" / "here")
-    files = [tmp_path / "new" / "here" / name for name in FILES]
-    numbers = json.loads(files[0].read_text())
+def test_the_files_are_the_posteriors_mean(bwbayes: Type, run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    said = bwbayes("export", "run")
+    wrote = "wrote run/export/model.json\nwrote run/export/actuator.c\n"
+    assert (0, wrote, "") == (said.status, said.out, said.err)
+    numbers = json.loads((tmp_path / "run/export/model.json").read_text())
     posterior = json.loads((run / "summary.json").read_text())["parameters"]
     for name, known in numbers["parameters"].items():
         if name in posterior:
@@ -32,27 +33,27 @@ def test_the_files_are_the_posteriors_mean(run: Path, tmp_path: Path) -> None:
     assert numbers["inverse"]
     assert (0.02, "zero") == (numbers["interval_s"], numbers["hold"])
     assert numbers["limits_V"] == pytest.approx([-100, 100], abs=1)
-    assert files[1].read_text(encoding="ascii") == made.c_code()
 
 
-def test_the_controllers_pace_is_an_option(run: Path, tmp_path: Path) -> None:
-    fit = bw.open_run(run)
-    made = fit.export(tmp_path, voltage=(-20, 80), rate=1e4, hold="first")
-    numbers = json.loads((tmp_path / "model.json").read_text())
+def test_the_controllers_pace_is_an_option(fit: bw.Fit, tmp_path: Path) -> None:
+    exported = fit.export(tmp_path, voltage=(-20, 80), rate=1e4, hold="first")
+    numbers, code = (tmp_path / name for name in FILES)
+    assert code.read_text(encoding="ascii") == exported.c_code()
     assert (1e-4, "first", [-20, 80]) == tuple(
-        numbers[name] for name in ("interval_s", "hold", "limits_V")
+        json.loads(numbers.read_text())[name] for name in ("interval_s", "hold", "limits_V")
     )
-    assert 1e-4 == made.linear.dt
+    assert 1e-4 == exported.linear.dt
     with pytest.raises(InputError, match=r"model\.json: exists; choose another name, or give"):
         fit.export(tmp_path)
     fit.export(tmp_path, overwrite=True)
-    assert 0.02 == json.loads((tmp_path / "model.json").read_text())["interval_s"]
+    assert 0.02 == json.loads(numbers.read_text())["interval_s"]
+    with pytest.raises(InputError, match="choose another folder"):
+        fit.export(code)
 
 
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({"voltage": (5.0, -5.0)}, "give two voltages, the lower one first"),
         ({"voltage": (np.nan, 5.0)}, "give two voltages, the lower one first"),
         ({"rate": 0.0}, "rate: 0 Hz; give a number above 0"),
         ({"rate": np.nan}, "rate: nan Hz; give a number above 0"),
@@ -60,22 +61,8 @@ def test_the_controllers_pace_is_an_option(run: Path, tmp_path: Path) -> None:
     ],
 )
 def test_options_that_make_no_sense_are_one_line(
-    run: Path, tmp_path: Path, options: dict[str, Any], line: str
+    fit: bw.Fit, tmp_path: Path, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line):
-        export(converged(run), tmp_path / "out", **options)
+        fit.export(tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="choose another folder"):
-        export(converged(run), tmp_path / "file")
-
-
-def test_the_command_says_what_it_wrote(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(run, tmp_path / "run")
-    arguments = [str(tmp_path / "run"), "--rate", "1000", "--hold", "zero"]
-    assert 0 == command.main(arguments, standalone_mode=False)
-    folder = tmp_path / "run/export"
-    said = f"wrote {folder / 'model.json'}\nwrote {folder / 'actuator.c'}\n"
-    assert said == capsys.readouterr().out

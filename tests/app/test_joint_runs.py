@@ -13,15 +13,17 @@ import pytest
 import bwbayes
 from bwbayes.app.config.config import Config, dump, parse
 from bwbayes.app.config.models import models_of
+from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.jobs.compare import compare, compare_models, open_runs
-from bwbayes.app.jobs.design import amplifier_of, candidates_of, liveliest
+from bwbayes.app.jobs.design import candidates_of, liveliest
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume, start
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.model.inverse.limits import Limits
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures.pictures import pictures
 from tests.app import small
@@ -209,9 +211,9 @@ def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: Ru
     signals = []
     for one in (made, flipped):
         assert "loops" == liveliest(one)
-        amplifier = amplifier_of(one, None, None, None, None)
+        amplifier = Limits(*limits_of(one, None))
         assert made.records["loops"].range_voltage == (amplifier.low, amplifier.high)
-        signals.append(candidates_of("standard", one, amplifier))
+        signals.append(candidates_of("standard", one.records["loops"], amplifier))
     assert signals[0].keys() == signals[1].keys()
     for name, voltage in signals[0].items():
         np.testing.assert_array_equal(voltage, signals[1][name])

@@ -16,7 +16,6 @@ from bwbayes.comparison.leave_future_out import (
     FUTURE,
     Part,
     bands_part,
-    cut,
     leave_future_out,
     log_ratios,
 )
@@ -171,10 +170,3 @@ def test_the_residuals_worth_is_their_number_over_their_correlation_time() -> No
         assert part.worth == pytest.approx(residual.size / time, rel=0.35)
         assert np.sum(part.log_scores) == pytest.approx(-1.5 * residual.size)
         assert not part.joint
-
-
-def test_windows_are_cut_before_a_sample() -> None:
-    windows = slice(2, 5), slice(7, 9)
-    assert cut(windows, 8) == (slice(2, 5), slice(7, 8))
-    assert cut(windows, 6) == (slice(2, 5),)
-    assert cut(windows, 4) == (slice(2, 4),)

@@ -24,7 +24,7 @@ from bwbayes.app.commands.products import compensate, design, export, predict, t
 from bwbayes.app.commands.reference import config, models
 from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
 from bwbayes.app.commands.wording import as_typed
-from bwbayes.errors import ColumnsError, InputError, NotConvergedError
+from bwbayes.errors import ColumnsError, InputError, NotConvergedError, one_line
 
 __all__ = ["main"]
 
@@ -40,24 +40,9 @@ def cli() -> None:
     """
 
 
-for command in (
-    init,
-    check,
-    run,
-    resume,
-    predict,
-    report,
-    simulate,
-    calibrate,
-    campaign,
-    compensate,
-    export,
-    track,
-    compare,
-    design,
-    config,
-    models,
-):
+for command in (init, check, run, resume, predict, report, simulate, calibrate, campaign):
+    cli.add_command(command)
+for command in (compensate, export, track, compare, design, config, models):
     cli.add_command(command)
 
 
@@ -78,6 +63,36 @@ def _one_line(message: Warning | str, *_: object, **__: object) -> str:
     return f"bwbayes: {as_typed(str(message))}\n"
 
 
+def _failure(error: BaseException) -> tuple[str, int]:
+    """Return the line that says what went wrong, and the exit status; raise what is a defect."""
+    text, status = str(error), BAD_INPUT
+    match error:
+        case NotConvergedError():
+            text = text.removeprefix("not converged: ")
+            return f"NOT CONVERGED: {as_typed(text)}", NOT_CONVERGED
+        case ColumnsError():
+            text = str(error.in_config())
+        case InputError():
+            pass
+        case click.ClickException():
+            text = one_line(error.format_message())
+        case OSError():
+            # A full disk, a folder that went away: what is on disk already stays whole.
+            where = f"{error.filename}: " if error.filename else ""
+            text = f"{where}{error.strerror or error}; fix it and resume"
+        case BrokenExecutor():
+            # Python's own says nothing of use.
+            text = one_line("" if isinstance(error, BrokenProcessPool) else text)
+            text = text or "a worker process was killed; free some memory, and resume"
+        case MemoryError():
+            text = "out of memory; take fewer samples or walkers"
+        case KeyboardInterrupt() | click.Abort():
+            text, status = "interrupted", INTERRUPTED
+        case _:
+            raise error
+    return f"bwbayes: {as_typed(text)}", status
+
+
 def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # A polite request to stop ends a run as Ctrl-C does.
@@ -86,33 +101,7 @@ def main() -> None:
     warnings.formatwarning = _one_line
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
-    except NotConvergedError as error:
-        click.echo(
-            f"NOT CONVERGED: {as_typed(str(error).removeprefix('not converged: '))}", err=True
-        )
-        status = NOT_CONVERGED
-    except InputError as error:
-        line = error.in_config() if isinstance(error, ColumnsError) else error
-        click.echo(f"bwbayes: {as_typed(str(line))}", err=True)
-        status = BAD_INPUT
-    except click.ClickException as error:
-        click.echo(f"bwbayes: {' '.join(error.format_message().split())}", err=True)
-        status = BAD_INPUT
-    except OSError as error:
-        # A full disk, a folder that went away: what is on disk already stays whole.
-        where = f"{error.filename}: " if error.filename else ""
-        click.echo(f"bwbayes: {where}{error.strerror or error}; fix it and resume", err=True)
-        status = BAD_INPUT
-    except BrokenExecutor as error:
-        # Python's own says nothing of use.
-        message = "" if isinstance(error, BrokenProcessPool) else str(error)
-        message = message or "a worker process was killed; free some memory, and resume"
-        click.echo(f"bwbayes: {' '.join(message.split())}", err=True)
-        status = BAD_INPUT
-    except MemoryError:
-        click.echo("bwbayes: out of memory; take fewer samples or walkers", err=True)
-        status = BAD_INPUT
-    except (KeyboardInterrupt, click.Abort):
-        click.echo("bwbayes: interrupted", err=True)
-        status = INTERRUPTED
+    except (Exception, KeyboardInterrupt) as error:
+        line, status = _failure(error)
+        click.echo(line, err=True)
     sys.exit(status if isinstance(status, int) else 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
+from bwbayes.errors import InputError
+
 if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem
     from bwbayes.diagnosis.standing import Standing
     from bwbayes.report.report import Report
@@ -22,6 +23,7 @@ __all__ = [
     "NOT_CONVERGED",
     "finish",
     "present",
+    "require_new_or_resumed",
     "resumable",
     "show_report",
 ]
@@ -49,6 +51,16 @@ def resumable(command: str) -> Iterator[None]:
         raise click.exceptions.Exit(INTERRUPTED) from None
 
 
+def require_new_or_resumed(
+    command: str, either: str, new: object, resumed: object, options: Mapping[str, object]
+) -> None:
+    """Refuse neither a new study nor one to resume, both, and options of a new one to resume."""
+    if (new is None) == (resumed is None):
+        raise InputError(f"{command}: give either {either}")
+    if new is None and any(value not in (None, False) for value in options.values()):
+        raise InputError(f"{command}: --resume goes on as begun; leave the other options out")
+
+
 def present(
     report: Report, files: Sequence[Path], standing: Standing, *, quiet: bool = False
 ) -> int:
@@ -64,11 +76,7 @@ def present(
 
 
 def finish(
-    path: Path,
-    *,
-    quiet: bool,
-    show: Callable[[Problem], None] | None = None,
-    **options: Any,
+    path: Path, *, quiet: bool, show: Callable[[Problem], None] | None = None, **options: Any
 ) -> int:
     """Sample the run in a folder to its end, say how it went, and return the exit status.
 
@@ -78,14 +86,16 @@ def finish(
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.running.run import resume
 
-    def answer(fit: Fit) -> None:
-        if not quiet:
-            show_report(fit.report())
-
     folder = RunFolder.open(path)
-    console = Console(stderr=True, quiet=quiet)
     with resumable(f"`bwbayes resume {path}`"):
-        fit = resume(folder, console, background=True, show=show, answer=answer, **options)
+        fit = resume(
+            folder,
+            Console(stderr=True, quiet=quiet),
+            background=True,
+            show=show,
+            answer=lambda fit: None if quiet else show_report(fit.report()),
+            **options,
+        )
     if not quiet:
         click.echo(f"report: {folder.path / 'report.html'}")
     if not fit.converged:

@@ -62,9 +62,7 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
     """
     from bwbayes.app.jobs.check import check as check_config
 
-    chosen, _ = _config_or_proposal(config, naming, "check", quiet=True)
-    if record is not None:
-        chosen = chosen.with_record(record)
+    chosen, _ = _config_or_proposal(config, record, naming, "check", quiet=True)
     out = out or Path("results") / f"{config.stem}-check"
     show_report(check_config(chosen, config.parent, out))
     click.echo(f"report: {out / 'check.html'}")
@@ -103,11 +101,8 @@ def run(
     from bwbayes.report.priors import priors_table
     from bwbayes.report.report import Report, remarks_banner
 
-    chosen, is_proposal = _config_or_proposal(config, naming, "run", quiet=quiet)
-    if record is not None:
-        chosen = chosen.with_record(record)
-    changes = {"name": chosen.name or config.stem} | ({} if seed is None else {"seed": seed})
-    chosen = chosen.model_copy(update=changes)
+    chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
+    chosen = chosen.renamed(config.stem, seed)
     path = out or Path("results") / config.stem
     if improve:
         RunFolder.require_free(path, overwrite)
@@ -152,11 +147,12 @@ def report(folder: Path) -> int:
 
 
 def _config_or_proposal(
-    path: Path, naming: dict[str, Any], command: str, *, quiet: bool
+    path: Path, record: Path | None, naming: dict[str, Any], command: str, *, quiet: bool
 ) -> tuple[Config, bool]:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
 
-    Return the config, and whether it is a proposal. What only ``check`` can use is refused.
+    Return the config, of another record if there is one, and whether it is a proposal. What only
+    ``check`` can use is refused.
     """
     from bwbayes.app.config.config import is_config, load
 
@@ -167,24 +163,23 @@ def _config_or_proposal(
                 f"{path}: --column, --unit and --fs are for a record; in a config say columns, "
                 "units and fs under [record]"
             )
-        return config, False
+        return config if record is None else config.with_record(record), False
     proposal = _proposed(path, path.parent, naming, command)
+    config = proposal.config
     if command != "check" and proposal.pointless is not None:
         raise InputError(
             f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "
             f"with `bwbayes init {path}` and run that"
         )
     if not quiet:
-        train = ", ".join(
-            f"{a:g} to {b:g}" for a, b in proposal.config.records["record"].train or ()
-        )
-        held_out = "the rest" if "held_out" in proposal.config.validation else "nothing"
+        train = ", ".join(f"{a:g} to {b:g}" for a, b in config.records["record"].train or ())
+        held_out = "the rest" if "held_out" in config.validation else "nothing"
         _show(
             proposal,
             f"training on {train} s, holding out {held_out}; "
             f"save this config with `bwbayes init {path}`",
         )
-    return proposal.config, True
+    return config if record is None else config.with_record(record), True
 
 
 def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> ConfigProposal:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,6 +21,26 @@ from bwbayes.app.commands.options import (
 from bwbayes.errors import ColumnsError, InputError
 
 __all__ = ["compensate", "design", "export", "predict", "track"]
+
+
+def _saved(
+    job: Callable[..., Any],
+    folder: Path,
+    out: Path,
+    *arguments: Any,
+    overwrite: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Do a job with the run in a folder, save and show its product; return the exit status."""
+    from bwbayes.app.fit.fitted import converged
+    from bwbayes.report.saving import refuse_existing
+
+    # What takes long is refused at once, and every single file when it is saved.
+    refuse_existing([out / f"{job.__name__}.json"], overwrite=overwrite)
+    product = job(converged(folder), *arguments, **options)
+    files = product.save(out, overwrite=overwrite)
+    return present(product.report(), files, product.standing, quiet=quiet)
 
 
 @click.command()
@@ -78,8 +99,7 @@ def predict(
     validation = Standing.of([bands.verdict] if bands.verdict else [])
     # The worse of the two.
     worse = validation if validation.holds is False or fit.standing.holds else fit.standing
-    present(bands.report(), files, worse)
-    return worse.exit_status
+    return present(bands.report(), files, worse)
 
 
 @click.command()
@@ -95,13 +115,7 @@ def predict(
 @overwrite_option
 @quiet_option
 def compensate(
-    folder: Path,
-    shape: str | None,
-    reference: Path | None,
-    out: Path | None,
-    overwrite: bool,
-    quiet: bool,
-    **options: Any,
+    folder: Path, shape: str | None, reference: Path | None, out: Path | None, **options: Any
 ) -> int:
     """Compute the voltage command for a reference displacement, with the run in FOLDER.
 
@@ -111,15 +125,13 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.compensate import compensate as invert
 
-    if (shape is None) == (reference is None):
+    requested = shape or reference
+    if requested is None or (shape and reference):
         raise InputError("compensate: give either a shape or --reference")
-    command = invert(converged(folder), shape or reference, **options)
-    where = out or folder / "compensation" / command.reference.name
-    files = command.save(where, overwrite=overwrite)
-    return present(command.report(), files, command.standing, quiet=quiet)
+    out = out or folder / "compensation" / Path(requested).stem
+    return _saved(invert, folder, out, requested, **options)
 
 
 @click.command()
@@ -133,13 +145,7 @@ def compensate(
 @overwrite_option
 @quiet_option
 def design(
-    folder: Path,
-    parameter: str | None,
-    drive: Path | None,
-    out: Path | None,
-    overwrite: bool,
-    quiet: bool,
-    **options: Any,
+    folder: Path, parameter: str | None, drive: Path | None, out: Path | None, **options: Any
 ) -> int:
     """Rank input signals by the expected reduction in posterior SD, from the run in FOLDER.
 
@@ -148,24 +154,12 @@ def design(
 
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
-    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.design import design as rank
-    from bwbayes.record import Record, write_record
-    from bwbayes.report.saving import refuse_existing, save
 
-    if parameter is not None and drive is not None:
-        raise InputError("design: give either a parameter or a drive")
     target = parameter or drive
-    if target is None:
+    if target is None or (parameter and drive):
         raise InputError("design: give either a parameter or a drive")
-    out = out or folder / "design"
-    best = out / "best.csv"
-    refuse_existing([best, out / "design.html", out / "design.json"], overwrite=overwrite)
-    ranking = rank(converged(folder), target, **options)
-    files = save(ranking.report(), out, "design")
-    signal = ranking.signals[ranking.best.name]
-    write_record(Record(signal, None, ranking.interval, voltage_is="command"), best)
-    return present(ranking.report(), [best, *files], ranking.standing, quiet=quiet)
+    return _saved(rank, folder, out or folder / "design", target, **options)
 
 
 @click.command()
@@ -201,7 +195,7 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 @options_of("bwbayes.app.jobs.track:track", frequencies="frequency")
 @overwrite_option
 @quiet_option
-def track(folder: Path, out: Path | None, overwrite: bool, quiet: bool, **options: Any) -> int:
+def track(folder: Path, out: Path | None, **options: Any) -> int:
     """Simulate closed-loop tracking with the run in FOLDER: open loop, feedforward, PID, and both.
 
     On the virtual test stand, with every draw of the posterior for actuator, and the paper's
@@ -211,13 +205,6 @@ def track(folder: Path, out: Path | None, overwrite: bool, quiet: bool, **option
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.track import track as simulate
-    from bwbayes.report.saving import refuse_existing, save
 
-    out = out or folder / "track"
-    files = [out / f"track.{kind}" for kind in ("json", "csv", "png", "html")]
-    refuse_existing(files, overwrite=overwrite)
-    tracking = simulate(converged(folder), **options)
-    written = save(tracking.report(), out, "track")
-    return present(tracking.report(), written, tracking.standing, quiet=quiet)
+    return _saved(simulate, folder, out or folder / "track", **options)

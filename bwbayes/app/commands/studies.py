@@ -8,7 +8,13 @@ from typing import Any
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.ending import NOT_CONVERGED, present, resumable, show_report
+from bwbayes.app.commands.ending import (
+    NOT_CONVERGED,
+    present,
+    require_new_or_resumed,
+    resumable,
+    show_report,
+)
 from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_option, seed_option
 from bwbayes.app.config.limits import USUAL_MODELS
 from bwbayes.errors import InputError
@@ -62,18 +68,14 @@ def calibrate(
     from bwbayes.app.running.folder import CalibrationFolder
     from bwbayes.report.calibration import calibration_report
 
-    if config is not None and resumed is None:
-        chosen = load(config)
-        changes = {"name": chosen.name or config.stem} | ({} if seed is None else {"seed": seed})
-        where = out or Path("results") / f"{config.stem}-calibration"
-        chosen = chosen.model_copy(update=changes)
-        folder = start(chosen, config.parent, where, replicates, overwrite=overwrite)
-    elif config is None and resumed is not None:
-        if out is not None or seed is not None or overwrite:
-            raise InputError("calibrate: --resume goes on as begun; leave the other options out")
-        folder = CalibrationFolder.open(resumed)
+    new = {"out": out, "seed": seed, "overwrite": overwrite}
+    require_new_or_resumed("calibrate", "a CONFIG or --resume FOLDER", config, resumed, new)
+    if config is None:
+        folder = CalibrationFolder.open(Path(str(resumed)))
     else:
-        raise InputError("calibrate: give either a CONFIG or --resume FOLDER")
+        chosen = load(config).renamed(config.stem, seed)
+        path = out or Path("results") / f"{config.stem}-calibration"
+        folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)
     with resumable(folder.resuming):
         console = Console(stderr=True, quiet=quiet)
         calibration = resume(folder, console, replicates=replicates, **options)
@@ -119,16 +121,16 @@ def campaign(
     from bwbayes.app.jobs.campaign import config_text, resume, start
     from bwbayes.app.running.campaign_folder import CampaignFolder
 
-    if folder is not None and resumed is None:
+    new = {"out": out, "config": config, "overwrite": overwrite, "pictures": no_pictures}
+    require_new_or_resumed(
+        "campaign", "a FOLDER of records or --resume CAMPAIGN", folder, resumed, new
+    )
+    if folder is None:
+        batch = CampaignFolder.open(Path(str(resumed)))
+    else:
         text, where = ("", folder) if config is None else (config_text(config), config.parent)
         out = out or Path("results") / folder.absolute().name
         batch = start(folder, text, where, out, pictures=not no_pictures, overwrite=overwrite)
-    elif folder is None and resumed is not None:
-        if out is not None or config is not None or overwrite or no_pictures:
-            raise InputError("campaign: --resume goes on as begun; leave the other options out")
-        batch = CampaignFolder.open(resumed)
-    else:
-        raise InputError("campaign: give either a FOLDER of records or --resume CAMPAIGN")
     with resumable(f"`bwbayes campaign --resume {batch.path}`"):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
     if not quiet:
@@ -176,8 +178,8 @@ def compare(
         raise InputError("compare: give two runs or more, or a CONFIG")
     if models is not None and others:
         raise InputError("compare: --models goes with one CONFIG; leave the others out")
+    out = out or Path("results") / ("comparison" if models is None else f"{path.stem}-comparison")
     config = None if models is None else load(path)
-    out = out or Path("results") / ("comparison" if config is None else f"{path.stem}-comparison")
     refuse_existing([out / "comparison.json"], overwrite=overwrite)
     console = Console(stderr=True, quiet=quiet)
     if config is None or models is None:
@@ -186,7 +188,7 @@ def compare(
         named_models = models_of(models, config.model)
         options |= {"screen": screen, "overwrite": overwrite}
         comparison = job.compare_models(config, path.parent, named_models, out, console, **options)
-    comparison.save(out)
+    comparison.save(out, overwrite=True)
     # What does not hold is among what speaks against the recommendation.
     page = out / "comparison.html"
     status = present(comparison.report(), [page], comparison.standing, quiet=quiet)

@@ -146,6 +146,11 @@ class Config(ConfigTable):
         source = self.record.model_copy(update={"file": str(file.resolve()), "signal": None})
         return self.model_copy(update={"record": source})
 
+    def renamed(self, name: str, seed: int | None) -> Config:
+        """Return the config with a name, if it has none, and another seed, if there is one."""
+        changes = {"name": self.name or name} | ({} if seed is None else {"seed": seed})
+        return self.model_copy(update=changes)
+
     @property
     def records(self) -> Mapping[str, RecordConfig]:
         """The training records by name; one alone is called "record"."""

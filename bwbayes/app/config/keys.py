@@ -98,15 +98,13 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], parent: str) -> I
     """Yield the keys of a table's JSON schema; ``tables`` has those of all tables by name."""
     for name, field in table["properties"].items():
         branches = field.get("anyOf") or field.get("oneOf") or [field]
-        inner = path = None
+        references = {branch["$ref"]: name for branch in branches if "$ref" in branch}
         for branch in branches:
-            if inner is None and "$ref" in branch:
-                inner, path = branch["$ref"], f"{parent}{name}"
             values = branch.get("patternProperties", {"": branch.get("additionalProperties")})
-            for value in values.values():
-                if inner is None and value and "$ref" in value:
-                    inner, path = value["$ref"], f"{parent}{name}.{ANY}"
-        inner = inner and inner.rpartition("/")[2]
+            named = (value["$ref"] for value in values.values() if value and "$ref" in value)
+            references |= {reference: f"{name}.{ANY}" for reference in named if not references}
+        reference, path = next(iter(references.items()), ("", name))
+        inner = reference.rpartition("/")[2] or None
         default = json.dumps(field.get("default"))  # which is TOML, too
         if name in table.get("required", ()):
             default = "required"
@@ -114,7 +112,7 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], parent: str) -> I
             default = "none"
         kinds = [_kind(branch) for branch in branches if branch.get("type") != "null"]
         yield Key(
-            path=path or f"{parent}{name}",
+            path=f"{parent}{path}",
             kind=" or ".join(dict.fromkeys(kinds)),
             unit=field["unit"],
             default=default,
@@ -124,7 +122,7 @@ def _keys(table: Mapping[str, Any], tables: Mapping[str, Any], parent: str) -> I
             table=inner,
         )
         if inner is not None:
-            yield from _keys(tables[inner], tables, f"{path}.")
+            yield from _keys(tables[inner], tables, f"{parent}{path}.")
 
 
 def _kind(branch: Mapping[str, Any]) -> str:
@@ -156,23 +154,21 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     names = [str(name) for name in first["loc"] if not branch.fullmatch(str(name))]
     path = ".".join(names) or "config"
     if first["type"] == "extra_forbidden":
-        hint = _home(names, root) or suggestion(
-            names[-1], _names_in(names[:-1], root), synonyms(root)
-        )
-        return f"{where}: {path}: unknown key; {hint}"
+        return f"{where}: {path}: unknown key; {_hint(names, root)}"
     message = first["msg"].removeprefix("Value error, ")
-    if names[-1:] == ["prior"]:
-        message = 'write a table like { distribution = "normal", mean = 1.0, sd = 0.1 }'
-    elif names[-1:] == ["signal"]:
-        message = (
-            "write a signal's name or a table like { amplitude = 100.0, frequency = 1.0, ... }"
-        )
-    elif first["type"] == "dict_type":
-        message = f"is not a table; write [{path}.NAME] and its keys below"
-    elif first["type"] == "model_type":
-        message = f"is not a table; known keys are {', '.join(_names_in(names, root))}"
-    elif first["type"] == "missing":
-        message = "is missing"
+    match names[-1:], first["type"]:
+        case ["prior"], _:
+            message = 'write a table like { distribution = "normal", mean = 1.0, sd = 0.1 }'
+        case ["signal"], _:
+            message = (
+                "write a signal's name or a table like { amplitude = 100.0, frequency = 1.0, ... }"
+            )
+        case _, "dict_type":
+            message = f"is not a table; write [{path}.NAME] and its keys below"
+        case _, "model_type":
+            message = f"is not a table; known keys are {', '.join(_names_in(names, root))}"
+        case _, "missing":
+            message = "is missing"
     try:
         got = "" if isinstance(first["input"], dict) else f", got {first['input']!r:.60}"
     except ValueError:  # Python writes no whole number of more than 4300 digits
@@ -180,13 +176,15 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
 
 
-def _home(names: Sequence[str], root: type[BaseModel]) -> str:
-    """Say where a key belongs that is known, but in another table; nothing if it is not."""
+def _hint(names: Sequence[str], root: type[BaseModel]) -> str:
+    """Say where an unknown key belongs, if in another table, or which one is meant."""
     if names[-1] in root.model_fields:
         return "it belongs above the first table, or is a table of its own"
-    tables = [key.parent for key in keys(root) if key.name == names[-1]]
-    tables = [table for table in tables if table and "." not in table and table != names[0]]
-    return f"it belongs under [{tables[0]}]" if tables else ""
+    for key in keys(root):
+        elsewhere = key.parent and "." not in key.parent and key.parent != names[0]
+        if key.name == names[-1] and elsewhere:
+            return f"it belongs under [{key.parent}]"
+    return suggestion(names[-1], _names_in(names[:-1], root), synonyms(root))
 
 
 def _names_in(path: Sequence[str], root: type[BaseModel]) -> list[str]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from bwbayes.app.config.config import ALONE, Config, checked
 from bwbayes.app.config.keys import synonyms
@@ -50,22 +49,18 @@ def config_of(
     InputError
         A key that does not exist, or what no config can say.
     """
-    keyed: dict[str, type[BaseModel]] = {
-        "sampling": SamplingConfig,
-        "record": RecordConfig,
-        "model": ModelConfig,  # the last of two tables with a key of the same name counts
-    }
-    homes = {key: table for table, kind in keyed.items() for key in kind.model_fields}
-    homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth"), "")
-    del homes["file"], homes["signal"]
     tables: dict[str, Any] = {"record": {}, "model": {}, "sampling": {}}
+    homes = dict.fromkeys(SamplingConfig.model_fields, "sampling")
+    homes |= dict.fromkeys(RecordConfig.model_fields.keys() - {"file", "signal"}, "record")
+    # Of two tables with a key of the same name the model's counts.
+    homes |= dict.fromkeys(ModelConfig.model_fields, "model")
+    homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth"), "")
     for key, value in keys.items():
-        if key in keyed:
-            example = next(iter(keyed[key].model_fields))
-            hint = f"give the keys of [{key}] themselves, {example} for instance"
-            raise InputError(f"{where}: {key}: unknown key; {hint}")
         if key not in homes:
-            hint = suggestion(key, [*homes], synonyms(Config))
+            example = next((name for name, table in homes.items() if table == key), None)
+            hint = f"give the keys of [{key}] themselves, {example} for instance"
+            if example is None:
+                hint = suggestion(key, [*homes], synonyms(Config))
             raise InputError(f"{where}: {key}: unknown key; {hint}")
         (tables[homes[key]] if homes[key] else tables)[key] = _plain(value)
     records: dict[str, Record] = {}
@@ -91,26 +86,23 @@ def _by_name(record: Any, where: str) -> Mapping[str, Any]:
         return {str(name): source for name, source in record.items()}
     if not isinstance(record, list | tuple) or not record:
         _file(record, ALONE, {}, where)
-    named: dict[str, Any] = {}
-    for number, source in enumerate(record, start=1):
-        name = Path(source).stem if isinstance(source, str | Path) else f"record_{number}"
-        if name in named:
+    names = [
+        Path(source).stem if isinstance(source, str | Path) else f"record_{number}"
+        for number, source in enumerate(record, start=1)
+    ]
+    for name in names:
+        if names.count(name) > 1:
             raise InputError(
                 f"{where}: two records are called {name!r}; give a dict of names and records"
             )
-        named[name] = source
-    return named
+    return dict(zip(names, record, strict=True))
 
 
 def _table(name: str, source: Any, records: dict[str, Record], where: str) -> dict[str, Any]:
     """Return a record, or the keys of its table with ``record`` among them, as in a config."""
-    if not isinstance(source, Mapping):
-        return {"file": _file(source, name, records, where)}
-    table: dict[str, Any] = _plain(source)
-    if "record" in source:
-        del table["record"]
-        table["file"] = _file(source["record"], name, records, where)
-    return table
+    table = dict(source) if isinstance(source, Mapping) else {"record": source}
+    file = {"file": _file(table.pop("record"), name, records, where)} if "record" in table else {}
+    return {str(key): _plain(value) for key, value in table.items()} | file
 
 
 def _file(source: Any, name: str, records: dict[str, Record], where: str) -> str:
@@ -130,10 +122,11 @@ def _file(source: Any, name: str, records: dict[str, Record], where: str) -> str
 
 def _plain(value: Any) -> Any:
     """Return a value in the types of TOML: lists for tuples and arrays, Python's own numbers."""
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+    match value:
+        case np.ndarray() | np.generic():
+            return _plain(value.tolist())
+        case Mapping():
+            return {str(key): _plain(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_plain(item) for item in value]
     return value

@@ -23,8 +23,6 @@ from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 
 __all__ = ["models_of", "slug"]
 
-OPERATOR = re.compile(r"\s*([^\s()+]+)\s*(?:\((.*)\))?\s*")
-
 
 def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
     """Return the models of a line by their names, which are what was written of them.
@@ -39,7 +37,10 @@ def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
         name = re.sub(r"\s*\+\s*", " + ", written)
         if name in models:
             raise InputError(f"models: {name!r} is there twice; leave one out")
-        models[name] = _model(name, base)
+        try:
+            models[name] = ModelConfig.model_validate(base.model_dump() | _changes(name))
+        except ValidationError as error:
+            raise InputError(one_line(f"models: {name!r}", error, ModelConfig)) from None
     if not models:
         raise InputError('models: names no model; write "bouc-wen; bouc-wen + quadratic"')
     return models
@@ -50,49 +51,35 @@ def slug(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
 
 
-def _model(name: str, base: ModelConfig) -> ModelConfig:
+def _changes(name: str) -> dict[str, Any]:
+    """Return the keys of [model] that a model's name says."""
     first, *others = re.split(r"\+(?![^(]*\))", name)
-    match = OPERATOR.fullmatch(first)
+    match = re.fullmatch(r"\s*([^\s()+]+)\s*(?:\((.*)\))?\s*", first)
     if match is None:
         raise InputError(f"models: {name!r}: begin with an operator, see `bwbayes models`")
-    operator, options = match[1], match[2]
+    operator, options = match[1], match[2] or ""
     if operator not in HYSTERESIS and ":" not in operator:
         raise InputError(f"models: {operator!r} is unknown; {suggestion(operator, HYSTERESIS)}")
-    changes: dict[str, Any] = dict.fromkeys(OPTIONS) | {
-        "hysteresis": operator,
-        "gain": [],
-        "creep": False,
-        "creep_growth": False,
-    }
-    if options:
-        changes |= _options(name, options)
+    changes: dict[str, Any] = dict.fromkeys(OPTIONS)
+    changes |= {"hysteresis": operator, "gain": [], "creep": False, "creep_growth": False}
+    try:
+        said = tomllib.loads(f"options = {{ {options} }}")["options"]
+    except (ValueError, RecursionError):
+        raise InputError(
+            f"models: {name!r}: cannot read {options!r}; write options as in thresholds=4"
+        ) from None
+    for key in said:
+        if key not in OPTIONS:
+            raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
+    changes |= said
     for word in (term.strip() for term in others):
         if word in TERMS:
             changes["gain"] = [*changes["gain"], word]
         elif word == "creep":
             changes["creep"] = True
-        elif word in DYNAMICS:
-            changes["dynamics"] = word
-        elif word in NOISES:
-            changes["noise"] = word
+        elif word in DYNAMICS or word in NOISES:
+            changes["dynamics" if word in DYNAMICS else "noise"] = word
         else:
             words = [*TERMS, "creep", *DYNAMICS, *NOISES]
             raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, words)}")
-    try:
-        return ModelConfig.model_validate(base.model_dump() | changes)
-    except ValidationError as error:
-        raise InputError(one_line(f"models: {name!r}", error, ModelConfig)) from None
-
-
-def _options(name: str, text: str) -> dict[str, Any]:
-    """Read what stands in an operator's brackets: ``thresholds=4``."""
-    try:
-        options = tomllib.loads(f"options = {{ {text} }}")["options"]
-    except (ValueError, RecursionError):
-        raise InputError(
-            f"models: {name!r}: cannot read {text!r}; write options as in thresholds=4"
-        ) from None
-    for key in options:
-        if key not in OPTIONS:
-            raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
-    return dict(options)
+    return changes

@@ -72,7 +72,11 @@ def config_reference(requested: str | None) -> str:
             "Every key of a config, by table. `bwbayes config KEY` shows one; notebooks and runs "
             "have whole configs."
         )
-        return "\n\n".join([_wrapped(head), *(_entry(key) for key in _once(documented))])
+        # Of a table that stands in two places the keys are shown once.
+        first = {key.table: key.path for key in reversed(documented)}
+        repeated = tuple(f"{k.path}." for k in documented if k.table and first[k.table] != k.path)
+        shown = [key for key in documented if not key.path.startswith(repeated)]
+        return "\n\n".join([_wrapped(head), *map(_entry, shown)])
     path = requested.split(".")
     found = [key for key in documented if _ends_with(key, path)]
     if not found:
@@ -82,17 +86,6 @@ def config_reference(requested: str | None) -> str:
     inside = tuple(f"{key.path}." for key in found if key.table is not None)
     shown = [key for key in documented if key in found or key.path.startswith(inside)]
     return "\n\n".join(map(_entry, shown))
-
-
-def _once(documented: Sequence[Key]) -> Iterator[Key]:
-    """Yield keys without those of a table that stands elsewhere already."""
-    first_paths: dict[str, str] = {}
-    skipped: tuple[str, ...] = ()
-    for key in documented:
-        if not key.path.startswith(skipped):
-            yield key
-            if key.table is not None and first_paths.setdefault(key.table, key.path) != key.path:
-                skipped = (*skipped, f"{key.path}.")
 
 
 def _ends_with(key: Key, written: Sequence[str]) -> bool:
@@ -135,14 +128,15 @@ def parts_reference(requested: str | None) -> str:
         There is no such part.
     """
     if requested is not None:
-        found = [(kind, makers[requested]) for kind, makers in PARTS.items() if requested in makers]
+        found = [
+            (kind, makers[requested]()) for kind, makers in PARTS.items() if requested in makers
+        ]
         if not found:
             registered = {
                 name: maker for makers in PARTS.values() for name, maker in makers.items()
             }
-            component = made("models", requested, registered, {})
-            found = [("from outside", lambda: component)]
-        return "\n\n".join(_part(kind, requested, maker()) for kind, maker in found)
+            found = [("from outside", made("models", requested, registered, {}))]
+        return "\n\n".join(_part(kind, requested, component) for kind, component in found)
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():
         lines.append(f"{kind}:")
@@ -222,6 +216,5 @@ def _default(declared: Declaration) -> str:
     if default is None:
         why = f" ({declared.without_default})" if declared.without_default else ""
         return f"no default: give prior or fixed{why}"
-    return (
-        f"fixed at {default:g}" if isinstance(default, float | int) else str(default)
-    ) + condition
+    is_fixed = isinstance(default, float | int)
+    return (f"fixed at {default:g}" if is_fixed else str(default)) + condition

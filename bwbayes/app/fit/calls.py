@@ -198,7 +198,7 @@ def compare(
             executor=executor,
         )
     if scratch is None:
-        comparison.save(path)
+        comparison.save(path, overwrite=True)
     return comparison
 
 

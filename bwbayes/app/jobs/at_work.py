@@ -50,17 +50,14 @@ def limits_of(problem: Problem, limits: tuple[float, float] | None) -> Span:
     InputError
         They are not two voltages, the lower one first.
     """
-    ranges = np.array([record.range_voltage for record in problem.records.values()])
-    low, high = limits or (float(ranges[:, 0].min()), float(ranges[:, 1].max()))
+    ranges = [record.range_voltage for record in problem.records.values()]
+    low, high = limits or (min(low for low, _ in ranges), max(high for _, high in ranges))
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
     return Span(low, high)
 
 
 def command_limits(problem: Problem, limits: tuple[float, float] | None) -> Span:
-    """Return the voltages that a command may use: those given, or zero and all fitted ones, V.
-
-    Errors are those of :func:`limits_of`.
-    """
+    """Return the voltages of a command: those given, or zero and all fitted ones, V."""
     low, high = limits_of(problem, limits)
     return Span(low, high) if limits else Span(min(low, 0.0), max(high, 0.0))

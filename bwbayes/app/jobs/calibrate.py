@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from hashlib import sha256
@@ -24,17 +24,15 @@ from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
+from bwbayes.app.jobs.batch import batch
 from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import CountProgress
-from bwbayes.app.running.workers import executor as executor_of
-from bwbayes.app.running.workers import one_thread, side_by_side
+from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
 from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import RANKED, Entry, Experiment
-from bwbayes.calibration.replicates import replicates as run_replicates
+from bwbayes.calibration.replicates import RANKED, Entry, Experiment, replicate
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.saving import save
@@ -49,10 +47,6 @@ class _Request(BaseModel):
 
     replicates: PositiveInt
     of: str
-
-    def line(self) -> bytes:
-        """Return it as it is written."""
-        return self.model_dump_json().encode() + b"\n"
 
 
 def start(
@@ -70,7 +64,8 @@ def start(
     problem = resolve(config, where)
     experiment(problem)
     request = _Request(replicates=count or 500, of=_identity(problem))
-    return CalibrationFolder.create(out, problem, overwrite, request.line())
+    line = f"{request.model_dump_json()}\n".encode()
+    return CalibrationFolder.create(out, problem, overwrite, line)
 
 
 def experiment(problem: Problem) -> Experiment:
@@ -112,10 +107,8 @@ def resume(
 
     Parameters
     ----------
-    folder
-        The calibration's folder.
-    console
-        Where progress goes.
+    folder, console
+        The calibration's folder, and where progress goes.
     replicates
         How many; default: 500, or as begun. None is thrown away.
     workers
@@ -131,27 +124,38 @@ def resume(
     """
     with folder.locked(), one_thread():
         problem = resolve(load(folder.config), folder.path)
-        common, identity = experiment(problem), _identity(problem)
+        common, identity, seed = experiment(problem), _identity(problem), problem.config.seed
         requested, entries = _read(folder, common, identity)
         if replicates not in (None, requested):
             requested = replicates or requested
-            _append(folder, _Request(replicates=requested, of=identity).line())
-        missing = [number for number in range(requested) if number not in entries]
+            _append(folder, _Request(replicates=requested, of=identity).model_dump_json())
         # The summary is the sign that all is done; now there is more to do.
         for path in (folder.summary, folder.path / "calibration.html"):
             path.unlink(missing_ok=True)
         shutil.rmtree(folder.path / "figures", ignore_errors=True)
-        if missing:
-            _make(folder, common, problem.config.seed, missing, entries, workers, console, executor)
+        unconverged = sum(not entry["converged"] for entry in entries.values())
+        for entry, _ in batch(
+            replicate,
+            [(common, seed, number) for number in range(requested) if number not in entries],
+            lambda made: "" if made.entry["converged"] else "not converged",
+            console=console,
+            kind="replicate",
+            done=len(entries),
+            short={"not converged": unconverged},
+            workers=workers,
+            backend=executor,
+        ):
+            entries[entry["number"]] = entry
+            _append(folder, json.dumps(entry))
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         provenance = {
-            "seed": problem.config.seed,
+            "seed": seed,
             "data_sha256": problem.sha256,
             "versions": versions(problem.posterior.engine),
         }
         calibration = replace(
-            judge(ordered, generator(problem.config.seed, "ranks")),
+            judge(ordered, generator(seed, "ranks")),
             name=problem.config.name or "calibration",
             parameters=problem.parameters,
             facts=_facts(problem, provenance),
@@ -167,37 +171,10 @@ def _identity(problem: Problem) -> str:
     return sha256((dump(problem.config) + problem.sha256).encode()).hexdigest()
 
 
-def _make(
-    folder: CalibrationFolder,
-    common: Experiment,
-    seed: int,
-    missing: Sequence[int],
-    entries: dict[int, Entry],
-    workers: int | None,
-    console: Console,
-    backend: str | Executor | None,
-) -> None:
-    """Add the missing replicates to the entries, and write each as soon as it is done."""
-    count = min(workers or os.cpu_count() or 1, len(missing))
-    unconverged = sum(not entry["converged"] for entry in entries.values())
-    # Processes, also for the compiled engine: most of a replicate's time goes into Python.
-    with (
-        executor_of(count, backend=backend) as pool,
-        CountProgress(
-            console, "replicate", len(entries), len(missing), {"not converged": unconverged}
-        ) as progress,
-    ):
-        together = side_by_side(pool, workers, len(missing))
-        for entry, _ in run_replicates(common, seed, missing, pool, together):
-            entries[entry["number"]] = entry
-            _append(folder, json.dumps(entry).encode() + b"\n")
-            progress("" if entry["converged"] else "not converged")
-
-
-def _append(folder: CalibrationFolder, line: bytes) -> None:
+def _append(folder: CalibrationFolder, line: str) -> None:
     """Write a line so that it survives a crash."""
     with folder.replicates.open("ab") as file:
-        file.write(line)
+        file.write(f"{line}\n".encode())
         file.flush()
         os.fsync(file.fileno())
 
@@ -251,14 +228,14 @@ def _facts(problem: Problem, provenance: Mapping[str, Any]) -> list[tuple[str, s
         "held out": [w for validation in problem.validations.values() for w in validation.windows],
     }
     samples = [sum(w.stop - w.start for w in several) for several in windows.values()]
+    one = len(problem.records) == 1
+    voltages = {
+        "voltage" if one else f"voltage, {name}": f"{record.origin}: {record.samples} samples "
+        f"every {record.interval:g} s"
+        for name, record in problem.records.items()
+    }
     return [
-        *(
-            (
-                "voltage" if len(problem.records) == 1 else f"voltage, {name}",
-                f"{record.origin}: {record.samples} samples every {record.interval:g} s",
-            )
-            for name, record in problem.records.items()
-        ),
+        *voltages.items(),
         (", ".join(windows), ", ".join(f"{count} samples" for count in samples)),
         ("model", in_words(model)),
         ("noise", model.noise),

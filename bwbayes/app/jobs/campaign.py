@@ -9,24 +9,21 @@ how many workers a campaign is done, and records that come later are fitted by t
 from __future__ import annotations
 
 import json
-import os
 import tomllib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
 from rich.console import Console
 
 from bwbayes.app.config.config import checked, dump, load
+from bwbayes.app.jobs.batch import batch
 from bwbayes.app.problem.problem import generator
 from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_in
-from bwbayes.app.running.progress import CountProgress
 from bwbayes.app.running.record_task import SPECIMEN, Ended, fit_record
-from bwbayes.app.running.workers import executor as executor_of
-from bwbayes.app.running.workers import one_thread, side_by_side
-from bwbayes.calibration.replicates import as_done
+from bwbayes.app.running.workers import one_thread
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.population.population import FEWEST, Population, population
@@ -37,15 +34,7 @@ __all__ = ["config_text", "resume", "start"]
 
 
 def config_text(path: Path) -> str:
-    """Return the config of all records as TOML, every default explicit.
-
-    It need not name a record.
-
-    Raises
-    ------
-    InputError
-        The config cannot be read, or says what no config can say.
-    """
+    """Return the config of all records as TOML, every default explicit; it need name no record."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         record = table.setdefault("record", {})
@@ -67,22 +56,10 @@ def start(
     pictures: bool = True,
     overwrite: bool = False,
 ) -> CampaignFolder:
-    """Make the folder of a campaign, or open the same one that was begun.
+    """Make the folder ``out`` of a campaign, or open the same one that was begun.
 
-    Parameters
-    ----------
-    records
-        The folder of the records.
-    config
-        The config of all, as TOML; empty lets each record propose its own.
-    where
-        The folder that the config's files are relative to.
-    out
-        The campaign's folder.
-    pictures
-        Draw every run's figures and report, too.
-    overwrite
-        Replace a campaign that is there.
+    ``config`` is that of all ``records``, as TOML, its files relative to the folder ``where``;
+    empty lets each record propose its own. With ``pictures`` every run draws its figures and report.
 
     Raises
     ------
@@ -105,10 +82,8 @@ def resume(
 
     Parameters
     ----------
-    folder
-        The campaign's folder.
-    console
-        Where progress goes.
+    folder, console
+        The campaign's folder, and where progress goes.
     workers
         Records side by side; default: all cores. The result does not depend on it.
     executor
@@ -122,78 +97,54 @@ def resume(
         The folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        origin = folder.origin()
+        origin, config = folder.origin(), folder.config.read_text(encoding="utf-8")
         files = records_in(Path(origin.records))
-        refused = _namesakes(files)
+        stems = Counter(file.stem.lower() for file in files)
+        refused = {
+            file.name: f"{file}: shares its name with another record; rename one of them"
+            for file in files
+            if stems[file.stem.lower()] > 1
+        }
         fitted = [file for file in files if file.name not in refused]
-        missing = [file for file in fitted if not folder.is_done(file)]
+        tasks = [
+            (file, config, Path(origin.where), folder.run(file.stem).absolute(), origin.pictures)
+            for file in fitted
+            if not folder.is_done(file)
+        ]
         folder.summary.unlink(missing_ok=True)
-        if missing:
-            done = len(fitted) - len(missing)
-            refused |= _fit(folder, origin, missing, done, workers, console, executor)
+        ended: Ended
+        for ended in batch(
+            fit_record,
+            tasks,
+            lambda ended: "refused" if ended.refused else ended.short,
+            console=console,
+            kind="record",
+            done=len(fitted) - len(tasks),
+            short={"not converged": 0, "refused": 0},
+            workers=workers,
+            backend=executor,
+        ):
+            if ended.refused:
+                refused[ended.file.name] = ended.short
         console.print("combining the records ...", highlight=False)
-        campaign = _together(folder, files, refused)
+        rows = tuple(_row(folder, file, refused.get(file.name, "")) for file in files)
+        campaign = Campaign(folder, rows, _population(folder, rows))
         # Nothing in its files depends on when or how it was computed.
         save(campaign.report(), folder.path, "campaign", pictures="figures")
     return campaign
 
 
-def _namesakes(files: Sequence[Path]) -> dict[str, str]:
-    """Refuse files that would share a folder, by file name."""
-    stems = Counter(file.stem.lower() for file in files)
-    return {
-        file.name: f"{file}: shares its name with another record; rename one of them"
-        for file in files
-        if stems[file.stem.lower()] > 1
-    }
-
-
-def _fit(
-    folder: CampaignFolder,
-    origin: Origin,
-    missing: Sequence[Path],
-    done: int,
-    workers: int | None,
-    console: Console,
-    backend: str | Executor | None,
-) -> dict[str, str]:
-    """Fit records side by side, note each that is done, and return the refusals by file name."""
-    config, where = folder.config.read_text(encoding="utf-8"), Path(origin.where)
-    tasks = [
-        (file, config, where, folder.run(file.stem).absolute(), origin.pictures) for file in missing
-    ]
-    count = min(workers or os.cpu_count() or 1, len(tasks))
-    refused: dict[str, str] = {}
-    with (
-        executor_of(count, backend=backend) as pool,
-        CountProgress(
-            console, "record", done, len(missing), {"not converged": 0, "refused": 0}
-        ) as progress,
-    ):
-        outcome: Ended
-        together = side_by_side(pool, workers, len(tasks))
-        for outcome in as_done(pool, together, fit_record, tasks):
-            if outcome.refused:
-                refused[outcome.file.name] = outcome.short
-            progress("refused" if outcome.refused else outcome.short)
-    return refused
-
-
-def _together(
-    folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]
-) -> Campaign:
-    """Read what the runs have left."""
-    rows = [_row(folder, file, refused.get(file.name, "")) for file in files]
+def _population(folder: CampaignFolder, rows: Sequence[Row]) -> Population | str:
+    """Return the population of the records that have converged, or why there is none."""
     specimens = [
         Specimen.load(row.name, folder.run(row.name) / SPECIMEN) for row in rows if row.parameters
     ]
-    together: Population | str = f"a population needs {FEWEST} records or more"
-    if len(specimens) >= FEWEST:
-        try:
-            together = population(specimens, generator(1, "population"))
-        except InputError as error:
-            together = str(error)
-    return Campaign(folder, tuple(rows), together)
+    if len(specimens) < FEWEST:
+        return f"a population needs {FEWEST} records or more"
+    try:
+        return population(specimens, generator(1, "population"))
+    except InputError as error:
+        return str(error)
 
 
 def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:

@@ -20,7 +20,6 @@ from bwbayes.record import Record
 from bwbayes.report.priors import priors_table
 from bwbayes.report.report import (
     Banner,
-    Facts,
     Picture,
     Report,
     Section,
@@ -53,38 +52,44 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
     # The findings are remarks too, but here they come with what to do.
-    findings = [finding for issues in problem.findings.values() for finding in issues]
     shown = {f"{name}: {issue}" for name, issues in problem.findings.items() for issue in issues}
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
-    warnings = [*map(str, identifiability.undetermined(posterior, point))]
     explanations: list[str] = []
     for name, alone, theta in posterior.each(free):
         odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))
         explanations += lines(explained(problem, name, point.optima, thorough=odd))
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
-    items = [item.format(finding.kind, finding.text, finding.fix) for finding in findings]
+    problems = [
+        item.format(finding.kind, finding.text, finding.fix)
+        for issues in problem.findings.values()
+        for finding in issues
+    ]
+    lists = {
+        "warning": [*map(str, identifiability.undetermined(posterior, point))],
+        "note": explanations,
+    }
     nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
-    facts = [
-        (f"{subject}, {name}" if several else subject, fact)
+    about = "; ".join(
+        f"{name}: {_facts(record)}" if several else _facts(record)
         for name, record in problem.records.items()
-        for subject, fact in _facts(record)
-    ]
+    )
     name = problem.config.name or problem.record.origin
-    about = "; ".join(f"{subject} {fact}" if several else fact for subject, fact in facts)
     report = Report(
         title=f"{name}, check",
         heading=f"Check: {name}",
         about=about,
         banners=[
-            Banner("note", "Problems of the record", items=items, label="problem", name="findings")
-            if items
+            Banner("note", "Problems of the record", (), problems, (), "problem", name="findings")
+            if problems
             else Banner("good", "Nothing wrong shows", [nothing]),
             *remarks_banner(remarks),
-            *[Banner("note", "Warnings", items=warnings, label="warning")] * bool(warnings),
-            *[Banner("note", "Explanations", items=explanations, label="note")]
-            * bool(explanations),
+            *(
+                Banner("note", title, items=lists[label], label=label)
+                for title, label in (("Warnings", "warning"), ("Explanations", "note"))
+                if lists[label]
+            ),
         ],
         blocks=[
             Text(about, on="screen"),
@@ -103,7 +108,6 @@ def check(config: Config, folder: Path, out: Path) -> Report:
                 ],
                 folded=False,
             ),
-            Section("The record", [Facts(facts)], folded=False),
         ],
     )
     save(report, out, "check", pictures="figures")
@@ -128,21 +132,16 @@ def _pictures(problem: Problem) -> Iterator[Picture]:
         training = problem.posterior.alone(name).only.training
         for kind, draw in record_drawings(record, training, problem.findings[name]).items():
             title, text = captions[kind]
-            yield Picture(
-                f"{kind}_{name}" if several else kind,
-                f"{title}: {name}" if several else title,
-                text,
-                draw,
-            )
+            picture = (f"{kind}_{name}", f"{title}: {name}") if several else (kind, title)
+            yield Picture(*picture, text, draw)
 
 
-def _facts(record: Record) -> list[tuple[str, str]]:
-    """Return what a record is, by subject."""
+def _facts(record: Record) -> str:
+    """Say what a record is."""
     low, high = record.range_voltage
     missing = record.samples - record.readings
-    return [
-        ("origin", record.origin),
-        ("samples", f"{record.samples} samples every {record.interval:g} s"),
-        ("voltage", f"{low:.4g} to {high:.4g} V ({record.voltage_is})"),
-        ("readings", f"{record.readings} readings" + (f", {missing} missing" if missing else "")),
-    ]
+    return (
+        f"{record.origin}; {record.samples} samples every {record.interval:g} s; "
+        f"{low:.4g} to {high:.4g} V ({record.voltage_is}); {record.readings} readings"
+        + (f", {missing} missing" if missing else "")
+    )

@@ -3,7 +3,7 @@
 :func:`compare` takes fits that exist, :func:`open_runs` those in folders. :func:`compare_models`
 runs a config with several models side by side, each into a folder of its own, and goes on with
 those that are there already. All are screened by their MAP estimates first; only what is within
-reach is sampled.
+reach is sampled. Their options are those of :func:`bwbayes.compare`.
 """
 
 from __future__ import annotations
@@ -51,9 +51,6 @@ if TYPE_CHECKING:
 
 __all__ = ["by_name", "compare", "compare_models", "open_runs"]
 
-# Nats of evidence and of likelihood by which a model may be behind at its MAP estimate.
-REACH = 30.0
-
 
 def open_runs(folders: Sequence[Path]) -> dict[str, Fit]:
     """Return the fits of the runs in folders, by the folders' names.
@@ -68,8 +65,7 @@ def open_runs(folders: Sequence[Path]) -> dict[str, Fit]:
     names = [folder.name for folder in folders]
     if len(set(names)) < len(names):
         names = [str(folder) for folder in folders]
-    fits = [finished(RunFolder.open(folder)) for folder in folders]
-    return dict(zip(names, fits, strict=True))
+    return {name: finished(RunFolder.open(path)) for name, path in zip(names, folders, strict=True)}
 
 
 def by_name(named: Iterable[tuple[str, Fit]]) -> dict[str, Fit]:
@@ -88,39 +84,24 @@ def compare(
     workers: int | None = None,
     executor: Any = None,
 ) -> Comparison:
-    """Compare fits of the same readings.
-
-    Parameters
-    ----------
-    fits
-        The fits, of different models, by name.
-    console
-        Where progress goes, if anywhere.
-    future
-        Whether to score the later half of the training readings too, given the earlier half, which
-        takes a short fit.
-    workers
-        Ensembles of those side by side; by default one a core.
-    executor
-        Where they run, as in :func:`bwbayes.fit`.
+    """Compare fits of the same readings, of different models, by name.
 
     Raises
     ------
     InputError
         Fits of different readings: their numbers would not be about the same thing.
     """
+    console = console or Console(quiet=True)
     first, *others = fits
     for name in others:
         _require_same(f"compare: {first} and {name}", fits[first].problem, fits[name].problem)
     candidates = []
     for name, fit in fits.items():
-        if console is not None and not console.quiet:
-            console.print(f"judging {name} ...", highlight=False)
+        console.print(f"judging {name} ...", highlight=False)
         with one_thread(), executor_of(workers, fit.problem.posterior.engine, executor) as pool:
             candidate = _candidate(name, fit, pool, future=future)
-        if fit.converged:
-            candidate = replace(candidate, standing=fit.standing)
-        candidates.append(candidate)
+        standing = fit.standing if fit.converged else None
+        candidates.append(replace(candidate, standing=standing))
     return _comparison(fits[first].problem, candidates)
 
 
@@ -138,30 +119,17 @@ def compare_models(
     files: bool = True,
     workers: int | None = None,
     executor: Any = None,
+    reach: float = 30.0,
 ) -> Comparison:
     """Run a config with each of the models, in folders below ``out``, and compare them.
 
     The config's files are relative to the folder ``where``; ``in_memory`` are its records that are
     not in files. Runs that are there already, of the same config, are resumed, and those that are
-    finished are taken as they are. Only the recommended model's run is validated and gets its
-    report; ``bwbayes resume FOLDER`` does the same for another one.
-
-    Parameters
-    ----------
-    config, where, models, out, console, in_memory, overwrite
-        See above.
-    screen
-        Whether to leave out what is out of reach by Laplace's evidence at the MAP estimate, and by
-        the likelihood there: by both, so that no prior's width decides.
-    future
-        As in :func:`compare`.
-    files
-        Whether to write the files of the recommended model's run.
-    workers
-        Models side by side, in processes if more than one; by default as many as cores.
-    executor
-        Where they run, as in :func:`bwbayes.fit`. The machines of a cluster must all see the folder
-        ``out`` by the same path.
+    finished are taken as they are. A model is not sampled that is behind at its MAP estimate by
+    more than ``reach``, nats, in evidence and in likelihood: in both, so that no prior's width
+    decides. Only the recommended model's run is validated and gets its report (and its ``files``);
+    ``bwbayes resume FOLDER`` does the same for another one. The machines of a cluster must all see
+    the folder ``out`` by the same path.
 
     Raises
     ------
@@ -176,15 +144,14 @@ def compare_models(
     count = min(workers or os.cpu_count() or 1, len(models))
     with one_thread(), executor_of(count, backend=executor) as pool:
         together = side_by_side(pool, workers, len(models))
-        if not console.quiet:
-            console.print(f"screening {len(models)} models ...", highlight=False)
+        console.print(f"screening {len(models)} models ...", highlight=False)
         screened = as_done(pool, together, _screened, folders.items())
         candidates = {candidate.name: candidate for candidate in screened}
         criteria = {
             name: np.array([candidate.log_evidence, candidate.log_likelihood], dtype=np.float64)
             for name, candidate in candidates.items()
         }
-        within_reach = np.max([*criteria.values()], axis=0) - REACH
+        within_reach = np.max([*criteria.values()], axis=0) - reach
         runs = (
             (name, folders[name], future)
             for name, values in criteria.items()
@@ -192,8 +159,7 @@ def compare_models(
         )
         for candidate in as_done(pool, together, _sampled, runs):
             candidates[candidate.name] = candidate
-            if not console.quiet:
-                console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
+            console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
         problem = next(iter(folders.values())).problem()
         comparison = _comparison(problem, [candidates[name] for name in folders])
         best = comparison.recommended
@@ -211,33 +177,29 @@ def _require_same(pair: str, first: Problem, other: Problem) -> None:
             f"{pair}: fitted to different records, or in different units; compare fits of one "
             "record, with the same readings left out"
         )
-    windows, other_windows = (
-        [dataset.training for dataset in problem.posterior.datasets] for problem in (first, other)
-    )
-    if windows != other_windows:
+    windows, held_out = [], []
+    for problem in (first, other):
+        windows.append([dataset.training for dataset in problem.posterior.datasets])
+        held_out.append(
+            {
+                (
+                    name,
+                    v.windows,
+                    v.record and v.record.sha256,
+                    replace(v.start, hold=None),
+                    v.judged,
+                    v.of,
+                )
+                for name, v in problem.validations.items()
+            }
+        )
+    if windows[0] != windows[1]:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
-    held_out, other_held_out = (
-        {
-            name: (
-                validation.windows,
-                validation.record and validation.record.sha256,
-                replace(validation.start, hold=None),
-                validation.judged,
-                validation.of,
-            )
-            for name, validation in problem.validations.items()
-        }
-        for problem in (first, other)
-    )
-    names = [
-        key
-        for key in {**held_out, **other_held_out}
-        if held_out.get(key) != other_held_out.get(key)
-    ]
-    if names:
+    different = {str(validation[0]) for validation in held_out[0] ^ held_out[1]}
+    if different:
         raise InputError(
-            f"{pair}: differ in what is held out ({', '.join(names)}); give both the same "
-            "[validation]"
+            f"{pair}: differ in what is held out ({', '.join(sorted(different))}); give both the "
+            "same [validation]"
         )
 
 
@@ -250,7 +212,7 @@ def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison
     ]
     facts.append(("readings fitted", str(candidates[0].readings)))
     facts.append(("held out", ", ".join(problem.validations) or "nothing"))
-    return replace(recommend(candidates), facts=tuple(facts))
+    return recommend(candidates, facts)
 
 
 def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidate:
@@ -260,26 +222,25 @@ def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidat
     if not fit.converged:
         return plain
     sampled, density = draws(posterior, fit.chain), log_densities(fit.chain)
-    flat = sampled.reshape(-1, sampled.shape[-1])
-    predicted = predictions(problem, flat, training=False)
-    bands = tuple(prediction for prediction in predicted if prediction.measured is not None)
-    full = max(dataset.extent for dataset in posterior.datasets)
+    flat = fit.flat_draws
+    bands = [
+        prediction
+        for prediction in predictions(problem, flat, training=False)
+        if prediction.measured is not None
+    ]
     windows = {record: problem.held_out(record) for record in problem.records}
     rng = generator(seed, "future")
     parts = leave_future_out(posterior, problem.plan, flat, windows, rng, pool, future=future)
-    others = {
-        prediction.name: bands_part(prediction, judged(prediction))
-        for prediction in bands
-        if problem.validations[prediction.name].record is not None
-    }
+    for prediction in bands:
+        part = bands_part(prediction, judged(prediction))
+        if part is not None and problem.validations[prediction.name].record is not None:
+            parts[prediction.name] = part
+    extent = max(dataset.extent for dataset in posterior.datasets)
     return replace(
         plain,
-        held_out=bands,
-        scores={
-            prediction.name: score(prediction, scoring(seed, prediction), full)
-            for prediction in bands
-        },
-        parts=parts | {name: scores for name, scores in others.items() if scores is not None},
+        held_out=tuple(bands),
+        scores={p.name: score(p, scoring(seed, p), extent) for p in bands},
+        parts=parts,
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
     )
 

@@ -153,23 +153,21 @@ def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> R
             if name not in options:
                 raise InputError(f"{requested}: has no {name}; give it, in {unit}")
         return shaped(requested, **{"interval": interval, **options})
-    kind, allowed = "displacements take", ["smoothed", "interval"]
-    if isinstance(requested, Reference):
-        kind, allowed = "one that is made already takes", []
-    elif isinstance(requested, str | Path):
-        kind, allowed = "a file takes", ["smoothed"]
-    for name in set(options) - set(allowed):
+    is_file, is_made = isinstance(requested, str | Path), isinstance(requested, Reference)
+    kind, allowed = "displacements take", {"smoothed", "interval"}
+    if is_made or is_file:
+        kind = "one that is made already takes" if is_made else "a file takes"
+        allowed = {"smoothed"} if is_file else set()
+    for name in options.keys() - allowed:
         raise InputError(f"reference: {kind} no {name}; leave it out, or give one of {shapes}")
     if isinstance(requested, Reference):
         return requested
     smoothed = options.get("smoothed", 0.0)
-    if isinstance(requested, str | Path):
+    if is_file:
         path = Path(requested)
         if isinstance(requested, str) and not path.suffix and not path.exists():
-            raise InputError(
-                f"reference: {requested!r} is neither a shape nor a file; "
-                f"{suggestion(requested, SHAPES)}"
-            )
+            hint = suggestion(requested, SHAPES)
+            raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
         values, interval = read_reference(path)
         return Reference(values, interval, path.stem, smoothed)
     try:
@@ -177,8 +175,8 @@ def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> R
     except (TypeError, ValueError):
         values = np.empty(())
     if values.ndim == 0:
+        given = type(requested).__name__
         raise InputError(
-            f"reference: {type(requested).__name__} is none; give one of {shapes}, a file, or "
-            "displacements in um"
+            f"reference: {given} is none; give one of {shapes}, a file, or displacements in um"
         )
     return Reference(values, options.get("interval", interval), smoothed=smoothed)

@@ -40,7 +40,7 @@ from bwbayes.record.waveforms import (
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["amplifier_of", "candidates_of", "design", "liveliest"]
+__all__ = ["candidates_of", "design", "liveliest"]
 
 
 def design(
@@ -84,21 +84,20 @@ def design(
         none that the amplifier can make.
     """
     problem = fit.problem
-    amplifier = amplifier_of(problem, voltage, slew, current, capacitance)
-    signals = candidates_of(candidates, problem, amplifier)
-    drive = None if isinstance(target, str) else "a voltage"
-    quantity: str | FloatArray
-    if isinstance(target, str):
-        quantity = target
-    elif isinstance(target, Path):
-        quantity, drive = _drive(str(target), problem), str(target)
-    else:
-        quantity = np.asarray(target, dtype=np.float64)
+    low, high = voltage or limits_of(problem, None)
+    amplifier = Limits(low, high, np.inf if slew is None else slew, current, capacitance)
     # Of several records, what all of them taught of the actuator, seen from one.
-    name = liveliest(problem)
+    record = liveliest(problem)
+    signals = candidates_of(candidates, problem.records[record], amplifier)
+    is_parameter = isinstance(target, str)
+    quantity: str | FloatArray
+    if isinstance(target, Path):
+        quantity = _drive(str(target), problem.records[record].interval)
+    else:
+        quantity = target if isinstance(target, str) else np.asarray(target, dtype=np.float64)
     promises = rank(
-        problem.posterior.alone(name),
-        problem.posterior.select_draws(fit.flat_draws, name),
+        problem.posterior.alone(record),
+        problem.posterior.select_draws(fit.flat_draws, record),
         signals,
         quantity,
         amplifier,
@@ -112,10 +111,10 @@ def design(
     return Design(
         fit.folder.path.name,
         target if isinstance(target, str) else None,
-        drive,
+        None if is_parameter else str(target) if isinstance(target, Path) else "a voltage",
         amplifier,
         signals,
-        problem.records[name].interval,
+        problem.records[record].interval,
         fit.standing,
         promises,
     )
@@ -126,22 +125,10 @@ def liveliest(problem: Problem) -> str:
     return max(problem.records, key=lambda name: turning_points(problem.records[name].voltage).size)
 
 
-def amplifier_of(
-    problem: Problem,
-    voltage: tuple[float, float] | None,
-    slew: float | None,
-    current: float | None,
-    capacitance: float | None,
-) -> Limits:
-    """Return the amplifier; by default with the voltages that were fitted alone."""
-    low, high = limits_of(problem, None) if voltage is None else voltage
-    return Limits(low, high, np.inf if slew is None else slew, current, capacitance)
-
-
 def candidates_of(
-    candidates: Mapping[str, ArrayLike] | str | Path, problem: Problem, amplifier: Limits
+    candidates: Mapping[str, ArrayLike] | str | Path, record: Record, amplifier: Limits
 ) -> dict[str, FloatArray]:
-    """Return the candidates' voltages (samples,) by name, V, at the liveliest record's interval.
+    """Return the candidates' voltages (samples,) by name, V, at a record's interval.
 
     Raises
     ------
@@ -150,7 +137,6 @@ def candidates_of(
     """
     if not isinstance(candidates, str | Path):
         return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}
-    record = problem.records[liveliest(problem)]
     standard = str(candidates) == "standard"
     waveforms = _preset(record, amplifier) if standard else _from_file(Path(candidates))
     return {name: waveform.sample(1 / record.interval)[1] for name, waveform in waveforms.items()}
@@ -191,36 +177,32 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
 
 def _from_file(path: Path) -> dict[str, Waveform]:
     """Read a table for each signal."""
+    name = ""
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        if not tables:
+            raise InputError("has no candidate; write a table for each signal")
+        waveforms = {}
+        for name, table in tables.items():
+            waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
+    except ValidationError as error:
+        raise InputError(one_line(f"{path}: {name}", error, SignalConfig)) from None
+    except InputError as error:
+        raise InputError(": ".join(filter(None, [str(path), name, str(error)]))) from None
     except OSError as error:
         reason = f'{error.strerror}; give a file of candidates, or "standard"'
         raise InputError(f"{path}: {reason}") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: invalid TOML: {error}; correct the file") from None
-    if not tables:
-        raise InputError(f"{path}: has no candidate; write a table for each signal")
-    waveforms = {}
-    for name, table in tables.items():
-        try:
-            waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
-        except ValidationError as error:
-            raise InputError(one_line(f"{path}: {name}", error, SignalConfig)) from None
-        except InputError as error:
-            raise InputError(f"{path}: {name}: {error}") from None
     return waveforms
 
 
-def _drive(name: str, problem: Problem) -> FloatArray:
-    """Return the voltage of a signal's name or of a record's file, at the liveliest's interval."""
-    interval = problem.records[liveliest(problem)].interval
+def _drive(name: str, interval: float) -> FloatArray:
+    """Return the voltage of a signal's name or of a record's file, at an interval."""
     if name in signal_names():
         return signal(name).sample(1 / interval)[1]
     record = read_record(Path(name), need_displacement=False)
     if np.isclose(record.interval, interval, rtol=1e-6):
         return record.voltage
-    times = np.arange(0.0, record.duration, interval)
-    voltage: FloatArray = np.interp(
-        times, record.interval * np.arange(record.samples), record.voltage
-    )
-    return voltage
+    samples = np.arange(0.0, record.duration, interval) / record.interval
+    return np.interp(samples, np.arange(record.samples), record.voltage)

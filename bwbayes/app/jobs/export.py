@@ -26,9 +26,6 @@ __all__ = ["FILES", "at_rate", "export"]
 
 FILES = ("model.json", "actuator.c")
 
-# Fastest sampling of a controller, Hz.
-LARGEST_RATE = 1e7
-
 
 def export(
     fit: Fit,
@@ -47,7 +44,8 @@ def export(
     Parameters
     ----------
     fit
-        What is built on; of several records the first.
+        What is built on; of several records the first, as what belongs to a record matters little
+        to a controller.
     folder
         Where the files go.
     voltage
@@ -68,11 +66,9 @@ def export(
         A hysteresis that has no step of bounded time, options that make no sense, or files that
         exist or cannot be written.
     """
-    problem, flat = fit.problem, fit.flat_draws
-    posterior = problem.posterior
-    # Of several records the first: what belongs to a record matters little to a controller.
-    dataset = posterior.datasets[0]
-    theta = dataset.table.actuator(posterior.table.of(posterior.prior.theta(flat), dataset.name))
+    problem, posterior = fit.problem, fit.problem.posterior
+    dataset, theta = posterior.datasets[0], posterior.prior.theta(fit.flat_draws)
+    theta = dataset.table.actuator(posterior.table.of(theta, dataset.name))
     actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
@@ -91,14 +87,14 @@ def export(
 
 
 def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
-    """Return an actuator at a controller's pace: so many samples a second, with this hold.
+    """Return an actuator at a controller's pace: samples a second up to 10 MHz, with this hold.
 
     Raises
     ------
     InputError
         A rate that is not above zero, or is too high.
     """
-    if rate is not None and not 0 < rate <= LARGEST_RATE:
-        raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {LARGEST_RATE:g}")
+    if rate is not None and not 0 < rate <= 1e7:
+        raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {1e7:g}")
     interval = actuator.interval if rate is None else 1 / rate
     return replace(actuator, interval=interval, hold=hold)

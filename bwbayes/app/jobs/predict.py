@@ -90,7 +90,7 @@ def predict(
         )
     problem, of = fit.problem, training_record(fit.problem, of)
     if signal is not None:
-        interval = problem.records[of].interval
+        name, interval = name or signal, problem.records[of].interval
         voltage = named_signal(signal).sample(1 / interval)[1]
         if after and window is not None:
             raise InputError(
@@ -98,16 +98,15 @@ def predict(
                 "predicted whole"
             )
         if after:
-            return predict_after(problem, fit.flat_draws, voltage, name or signal, of)
-        name, record = name or signal, Record(voltage, None, interval, origin=f"{signal} signal")
+            return predict_after(problem, fit.flat_draws, voltage, name, of)
+        record = Record(voltage, None, interval, origin=f"{signal} signal")
     elif not isinstance(record, Record):
         name = name or Path(str(record)).stem
         record = read_record(str(record), need_displacement=False)
-    model_hold = problem.config.model.hold
-    hold = None if model_hold == "auto" else model_hold
-    start = Start(from_rest, own_offset, lead_in, lead_in_from, hold, after)
-    name = name or "prediction"
-    return predict_another(problem, fit.flat_draws, record, start, name, window, of)
+    hold = problem.config.model.hold
+    known = None if hold == "auto" else hold
+    start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
+    return predict_another(problem, fit.flat_draws, record, start, name or "prediction", window, of)
 
 
 def prediction_notes(prediction: Prediction) -> list[str]:

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["track"]
 
-# Longest delay, samples.
-LONGEST_DELAY = 100
-
 
 def track(
     fit: Fit,
@@ -73,31 +70,26 @@ def track(
     InputError
         A model that cannot be stepped or inverted, or options that make no sense.
     """
-    if not 0 <= delay <= LONGEST_DELAY:
-        raise InputError(f"delay: {delay} samples; give 0 to {LONGEST_DELAY}")
+    if not 0 <= delay <= 100:
+        raise InputError(f"delay: {delay} samples; give 0 to 100")
     if draws < 2:
         raise InputError(f"draws: {draws} say nothing of how sure one may be; give more")
-    robustness = Robustness(gain_margin, phase_margin)
-    problem, seed = fit.problem, fit.problem.config.seed
-    posterior = problem.posterior
-    # Of several records the first: what belongs to a record matters little to a controller.
+    problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
     dataset = posterior.datasets[0]
-    thinned_draws = thinned(fit.flat_draws, generator(seed, "draws"))
-    theta = posterior.table.of(posterior.prior.theta(thinned_draws), dataset.name)
-    simulated = theta[:draws]
+    free = thinned(fit.flat_draws, generator(seed, "draws"))
+    theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.alone(dataset.name)
-    parameters = alone.noise_of_new(simulated, generator(seed, "noise"))
+    parameters = alone.noise_of_new(theta[:draws], generator(seed, "noise"))
     discrepancy, sensor = dataset.noise.marginal_sd(parameters)
     memory = dataset.noise.correlation_time(parameters)
-    # A white noise has no discrepancy, so that any time will do.
-    noise = LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0))
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),
-        dataset.table.actuator(simulated),
-        noise,
+        dataset.table.actuator(theta[:draws]),
+        # A white noise has no discrepancy, so that any time will do.
+        LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0)),
         Stand(command_limits(problem, voltage), delay),
         generator(seed, "track"),
-        robustness=robustness,
+        robustness=Robustness(gain_margin, phase_margin),
         frequencies=frequencies or None,
         amplitude=amplitude,
         all_theta=dataset.table.actuator(theta),
