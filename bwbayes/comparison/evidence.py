@@ -104,8 +104,7 @@ def evidence(
     except np.linalg.LinAlgError:  # too few draws
         highest = float(np.max(log_likelihood))
         return Evidence(np.nan, np.inf, mass, 0.0, max_log_likelihood=highest)
-    size = log_density[:, half:].size
-    thin = max(size // MAX_DRAWS, 1)
+    thin = max(log_density[:, half:].size // MAX_DRAWS, 1)
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))

@@ -80,16 +80,12 @@ def leave_future_out(
 
     Parameters
     ----------
-    posterior, plan
-        What was fitted, and how.
-    flat
-        (draws, free) its draws, parameters in their own units.
+    posterior, plan, flat
+        What was fitted, and how; its draws (draws, free), parameters in their own units.
     held_out
         Windows by their names, by the names of the training records.
-    rng
-        Starts fits, chooses draws.
-    executor
-        Runs the ensembles.
+    rng, executor
+        Starts fits, chooses draws; runs the ensembles.
     future
         Whether to score the later half of the training readings, given the earlier one, which
         takes a fit to the earlier one.

@@ -59,7 +59,7 @@ def start(
     """Make the folder ``out`` of a campaign, or open the same one that was begun.
 
     ``config`` is that of all ``records``, as TOML, its files relative to the folder ``where``;
-    empty lets each record propose its own. With ``pictures`` every run draws its figures and report.
+    empty lets each record propose its own. With ``pictures`` every run has figures and report.
 
     Raises
     ------
