@@ -18,6 +18,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
+from bwbayes.app.jobs.batch import batch
 from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.campaign_folder import CampaignFolder
@@ -129,7 +130,6 @@ def test_a_finished_campaign_fits_nothing_again(
 ) -> None:
     shutil.copytree(whole, tmp_path / "batch")
     asked: list[list[str]] = []
-    batch = module.batch
 
     def noted(call: Any, tasks: list[tuple[Path, Any]], *rest: Any, **options: Any) -> Any:
         asked.append([file.stem for file, *_ in tasks])
@@ -270,30 +270,30 @@ def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> No
         "walkers": 12,
     }
     keys |= {"block": 20, "pilot_steps": 60, "parameters": tomllib.loads(CONFIG)["parameters"]}
-    batch = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
-    assert ["r0", "r1", "r2"] == list(batch.table.index)
-    assert {"d", "alpha"} == set(batch.population.parameters)
-    assert {"d", "alpha"} == set(batch.population.to_pandas().index)  # type: ignore[attr-defined]
-    assert ({}, {}) == (batch.short, batch.outliers)
-    assert batch.fit("r1").converged
+    campaign = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
+    assert ["r0", "r1", "r2"] == list(campaign.table.index)
+    assert {"d", "alpha"} == set(campaign.population.parameters)
+    assert {"d", "alpha"} == set(campaign.population.to_pandas().index)  # type: ignore[attr-defined]
+    assert ({}, {}) == (campaign.short, campaign.outliers)
+    assert campaign.fit("r1").converged
     # A specimen that was not measured is less sure than one that was.
     planned = replace(record(9), displacement=None)
-    bands = batch.predict(planned, from_rest=True)
-    own = batch.fit("r1").predict(planned, from_rest=True)
+    bands = campaign.predict(planned, from_rest=True)
+    own = campaign.fit("r1").predict(planned, from_rest=True)
     wide, narrow = (
         np.mean(b.upper["parameter", 95] - b.lower["parameter", 95]) for b in (bands, own)
     )
     assert wide > 5 * narrow
-    assert "3 records: 3 passed" == repr(batch)
-    assert batch.plot().axes
+    assert "3 records: 3 passed" == repr(campaign)
+    assert campaign.plot().axes
 
 
 def test_python_warns_of_what_is_short(tmp_path: Path) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records/broken.csv").write_text(BROKEN)
     with pytest.warns(InputWarning, match="broken: refused: broken.csv:2"):
-        batch = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
+        campaign = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
     with pytest.raises(InputError, match="no population: a population needs 3 records or more"):
-        _ = batch.population
+        _ = campaign.population
     with pytest.raises(InputError, match="either config or keys"):
         bw.campaign(tmp_path / "records", config="x.toml", dynamics="none")
