@@ -288,18 +288,18 @@ def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path
     plain = compare_models(config, ROOT, alone, tmp_path / "plain", quiet)["bouc-wen"].mean
     assert chosen is not None
     assert plain is not None
-    narrower = 1 - chosen.width_um / plain.width_um
+    narrower = 1 - chosen["width_um"] / plain["width_um"]
     keep(
         "models of the measured stack",
         {
             "recommended": made.recommended,
             "tied": list(made.tied),
-            "nrmse_percent": round(100 * chosen.nrmse, 3),
+            "nrmse_percent": round(100 * chosen["nrmse"], 3),
             "narrower_percent": round(100 * narrower),
             "minutes": round(minutes, 1),
         },
     )
-    assert chosen.nrmse <= 0.0042
+    assert chosen["nrmse"] <= 0.0042
     assert narrower >= 0.35
     # Plain Bouc-Wen, and a model without hysteresis, are told apart from it.
     assert not {"bouc-wen", "linear"} & set(made.tied)
