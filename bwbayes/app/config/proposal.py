@@ -13,6 +13,7 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -99,81 +100,71 @@ def _text(
     path: Path, where: Path, naming: Naming, record: Record, findings: tuple[Finding, ...]
 ) -> str:
     """Write the config."""
-    lines: dict[str, list[str]] = {"record": [], "model": []}
-    notes = []
+    notes, fixes = [], {"record": "", "model": ""}
     for finding in findings:
         notes.append(f"# {finding.kind}: {finding.text}")
         fix = re.fullmatch(r"(\w+ = .+) under \[(record|model)\]", finding.fix)
         if fix:
-            lines[fix[2]].append(f"{fix[1]}  # {finding.kind}")
+            fixes[fix[2]] += f"{fix[1]}  # {finding.kind}\n"
         else:
             notes.append(f"#   fix: {finding.fix}")
     held = _held_out(record)
     # No fit sets aside the spikes that are held out.
     spikes = [s for s in isolated_outliers(record).tolist() for w in held if w.start <= s < w.stop]
-    if spikes and not any(line.startswith("exclude") for line in lines["record"]):
+    if spikes and "\nexclude" not in f"\n{fixes['record']}":
         windows = _windows(record, [slice(s, s + 1) for s in spikes])
-        lines["record"].append(f"exclude = {windows}  # spikes in the part that is held out")
-    first, stop = _span(record)
-    edges = [first, *(edge for window in held for edge in (window.start, window.stop)), stop]
+        fixes["record"] += f"exclude = {windows}  # spikes in the part that is held out\n"
+    first, last = np.flatnonzero(record.has_reading)[[0, -1]].tolist()
+    edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last + 1]
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-    file = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
-    lines["record"] = [
-        f"file = {_quoted(file)}",
-        *_columns(naming),
-        f"train = {_windows(record, train)}  # s: fitted",
-        *lines["record"],
-        _start(record),
-    ]
+    # A JSON string is a TOML string too, except for DEL, which no column's name has.
+    quoted = partial(json.dumps, ensure_ascii=False)
+    source = f"file = {quoted(Path(os.path.relpath(path.absolute(), where.absolute())).as_posix())}"
+    for key, table in (("columns", naming.columns), ("units", naming.units)):
+        if table:
+            pairs = ", ".join(f"{quantity} = {quoted(name)}" for quantity, name in table.items())
+            source += f"\n{key} = {{ {pairs} }}"
+    source += "" if naming.fs is None else f"\nfs = {naming.fs!r}"
+    command = ""
     if naming.units.get("voltage") is None and record.voltage_is == "output":
-        lines["record"].append(
+        command = (
             '# voltage_is = "command"  # if a DAC holds the voltage between samples; it is taken '
-            "for measured"
+            "for measured\n"
         )
-    others = ", ".join(_quoted(name) for name in DYNAMICS if name != "lag")
-    ending = [
-        "# Too little of the record can be left out of the fit to hold bands against it:",
-        "# [validation.another]",
-        '# file = "another.csv"',
-    ]
-    if held:
-        ending = [
-            "[validation.held_out]",
-            f"window = {_windows(record, held)}  # s: held out, used to validate the bands",
-        ]
-    written = [
-        *_ranges(record),
-        *(notes or ["# No issues found."]),
-        "",
-        "[record]",
-        *lines["record"],
-        "",
-        "[model]",
-        f'dynamics = "lag"  # or {others}',
-        *lines["model"],
-        "",
-        "# Priors come from the record's ranges; `bwbayes check` shows them. To say more:",
-        "# [parameters]",
-        '# d = { prior = { distribution = "normal", mean = 0.7, sd = 0.07 } }',
-        "",
-        "# [sampling]",
-        "# ess = 2000  # effective draws of every parameter",
-        "",
-        *ending,
-    ]
-    return "\n".join(written) + "\n"
-
-
-def _ranges(record: Record) -> list[str]:
-    low, high = record.range_voltage
+    ending = f"[validation.held_out]\nwindow = {_windows(record, held)}"
+    ending += "  # s: held out, used to validate the bands"
+    if not held:
+        ending = """\
+# Too little of the record can be left out of the fit to hold bands against it:
+# [validation.another]
+# file = "another.csv\""""
     assert record.displacement is not None
+    low, high = record.range_voltage
     missing = record.samples - record.readings
-    return [
-        f"# {record.origin}: {record.samples} samples every {record.interval:g} s from "
-        f"{record.start:g} s on" + (f", {missing} readings missing" if missing else ""),
-        f"# voltage {low:.4g} to {high:.4g} V, displacement {np.nanmin(record.displacement):.4g} "
-        f"to {np.nanmax(record.displacement):.4g} um",
-    ]
+    return f"""\
+# {record.origin}: {record.samples} samples every {record.interval:g} s from \
+{record.start:g} s on{f", {missing} readings missing" if missing else ""}
+# voltage {low:.4g} to {high:.4g} V, displacement {np.nanmin(record.displacement):.4g} \
+to {np.nanmax(record.displacement):.4g} um
+{chr(10).join(notes or ["# No issues found."])}
+
+[record]
+{source}
+train = {_windows(record, train)}  # s: fitted
+{fixes["record"]}{_start(record)}
+{command}
+[model]
+dynamics = "lag"  # or {", ".join(quoted(name) for name in DYNAMICS if name != "lag")}
+{fixes["model"]}
+# Priors come from the record's ranges; `bwbayes check` shows them. To say more:
+# [parameters]
+# d = {{ prior = {{ distribution = "normal", mean = 0.7, sd = 0.07 }} }}
+
+# [sampling]
+# ess = 2000  # effective draws of every parameter
+
+{ending}
+"""
 
 
 def _start(record: Record) -> str:
@@ -189,32 +180,16 @@ def _start(record: Record) -> str:
     )
 
 
-def _columns(naming: Naming) -> list[str]:
-    """Write which columns are meant, and their units."""
-    lines = [
-        f"{key} = {{ {', '.join(f'{q} = {_quoted(name)}' for q, name in table.items())} }}"
-        for key, table in (("columns", naming.columns), ("units", naming.units))
-        if table
-    ]
-    return lines if naming.fs is None else [*lines, f"fs = {naming.fs!r}"]
-
-
-def _span(record: Record) -> tuple[int, int]:
-    """Return the first sample with a reading, and that after the last one."""
-    first, last = np.flatnonzero(record.has_reading)[[0, -1]]
-    return int(first), int(last) + 1
-
-
 def _held_out(record: Record) -> list[slice]:
     """Return the windows of a quarter of the record whose drive is as the rest's, if there are any.
 
     A quarter of the whole record, or of each of so many equal parts: the fewest windows that are
     alike to 0.15, or else those that come nearest to it.
     """
-    first, stop = _span(record)
+    first, last = np.flatnonzero(record.has_reading)[[0, -1]].tolist()
     candidates = []
     for parts, begin in product((1, 2, 3, 4, 5, 6, 8), (0.75, 0.625, 0.5)):
-        edges = first + (stop - first) / parts * np.add.outer(
+        edges = first + (last + 1 - first) / parts * np.add.outer(
             np.arange(parts), [begin, begin + 0.25]
         )
         windows = [slice(*edge) for edge in np.rint(edges).astype(np.int64).tolist()]
@@ -256,8 +231,3 @@ def _windows(record: Record, windows: list[slice]) -> str:
     digits = decimals_of(record.interval) + 1
     edges = [[record.start + record.interval * s for s in (w.start, w.stop)] for w in windows]
     return str([[round(edge, digits) for edge in window] for window in edges])
-
-
-def _quoted(text: str) -> str:
-    # A JSON string is a TOML string too, except for DEL, which no column's name has.
-    return json.dumps(text, ensure_ascii=False)
