@@ -276,7 +276,7 @@ def test_replicates_of_nothing_or_of_another_config_are_refused(
 def test_nothing_of_an_earlier_end_stays_when_it_goes_on(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     shutil.copytree(whole, tmp_path / "a")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bwbayes.app.problem.problem import resolve
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
@@ -125,13 +126,14 @@ def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
 
 
 def test_check_says_what_is_wrong_and_what_to_do(bwbayes: Type, tmp_path: Path) -> None:
-    assert 0 == bwbayes("simulate", "good.csv", "--rate", "50", "--discrepancy", "none").status
-    record = read_record(tmp_path / "good.csv")
+    record = resolve(small.config(), tmp_path).record
     assert record.displacement is not None
     spoilt = record.displacement.copy()
-    spoilt[700] += 60.0
+    spoilt[120] += 60.0
     write_record(replace(record, displacement=spoilt), tmp_path / "a.h5")
-    (tmp_path / "a.toml").write_text('[record]\nfile = "a.h5"\n[model]\ndynamics = "none"\n')
+    parameters = "[parameters]\ninitial = { fixed = 0.0 }\ngamma = { fixed = 0.0172 }\n"
+    model = '[model]\ndynamics = "none"\nnoise = "white"\n'
+    (tmp_path / "a.toml").write_text(f'[record]\nfile = "a.h5"\n{model}{parameters}')
     said = bwbayes("check", "a.toml", "--out", "page")
     assert 0 == said.status
     assert "spikes: 1 isolated outlier" in said.out
