@@ -125,7 +125,11 @@ def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
     assert "550 samples" in bwbayes("check", "small.toml", "--record", "a.csv").out
 
 
-def test_check_says_what_is_wrong_and_what_to_do(bwbayes: Type, tmp_path: Path) -> None:
+def test_check_says_what_is_wrong_and_what_to_do(
+    bwbayes: Type, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # Explanations, which take long where there is something odd, are tested by themselves.
+    monkeypatch.setattr("bwbayes.app.jobs.check.explained", lambda *_, **__: ())
     record = resolve(small.config(), tmp_path).record
     assert record.displacement is not None
     spoilt = record.displacement.copy()
