@@ -140,12 +140,6 @@ class Experiment:
                 return data.name, path
         return None
 
-    @property
-    def level(self) -> float:
-        """Voltage at which loops are measured, V."""
-        assert self.looped is not None
-        return crossings(self.looped[1])[0]
-
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
         """Log likelihood and the two loop measures of models θ, (models, 3).
 

@@ -20,7 +20,6 @@ from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
-from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.grid import decimals_of
 
@@ -160,22 +159,3 @@ def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: f
     for values in (voltage, rates):
         assert stats.ks_2samp(values[held], values[~held]).statistic < 0.2
         assert np.ptp(values[held]) > 0.7 * np.ptp(values)
-
-
-@pytest.mark.parametrize(
-    ("window", "gone"),
-    [
-        ((1.60, 1.67), [1.60, 1.65]),
-        ((1.63, 1.67), [1.60, 1.65]),
-        ((1.60, 1.65), [1.60]),
-        ((1.61, 1.62), [1.60]),
-        ((0.0, 0.05), [0.0]),
-    ],
-)
-def test_exclude_takes_every_sample_that_it_touches(
-    window: tuple[float, float], gone: list[float]
-) -> None:
-    time = 0.05 * np.arange(100)
-    record = Record(np.sin(time), np.cos(time), 0.05)
-    left = record.exclude([window])
-    np.testing.assert_allclose(time[~left.has_reading], gone, atol=1e-9)

@@ -25,6 +25,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.prediction.loops import crossings
 from bwbayes.prediction.prediction import Start
 from bwbayes.record.record import Record
 from bwbayes.sampling.plan import SamplingPlan
@@ -239,6 +240,8 @@ def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None
     voltage = decaying_sine(80) + shift
     posterior = small().posterior.altered(voltage=voltage)
     expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
-    assert expected == Experiment(posterior, PLAN).level
+    looped = Experiment(posterior, PLAN).looped
+    assert looped is not None
+    assert expected == crossings(looped[1])[0]
     with pytest.raises(InputError, match="does not go back and forth"):
         Experiment(posterior.altered(voltage=np.linspace(0.0, 100.0, 80)), PLAN)

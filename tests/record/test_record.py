@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,6 @@ from hypothesis import strategies as st
 
 from bwbayes.errors import InputError
 from bwbayes.record import Record
-
-MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
 
 
 def ramp(samples: int = 100, interval: float = 0.01, start: float = 0.0) -> Record:
@@ -105,6 +102,23 @@ def test_excluded_readings_are_missing_and_the_voltage_is_not() -> None:
     np.testing.assert_array_equal(ramp().voltage, record.voltage)
     with pytest.raises(InputError, match="reaches outside the record"):
         record.exclude([(0.5, 1.5)])
+
+
+@pytest.mark.parametrize(
+    ("window", "gone"),
+    [
+        ((1.60, 1.67), [32, 33]),
+        ((1.63, 1.67), [32, 33]),
+        ((1.60, 1.65), [32]),
+        ((1.61, 1.62), [32]),
+        ((0.0, 0.05), [0]),
+    ],
+)
+def test_exclude_takes_every_sample_that_it_touches(
+    window: tuple[float, float], gone: list[int]
+) -> None:
+    record = ramp(100, 0.05).exclude([window])
+    assert gone == np.flatnonzero(~record.has_reading).tolist()
 
 
 def test_a_record_needs_one_reading_and_all_missing_ones_are_alike() -> None:

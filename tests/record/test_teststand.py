@@ -154,19 +154,6 @@ def test_the_structural_even_term_is_one_micrometre_at_100_volts() -> None:
         np.testing.assert_allclose(expected, even[1200:], rtol=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["none", "process", "structural"])
-def test_the_same_seed_gives_the_same_record_and_another_seed_another(
-    kind: Literal["none", "process", "structural"],
-) -> None:
-    stand, drive = VirtualTestStand(kind), signal("step10")
-    first, same, other = (stand.run(drive, generator(seed)) for seed in (7, 7, 8))
-    assert first.displacement is not None
-    assert other.displacement is not None
-    np.testing.assert_array_equal(first.displacement, same.displacement)
-    np.testing.assert_array_equal(first.truth, same.truth)
-    assert np.mean(first.displacement != other.displacement) > 0.5
-
-
 def test_the_true_parameters_are_table_1_in_micrometers_and_the_noise() -> None:
     bouc_wen = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "exponent": 1.0}
     mechanics = {"mass": 0.00134, "damping": 1580.0, "stiffness": 4.10e5}
@@ -292,10 +279,14 @@ LEVELS = {
 def test_the_default_is_the_ring_bender_as_it_always_was(
     kind: Literal["none", "process", "structural"],
 ) -> None:
-    record = VirtualTestStand(kind, RATE).run(signal("identification"), np.random.default_rng(7))
-    assert record.displacement is not None
-    levels = np.round(record.displacement / LaserSensor().step).astype("<i4")
-    assert LEVELS[kind] == sha256(levels.tobytes()).hexdigest()[:16]
+    """And another with another seed."""
+    digests = []
+    for seed in (7, 8):
+        record = VirtualTestStand(kind, RATE).run(signal("identification"), generator(seed))
+        assert record.displacement is not None
+        levels = np.round(record.displacement / LaserSensor().step).astype("<i4")
+        digests.append(sha256(levels.tobytes()).hexdigest()[:16])
+    assert LEVELS[kind] == digests[0] != digests[1]
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,11 @@ def _columns_error(
         others = [s for s in others if s.size in {c.size for c in chosen.values()}]
     moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
     candidates = _beside(moving or others, chosen)
-    clocks = [s for s in candidates if s.name in ranges and _rises(s)]
+    clocks = [
+        s
+        for s in candidates
+        if s.name in ranges and _finite(s).size == s.size and (np.diff(_finite(s)) > 0).all()
+    ]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
     columns = dict(naming.columns)
@@ -345,11 +349,6 @@ def _finite(series: Series) -> FloatArray:
     except InputError:
         return np.empty(0)
     return values[np.isfinite(values)] + 0.0
-
-
-def _rises(series: Series) -> bool:
-    values = _finite(series)
-    return values.size == series.size and bool(np.all(np.diff(values) > 0))
 
 
 def _ranges(series: Sequence[Series]) -> dict[str, tuple[float, float]]:
