@@ -27,12 +27,12 @@ from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.declaration import Declaration, Values, lognormal, positive
 from bwbayes.model.elementwise import select
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
-from bwbayes.model.operators.scalar_memory import OneState, beta, initial_anywhere
+from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial_anywhere
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.model.step import OneStateStep
 from tests.control.compiled import Compiled
@@ -41,13 +41,7 @@ from tests.programs import needs
 HERE = "tests.test_outside_operator"
 
 
-def positive(name: str, unit: str, scale: str, times: float) -> Declaration:
-    """Declare a positive parameter near a part of one of the record's ranges."""
-
-    def default(known: Any) -> Any:
-        return lognormal(times * getattr(known.ranges, scale), 1.0)
-
-    return Declaration(name, unit, name, f"{name} of the loop", default, floor=0.0, loop=True)
+WIDTH = positive("width", "V", "u_s", "width of the loop", lambda ranges: 0.5 * ranges.voltage)
 
 
 @dataclass(frozen=True)
@@ -57,8 +51,9 @@ class TanhLoop(RemembersExtrema):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """Slopes d and α, um/V, u_s, V, and the start."""
-        slope, held = positive("d", "um/V", "gain", 1.4), positive("alpha", "um/V", "gain", 0.4)
-        return slope, held, positive("width", "V", "voltage", 0.5), INITIAL
+        slope = positive("d", "um/V", "d", "slope", lambda ranges: 1.4 * ranges.gain)
+        held = positive("alpha", "um/V", "a", "slope held back", lambda ranges: 0.4 * ranges.gain)
+        return slope, held, WIDTH, INITIAL
 
     def numbers(self, column: Values) -> FloatArray:
         """Return d, α and u_s."""
@@ -78,10 +73,8 @@ class SinglePlay(Operator):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """Slope d, um/V, r, V, and the start."""
-        return positive("d", "um/V", "gain", 1.0), positive("width", "V", "voltage", 0.1), INITIAL
-
-    def check(self, column: Values) -> None:
-        """Take any parameters within their bounds."""
+        width = replace(WIDTH, default=lambda c: lognormal(0.1 * c.ranges.voltage, 1.0))
+        return positive("d", "um/V", "d", "slope", lambda ranges: ranges.gain), width, INITIAL
 
     def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> FloatArray:
         """Return z: from below at −1, from above at 1."""
@@ -157,20 +150,8 @@ class Bent(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """Slopes d and α, um/V, β, 1/V, k, um, u_s, V, and the start."""
-        bend, width = (
-            positive("bend", "um", "displacement", 0.02),
-            positive("width", "V", "voltage", 0.5),
-        )
-        slopes = positive("d", "um/V", "gain", 1.2), positive("alpha", "um/V", "gain", 0.2)
-        return *slopes, beta(), bend, width, initial_anywhere()
-
-    def check(self, column: Values) -> None:
-        """Take any parameters within their bounds."""
-
-    def gain(self, column: Values, span: Span) -> FloatArray:
-        """Return d."""
-        del span
-        return column["d"]
+        bend = positive("bend", "um", "k", "bend", lambda ranges: 0.02 * ranges.displacement)
+        return d(), alpha(), beta(), bend, WIDTH, initial_anywhere()
 
     def step(self, column: Values) -> BentStep:
         """Return the step."""

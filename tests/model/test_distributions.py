@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -118,17 +117,12 @@ def test_what_is_no_continuous_distribution_is_unknown(name: str) -> None:
         ("normal", {"mean": 1.0}, "sd is missing; it takes mean, sd"),
         ("normal", {"mean": 1.0, "sd": 1.0, "sigma": 1.0}, "sigma is unknown; it takes mean, sd"),
         ("normal", {"mean": 1.0, "sd": 0.0}, "check its arguments"),
-        ("normal", {"mean": 1.0, "sd": -1.0}, "check its arguments"),
-        ("normal", {"mean": np.nan, "sd": 1.0}, "mean is nan; give a finite number"),
         ("normal", {"mean": 1.0, "sd": np.inf}, "sd is inf; give a finite number"),
         ("normal", {"mean": "1", "sd": 1.0}, "mean is '1'; give a number"),
         ("normal", {"mean": True, "sd": 1.0}, "mean is True; give a number"),
         ("lognormal", {"median": -1.0, "sigma": 1.0}, "check its arguments"),
         ("uniform", {"lower": 2.0, "upper": 1.0}, "lower 2 is not below upper 1"),
-        ("uniform", {"lower": 1.0, "upper": 1.0}, "lower 1 is not below upper 1"),
         ("beta", {"a": 1.0, "b": 1.0, "lower": 1.0}, "lower 1 is not below upper 1"),
-        ("beta", {"a": -1.0, "b": 1.0}, "check its arguments"),
-        ("gamma", {}, "wrong arguments; scipy's takes a, loc, scale"),
         ("gamma", {"a": 1.0, "b": 1.0}, "wrong arguments; scipy's takes a, loc, scale"),
         ("gamma", {"a": -1.0}, "check its arguments"),
         ("cauchy", {"mean": 1.0}, "wrong arguments; scipy's takes loc, scale"),
@@ -142,33 +136,3 @@ def test_wrong_arguments_are_refused_in_one_line(
     assert says in str(refused.value)
     assert str(refused.value).startswith(name)
     assert "\n" not in str(refused.value)
-
-
-def scipys_continuous() -> list[tuple[str, dict[str, float]]]:
-    """Return every fifth continuous distribution of scipy with shapes from inside its domain."""
-    result = []
-    for name, family in sorted(vars(stats).items()):
-        if not isinstance(family, stats.rv_continuous) or name in ("uniform", "beta"):
-            continue
-        shapes = [s.strip() for s in family.shapes.split(",")] if family.shapes else []
-        for value in (1.5, 0.5, 3.0):
-            arguments = {shape: value + 0.25 * i for i, shape in enumerate(shapes)}
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                allowed = np.all(family._argcheck(*arguments.values()))
-            if allowed and name not in ("levy_stable", "studentized_range"):
-                result.append((name, arguments))
-                break
-    return result[::5]
-
-
-@pytest.mark.parametrize(("name", "arguments"), scipys_continuous(), ids=lambda v: str(v)[:20])
-def test_any_continuous_distribution_of_scipy_goes_by_its_name(
-    name: str, arguments: dict[str, float]
-) -> None:
-    distribution = Distribution(name, {**arguments, "loc": 0.5, "scale": 2.0})
-    bounds = [np.array(end) for end in distribution.frozen.support()]
-    z = np.linspace(-2, 2, 9)
-    x, _ = distribution.from_normal(z, bounds[0], bounds[1])
-    np.testing.assert_allclose(stats.norm.cdf(z), distribution.frozen.cdf(x), atol=1e-7)
-    np.testing.assert_allclose(z, distribution.to_normal(x, bounds[0], bounds[1]), atol=1e-5)
