@@ -17,7 +17,7 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
 from bwbayes.model.registry import DYNAMICS
-from tests.model.references import Model, assert_close, by_samples, random_walk
+from tests.model.operators.slow import Model, assert_close, by_samples, random_walk
 
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 # The paper's Table 1 in the package's units, with a mass that lets the second order ring.

@@ -13,17 +13,24 @@ from scipy.special import hyp2f1
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen, ceiling, hysteresis
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
-from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.model.power import PowerStep
 from bwbayes.model.relaxing import phi_functions
-from tests.model.operators.slow import SPAN, by_integration, drawn, paths, rows, run
-from tests.model.references import Model, assert_close, by_samples, random_walk
+from tests.model.operators.slow import (
+    Model,
+    assert_close,
+    by_integration,
+    by_samples,
+    drawn,
+    paths,
+    random_walk,
+    rows,
+    run,
+)  # fmt: skip
 
 ALPHA = 0.3575
 PLAIN = {"d": 0.62, "alpha": ALPHA, "beta": 0.0272, "gamma": 0.0172, "initial": 2.5}
@@ -376,70 +383,6 @@ def test_the_edges_of_the_domain_are_inside() -> None:
             start = initial if exponent == 1 else np.sign(initial)
             h = hysteresis([0, 10, -10], ALPHA, beta, gamma, exponent, start)
             assert np.isfinite(h).all()
-
-
-OPERATORS: dict[str, OneState] = {
-    "bouc-wen": BoucWen(),
-    "backlash-like": BacklashLike(),
-    "duhem": Duhem(),
-    "duhem with even terms": Duhem(odd=False),
-    "bouc-wen-asymmetric": BoucWenAsymmetric(),
-    "bouc-wen-asymmetric by the voltage": BoucWenAsymmetric(("b2", "b3")),
-    "jiles-atherton": JilesAtherton(),
-    "domain-wall": DomainWall(),
-}
-NOT_ODD = ("duhem with even terms", "bouc-wen-asymmetric")
-
-
-def models(name: str, size: int, seed: int) -> dict[str, FloatArray]:
-    """Draw models; fewer where there is an integrator to run."""
-    pinned = isinstance(OPERATORS[name], Pinned)
-    return drawn(OPERATORS[name], min(size, 2 if size < 20 else 50) if pinned else size, seed)
-
-
-@pytest.mark.parametrize("name", sorted({*OPERATORS} - {*NOT_ODD}))
-@settings(deadline=None, max_examples=10)
-@given(path=corners, seed=st.integers(0, 9))
-def test_the_mirrored_drive_and_start_give_the_mirrored_displacement(
-    name: str, path: list[float], seed: int
-) -> None:
-    column, voltage = models(name, 3, seed), np.array(path)
-    mirrored = {**column, "initial": -column["initial"]}
-    expected = -run(OPERATORS[name], column, voltage)
-    np.testing.assert_array_equal(run(OPERATORS[name], mirrored, -voltage), expected)
-
-
-@pytest.mark.parametrize("name", OPERATORS)
-def test_a_minor_loop_is_not_forgotten_and_not_congruent(name: str) -> None:
-    """What a Preisach model would do, none of these does: neither wiping out nor congruency."""
-    operator, column = OPERATORS[name], models(name, 100, 5)
-    column["initial"] = np.zeros_like(column["initial"])
-    straight = run(operator, column, np.array([0.0, 40.0, 60.0]))
-    detour = run(operator, column, np.array([0.0, 40.0, 0.0, 40.0, 60.0]))
-    missed = np.abs(detour[:, -1] - straight[:, -1]) / np.ptp(straight, axis=1)
-    assert np.median(missed) > 1e-4
-    after_less = run(operator, column, np.array([0.0, 40.0, 0.0, 40.0]))
-    after_more = run(operator, column, np.array([0.0, 60.0, 0.0, 40.0, 0.0, 40.0]))
-    heights = [np.diff(w[:, -2:], axis=1)[:, 0] for w in (after_less, after_more)]
-    assert np.median(np.abs(heights[0] - heights[1]) / np.abs(heights[0])) > 1e-4
-
-
-@pytest.mark.parametrize("name", OPERATORS)
-def test_sweeps_reach_what_they_say(name: str) -> None:
-    operator, column = OPERATORS[name], models(name, 200, 7)
-    low, high = operator.reachable(column, 20.0, Span(-30.0, 70.0))
-    assert (low < high).all()
-    column["initial"] = np.zeros_like(column["initial"])
-    start = operator.begin(column, 0.0, SPAN, from_rest=True)
-    _, end = operator.advance(column, np.array([70.0, -30.0, 70.0, -30.0, 20.0]), start)
-    # The state need not be what the parameter is, and may grow as that falls.
-    ends = [
-        operator.begin({**column, "initial": initial}, 20.0, SPAN, from_rest=False).state
-        for initial in (low, high)
-    ]
-    slack = 1e-6 * np.max(np.abs(ends), axis=0)
-    assert (end.state >= np.min(ends, axis=0) - slack).all()
-    assert (end.state <= np.max(ends, axis=0) + slack).all()
 
 
 def test_unknown_terms_are_refused_by_name() -> None:
