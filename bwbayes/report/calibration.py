@@ -181,7 +181,7 @@ def _priors(calibration: Calibration) -> Table:
         "Priors",
         ("Parameter", "Symbol", "Prior", "Unit"),
         [
-            (p.name, symbol(p).html, str(p.prior), unit_text(p.unit))
+            (p.name, symbol(p), str(p.prior), unit_text(p.unit))
             for p in calibration.parameters
             if p.fixed is None
         ],

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,22 @@ from bwbayes.report.result import Result
 __all__ = ["posterior_tree", "write_bands", "write_posterior", "write_summary"]
 
 
+@contextmanager
+def _draft(path: Path) -> Iterator[Path]:
+    """Give another name to write to, which becomes the file's once it is whole."""
+    draft = path.with_suffix(".partial")
+    yield draft
+    draft.replace(path)
+
+
 def write_posterior(
     path: Path, result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
 ) -> None:
     """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
-    tree = posterior_tree(result, log_likelihood, records)
-    temporary = path.with_suffix(".partial")
     # From memory: HDF5 does not survive a disk that is full.
-    temporary.write_bytes(tree.to_netcdf(engine="h5netcdf"))
-    temporary.replace(path)
+    whole = posterior_tree(result, log_likelihood, records).to_netcdf(engine="h5netcdf")
+    with _draft(path) as draft:
+        draft.write_bytes(whole)
 
 
 def posterior_tree(
@@ -105,8 +113,7 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
 
     Every column has seven digits of its range, however far from zero it lies.
     """
-    temporary = path.with_suffix(".partial")
-    with temporary.open("w", encoding="utf-8") as file:
+    with _draft(path) as draft, draft.open("w", encoding="utf-8") as file:
         for number, predicted in enumerate(bands):
             names, columns = zip(*predicted.columns(), strict=True)
             if number == 0:
@@ -115,7 +122,6 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
             row = prefix + ",".join(_format(n, c) for n, c in zip(names, columns, strict=True))
             row += "\n"
             file.writelines(row % values for values in zip(*columns, strict=True))
-    temporary.replace(path)
 
 
 def _format(name: str, column: FloatArray) -> str:
@@ -130,9 +136,8 @@ def _format(name: str, column: FloatArray) -> str:
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:
     """Write a summary as JSON; numbers that are not finite become null."""
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n")
-    temporary.replace(path)
+    with _draft(path) as draft:
+        draft.write_text(json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n")
 
 
 def _finite(value: object) -> object:

@@ -26,22 +26,17 @@ from bwbayes.report.report import (
     Block,
     Facts,
     Glossary,
-    Kind,
     Report,
     Section,
     SideBySide,
     Text,
     remarks_banner,
+    standing_banner,
 )
 from bwbayes.report.result import Result
 from bwbayes.report.words import covered, error_text, mark
 
 __all__ = ["prediction_report", "run_report"]
-
-# Figures of the evidence, besides those of the bands.
-EVIDENCE = ("agreement", "coverage", "innovations", "spectrum")
-
-LEVEL = 95  # %, of the bands that the answer speaks of
 
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
@@ -98,27 +93,26 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
     if not result.outcome.converged:
         return [_not_converged(result, numbers)]
     if not standing.headline:
-        return [Banner("good", _headline(result), blocks=_results(result), on="page")]
-    open_verdicts = [v for v in result.verdicts.values() if v.holds is standing.holds]
+        headline = "Converged"
+        if result.verdicts:
+            is_held_out = any(not verdict.training for verdict in result.verdicts.values())
+            data = "held-out data" if is_held_out else "the training data"
+            headline += f"; validation passed on {data}"
+        return [Banner("good", headline, blocks=_results(result), on="page")]
     meaning = (
         "the readings do not tell whether the bands hold"
         if standing.holds is None
         else "the bands fail validation; the parameters may be biased too"
     )
+    open_verdicts = [v for v in result.verdicts.values() if v.holds is standing.holds]
     explained = Glossary([(v.where, _explained(v)) for v in open_verdicts], note=False)
     blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), explained]
-    on_page = Banner(_kind(standing), standing.headline, blocks=blocks, on="page")
-    return [on_page, *_standing_on_screen(standing)]
+    (on_screen,) = _standing_on_screen(standing)
+    return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
 
 
 def _standing_on_screen(standing: Standing) -> list[Banner]:
-    if not standing.lines:
-        return []
-    return [Banner(_kind(standing), standing.headline, items=standing.lines, on="screen")]
-
-
-def _kind(standing: Standing) -> Kind:
-    return "note" if standing.holds is None else "bad"
+    return [replace(banner, blocks=()) for banner in standing_banner(standing, on="screen")]
 
 
 def _explained(verdict: Verdict) -> Markup:
@@ -162,13 +156,6 @@ def _sampled(result: Result) -> str:
     return f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted."
 
 
-def _headline(result: Result) -> str:
-    """Return what may be said of a converged run none of whose bands fail."""
-    if any(not verdict.training for verdict in result.verdicts.values()):
-        return "Converged; validation passed on held-out data"
-    return "Converged; validation passed on the training data" if result.verdicts else "Converged"
-
-
 def _results(result: Result) -> list[Text]:
     """Return what the bands did on readings that were not fitted, or else on those that were."""
     texts = []
@@ -183,8 +170,8 @@ def _results(result: Result) -> list[Text]:
             ).format(
                 f"{title(bands)}, {_span(bands)}",
                 status,
-                covered(scores, "sensor", LEVEL),
-                f"{scores.width_um[LEVEL]:.2f} µm",
+                covered(scores, "sensor", 95),
+                f"{scores.width_um[95]:.2f} µm",
                 error_text(scores),
                 f"{scores.max_error_um:.2f} µm",
             )
@@ -219,10 +206,10 @@ def _answer(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> l
 
 def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
     ordered = _held_out_first(result)
+    shown = [pictures[f"bands_{bands.name}"] for bands in ordered]
     # Of several records "innovations_NAME" is one of the innovations.
-    names = [f"bands_{bands.name}" for bands in ordered]
-    names += [name for kind in EVIDENCE for name in pictures if name.partition("_")[0] == kind]
-    shown = [pictures[name] for name in names if name in pictures]
+    for kind in ("agreement", "coverage", "innovations", "spectrum"):
+        shown += [p for name, p in pictures.items() if name.partition("_")[0] == kind]
     validation: list[Block] = []
     if result.scores:
         titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}

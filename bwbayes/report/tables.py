@@ -307,7 +307,7 @@ def name_columns(title: str) -> tuple[TableColumn, TableColumn]:
 
 def parameter_words(parameter: Parameter) -> Markup:
     """Return a parameter in words, with its symbol."""
-    return Markup("{}, {}").format(parameter.description, symbol(parameter).html)
+    return Markup("{}, {}").format(parameter.description, symbol(parameter))
 
 
 def _other_scores(scores: Scores) -> Iterator[tuple[str, str]]:

@@ -6,7 +6,6 @@ import math
 import re
 import unicodedata
 from collections.abc import Mapping
-from typing import NamedTuple
 
 from markupsafe import Markup
 
@@ -16,7 +15,6 @@ from bwbayes.report.report import Kind
 
 __all__ = [
     "STATUS_KINDS",
-    "Symbol",
     "covered",
     "digits",
     "error_text",
@@ -34,21 +32,8 @@ STATUS_KINDS: Mapping[str, Kind] = {
 }
 
 
-class Symbol(NamedTuple):
-    """A symbol in plain characters: its base, and what stands below."""
-
-    base: str
-    below: str
-
-    @property
-    def html(self) -> Markup:
-        """The symbol with its subscript."""
-        below = Markup("<sub>{}</sub>").format(self.below) if self.below else Markup("")
-        return Markup("<i>{}</i>").format(self.base) + below
-
-
-def symbol(parameter: Parameter) -> Symbol:
-    r"""Return a parameter's LaTeX label in plain characters, or its name if that cannot be done.
+def symbol(parameter: Parameter) -> Markup:
+    r"""Return a parameter's LaTeX label as HTML, or its name if that cannot be done.
 
     Greek letters, one subscript and ``\mathrm`` are understood.
     """
@@ -56,8 +41,10 @@ def symbol(parameter: Parameter) -> Symbol:
     text = re.sub(r"\\([A-Za-z]+)", _greek, text)
     match = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
     if match is None:
-        return Symbol(parameter.name, "")
-    return Symbol(match[1], match[2] or match[3] or "")
+        return Markup("<i>{}</i>").format(parameter.name)
+    base, *below = match.groups("")
+    subscript = Markup("<sub>{}</sub>").format("".join(below)) if any(below) else ""
+    return Markup("<i>{}</i>").format(base) + subscript
 
 
 def _greek(match: re.Match[str]) -> str:

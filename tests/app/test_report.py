@@ -43,7 +43,7 @@ def rows(text: str, table: str) -> dict[str, list[str]]:
 
 
 def words(parameter: Parameter) -> str:
-    return f"{parameter.description}, {''.join(symbol(parameter))}"
+    return f"{parameter.description}, {symbol(parameter).striptags()}"
 
 
 def test_numbers_of_the_parameters_are_the_summarys() -> None:
@@ -159,19 +159,19 @@ def test_remarks_facts_and_circumstances_are_shown() -> None:
 @pytest.mark.parametrize(
     ("label", "expected"),
     [
-        ("d", ("d", "")),
-        (r"\alpha", ("α", "")),
-        (r"\Omega", ("Ω", "")),
-        ("h_0", ("h", "0")),
-        (r"\tau_\mathrm{lag}", ("τ", "lag")),
-        (r"\sigma_{\mathrm{lag}}", ("σ", "lag")),
-        (r"k_{12}", ("k", "12")),
-        (r"\frac{a}{b}", ("some_name", "")),
-        (r"x^2", ("some_name", "")),
-        ("", ("some_name", "")),
+        ("d", "<i>d</i>"),
+        (r"\alpha", "<i>α</i>"),
+        (r"\Omega", "<i>Ω</i>"),
+        ("h_0", "<i>h</i><sub>0</sub>"),
+        (r"\tau_\mathrm{lag}", "<i>τ</i><sub>lag</sub>"),
+        (r"\sigma_{\mathrm{lag}}", "<i>σ</i><sub>lag</sub>"),
+        (r"k_{12}", "<i>k</i><sub>12</sub>"),
+        (r"\frac{a}{b}", "<i>some_name</i>"),
+        (r"x^2", "<i>some_name</i>"),
+        ("", "<i>some_name</i>"),
     ],
 )
-def test_labels_become_readable_symbols(label: str, expected: tuple[str, str]) -> None:
+def test_labels_become_readable_symbols(label: str, expected: str) -> None:
     parameter = dataclasses.replace(example.PARAMETERS[0], name="some_name", label=label)
     assert expected == symbol(parameter)
 
