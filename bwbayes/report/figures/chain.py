@@ -134,7 +134,7 @@ def draw_ranks(result: Result) -> Figure:
     for i, panel in enumerate(panels):
         panel.set_title(style.axis_label(result.free[i]))
         panel.margins(y=0.12)
-        panel.axhline(1.0, color="#777777", lw=0.8)
+        panel.axhline(1.0, color=style.EXPECTED_COLOR, lw=0.8)
         time = float(np.maximum(result.outcome.check.autocorrelation[i], 1.0))
         if np.isfinite(time):
             independent = steps * ensembles * walkers / time

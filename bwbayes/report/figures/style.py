@@ -28,8 +28,8 @@ __all__ = [
     "CHANCE_COLOR",
     "COLORS",
     "EDGE_COLOR",
+    "EXPECTED_COLOR",
     "LEAD_IN_COLOR",
-    "LIMIT_COLOR",
     "MEAN_COLOR",
     "MEASURED_COLOR",
     "STYLE",
@@ -82,7 +82,7 @@ MEAN_COLOR = "#D55E00"
 MEASURED_COLOR = "#222222"
 TRUTH_COLOR = "#E69F00"
 LEAD_IN_COLOR = "#999999"
-LIMIT_COLOR = "#777777"  # of what is expected
+EXPECTED_COLOR = "#777777"  # of what is expected
 CHANCE_COLOR = "#dddddd"  # of what chance does
 ZOOM_COLOR = "#CC79A7"
 
