@@ -62,34 +62,27 @@ def _banners(calibration: Calibration) -> list[Banner]:
 def _statistics(calibration: Calibration) -> Table:
     """Return a row for each statistic, and the limits of its intervals' coverage."""
     words = {p.name: (p.description, p.unit) for p in calibration.parameters} | EXTRA_WORDS
-    rows = [
-        (
-            name,
-            words[name][0],
-            unit_text(words[name][1]),
-            f"{uniformity.p:.2g}",
-            f"{uniformity.adjusted:.2g}",
-            "leaves band" if uniformity.outside else "inside",
-            *(f"{uniformity.covered[level]:.1%}" for level in LEVELS),
-        )
-        for name, uniformity in calibration.statistics.items()
-    ]
+    rows = []
+    for name, uniformity in calibration.statistics.items():
+        description, unit = words[name]
+        ecdf = "leaves band" if uniformity.outside else "inside"
+        tests = f"{uniformity.p:.2g}", f"{uniformity.adjusted:.2g}", ecdf
+        covered = (f"{uniformity.covered[level]:.1%}" for level in LEVELS)
+        rows.append((name, description, unit_text(unit), *tests, *covered))
     limits = (
         f"{low:.1%} to {high:.1%}" for low, high in map(calibration.limits.__getitem__, LEVELS)
     )
     rows.append(("", "99 % binomial limits", "", "", "", "", *limits))
+    columns = (
+        TableColumn("Name", on="screen"),
+        TableColumn("Statistic", on="page"),
+        TableColumn("Unit", on="page"),
+        *("p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS)),
+    )
     return Table(
         "statistics",
         "Ranks and intervals",
-        (
-            TableColumn("Name", on="screen"),
-            TableColumn("Statistic", on="page"),
-            TableColumn("Unit", on="page"),
-            "p",
-            "p adjusted",
-            "ECDF",
-            *(f"{level} %" for level in LEVELS),
-        ),
+        columns,
         rows,
         note="p: of the smooth test of the ranks; adjusted for the number of statistics, by Holm. "
         "ECDF: whether their distribution leaves its band. Percent: how often the central interval "
@@ -176,13 +169,11 @@ def _tests(calibration: Calibration) -> list[Text]:
 
 
 def _priors(calibration: Calibration) -> Table:
-    return Table(
-        "priors",
-        "Priors",
-        ("Parameter", "Symbol", "Prior", "Unit"),
-        [
-            (p.name, symbol(p), str(p.prior), unit_text(p.unit))
-            for p in calibration.parameters
-            if p.fixed is None
-        ],
+    columns = (
+        TableColumn("Parameter", text=lambda parameter: parameter.name),
+        TableColumn("Symbol", text=symbol),
+        TableColumn("Prior", text=lambda parameter: str(parameter.prior)),
+        TableColumn("Unit", text=lambda parameter: unit_text(parameter.unit)),
     )
+    free = [parameter for parameter in calibration.parameters if parameter.fixed is None]
+    return Table.of("priors", "Priors", free, columns)

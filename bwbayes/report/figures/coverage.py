@@ -24,9 +24,8 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     scored = [bands for bands in predictions if bands.name in scores]
     figure, ((nominal, pit),) = style.new_figure(11, 4.2, 1, 2)
     x = np.arange(len(LEVELS))
-    nominal.hlines(
-        LEVELS, x - 0.4, x + 0.4, color=style.EXPECTED_COLOR, ls="--", lw=1, label="nominal"
-    )
+    expected: style.Look = {"color": style.EXPECTED_COLOR, "lw": 1}
+    nominal.hlines(LEVELS, x - 0.4, x + 0.4, ls="--", label="nominal", **expected)
     for i, bands in enumerate(scored):
         color, name = style.COLORS[i % len(style.COLORS)], style.plain(style.title(bands))
         score, center = scores[bands.name], x + 0.14 * (i - (len(scored) - 1) / 2)
@@ -55,7 +54,7 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     nominal.set_xticks(x, [f"{level} %" for level in LEVELS])
     nominal.set(xlabel="nominal coverage (%)", ylabel="measured coverage (%)")
     nominal.legend(loc="lower right")
-    pit.axhline(1.0, color=style.EXPECTED_COLOR, lw=1)
+    pit.axhline(1.0, **expected)
     pit.set(xlim=(0, 1), xlabel="PIT: predicted probability below the reading (-)")
     pit.set(ylim=(0, None), ylabel="density (expected: 1)")
     return figure
