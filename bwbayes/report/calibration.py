@@ -69,16 +69,14 @@ def _statistics(calibration: Calibration) -> Table:
         tests = f"{uniformity.p:.2g}", f"{uniformity.adjusted:.2g}", ecdf
         covered = (f"{uniformity.covered[level]:.1%}" for level in LEVELS)
         rows.append((name, description, unit_text(unit), *tests, *covered))
-    limits = (
-        f"{low:.1%} to {high:.1%}" for low, high in map(calibration.limits.__getitem__, LEVELS)
-    )
+    limits = ("{:.1%} to {:.1%}".format(*calibration.limits[level]) for level in LEVELS)
     rows.append(("", "99 % binomial limits", "", "", "", "", *limits))
-    columns = (
+    columns: list[str | TableColumn] = [
         TableColumn("Name", on="screen"),
         TableColumn("Statistic", on="page"),
         TableColumn("Unit", on="page"),
-        *("p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS)),
-    )
+    ]
+    columns += ["p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS)]
     return Table(
         "statistics",
         "Ranks and intervals",

@@ -19,7 +19,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
 from bwbayes.inference.parameters import Parameter
-from bwbayes.report.figures import interactive, picture_of, save_pictures
+from bwbayes.report.figures import interactive, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.loop import draw_loop
 from bwbayes.report.figures.series import _around_largest_error, draw_bands
@@ -131,15 +131,9 @@ def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
     assert 10 * width > np.ptp(bands.mean[shown])
 
 
-def test_saved_files_are_the_returned_pictures(tmp_path: Path) -> None:
-    folder = tmp_path / "new" / "figures"
-    drawings = {"trace": lambda: Figure((1, 1)), "bands_a/b": lambda: Figure((2, 1))}
-    pictures = {name: picture_of(draw) for name, draw in drawings.items()}
-    save_pictures(pictures, folder)
-    assert ["trace", "bands_a/b"] == list(pictures)
-    for name, file in (("trace", "trace.png"), ("bands_a/b", "bands_a%2Fb.png")):
-        assert pictures[name] == (folder / file).read_bytes()
-        assert b"\x89PNG\r\n" == pictures[name][:6]
+def test_files_have_names_that_any_system_takes(tmp_path: Path) -> None:
+    save_pictures({"bands_a/b": b"PNG"}, tmp_path / "new")
+    assert b"PNG" == (tmp_path / "new" / "bands_a%2Fb.png").read_bytes()
 
 
 def test_coverage_is_drawn_in_percent_with_its_error(figures: Mapping[str, Figure]) -> None:
