@@ -114,14 +114,14 @@ FIGURES: dict[str, list[str]] = {
         "sum ordinary answers/other/True",
         "sum ordinary answers/other/False",
     ],
-    "-m slow tests/prediction/test_moving.py": [
+    "-m slow tests/prediction/test_moving.py -k kinds": [
         "sum moving, */cases",
         "max moving, */records of each case",
         "extent 100 moving, */coverage and t/*/95/0",
         "count moving, */coverage and t/*/*/0",
         "max moving, */largest t",
     ],
-    "-m slow tests/prediction/test_moving_operators.py": [
+    "-m slow tests/prediction/test_moving.py -k operator": [
         "min moving operators, */records",
         "extent 100 moving operators, */coverage and t/95/0",
         "count moving operators, */coverage and t/*/0",
