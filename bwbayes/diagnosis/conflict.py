@@ -1,12 +1,9 @@
 """Priors and posterior: where they disagree, press against a bound, or differ in unit.
 
 A finding's kind is the parameter, and its fix a line of config. The same findings come from the
-point fit, before any sampling, by :func:`around`, and from the posterior's draws.
-
-How often good runs have one: the score of a parameter that its prior describes is beyond three
-once in 400 times, and less where the posterior is wide; a posterior that is flat between its bounds
-or has its peak inside does not press. In the tests, 40 simulated records with default priors give
-none.
+point fit, before any sampling, by :func:`around`, and from the posterior's draws. The score of a
+parameter that its prior describes is beyond three once in 400 times, and less where the posterior
+is wide; a posterior that is flat between its bounds or has its peak inside does not press.
 """
 
 from __future__ import annotations

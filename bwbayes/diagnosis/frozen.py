@@ -38,11 +38,10 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     """Return where values (samples,) stay at their largest while the other column moves on.
 
     A sensor whose steps are finer than its noise hardly ever repeats itself, in 2 % of its
-    readings at most: then all readings of the largest value count. A coarse one repeats it in two
-    ways that are harmless. At rest the other column stands still: only runs count in which its
-    quartiles lie apart, by 1 % of its range and by what three steps of the sensor are worth. At a
-    smooth peak the next level lasts as well: a parabola stays at its top level up to 2.4 times as
-    long as at the next, a clipped one longer.
+    readings at most: then all readings of the largest value count. A coarse one repeats it at rest,
+    where the other column stands still: only runs count in which its quartiles lie apart, by 1 % of
+    its range and by what three steps of the sensor are worth. And at a smooth peak: a parabola
+    stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
     """
     levels = np.unique(values)
     if levels.size < 3:
@@ -64,9 +63,9 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
 def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
     """Return where readings (samples,) are held while the voltage moves, and then jump.
 
-    A sensor with coarse steps repeats itself where it moves slowly, and goes on by a step or two;
-    one that is held goes on by all that it has missed, on the same side as it came from. One run
-    of twenty samples is enough, of shorter ones more than chance makes.
+    A coarse sensor repeats itself where it moves slowly, and goes on by a step or two; one that is
+    held goes on as it came, by all that it has missed. One run of twenty samples is enough, of
+    shorter ones more than chance makes.
     """
     moved = np.diff(displacement)
     if not np.any(moved):

@@ -1,9 +1,8 @@
 """What a record cannot tell: combinations of hysteresis parameters that stay as the prior had them.
 
-Every Bouc-Wen fit leaves a discrepancy of a percent of the range or so, and it comes back whenever
-the voltage takes the same way again: a hundred periods of one sine show one loop, not a hundred.
-So each distinct branch of the voltage counts once here, under a discrepancy of that percent, and
-a combination of parameters is named when a third of its prior sd or more would be left. The
+Every fit leaves a discrepancy of a percent of the range or so, and it comes back whenever the
+voltage takes the same way again: a hundred periods of one sine show one loop, not a hundred. So
+each distinct branch of the voltage counts once here, under a discrepancy of that percent. The
 posterior itself, which trusts the noise model, may look surer.
 """
 

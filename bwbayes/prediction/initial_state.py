@@ -4,8 +4,7 @@ A record that was not fitted brings unknowns of its own: the hysteretic state it
 the dynamics are moving then, and its sensor's offset. Each posterior draw gets its own values. The
 readings of a lead-in, which is not judged later, choose them: offset and dynamics enter linearly
 and are integrated out exactly; the hysteretic state comes from :mod:`bwbayes.prediction.histories`.
-The other parameters keep the posterior of the record that was fitted. Whether the lead-in fits the
-model at all is tested.
+Whether the lead-in fits the model at all is tested.
 """
 
 from __future__ import annotations

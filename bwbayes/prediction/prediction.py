@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.prediction.initial_state`.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -219,11 +219,16 @@ def _bands(
             joined[key][first : first + values.size] = values
         watch(values.size)
 
+    begin = 0
     with ThreadPoolExecutor(THREADS) as executor:
-        for first, simulated in _simulated(mixed.start, record.voltage, window):
-            work = executor.submit(_summarized, mixed, record, first, simulated)
+        for simulated in mixed.start.pieces(record.voltage[: window.stop], PIECE):
+            first, begin = max(begin, window.start), begin + simulated.shape[1]
+            if begin <= first:
+                continue
+            inside = simulated[:, first - begin :]
+            work = executor.submit(_summarized, mixed, record, first, inside)
             pending.append((first - window.start, work))
-            totals += simulated.sum(axis=1)
+            totals += inside.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
             if len(pending) > THREADS:
                 put()
@@ -247,18 +252,6 @@ def _bands(
         time_offset=record.time_offset,
         common_sd=float(np.sqrt(common)),
     )
-
-
-def _simulated(
-    start: Started, voltage: FloatArray, window: slice
-) -> Iterator[tuple[int, FloatArray]]:
-    """Yield first sample and simulations (draws, samples) of the pieces that make up a window."""
-    first = 0
-    for simulated in start.pieces(voltage[: window.stop], PIECE):
-        skipped = max(window.start - first, 0)
-        if skipped < simulated.shape[1]:
-            yield first + skipped, simulated[:, skipped:]
-        first += simulated.shape[1]
 
 
 def _summarized(

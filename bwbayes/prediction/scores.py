@@ -26,18 +26,14 @@ class Scores:
 
     Attributes
     ----------
-    nrmse
-        Root mean square of measured - mean over the range (largest - smallest) of the measured;
-        nan if the measured does not vary.
-    nrmse_full
-        The same over the range of all readings that were fitted; None if it is not known.
+    nrmse, nrmse_full
+        Root mean square of measured - mean over the range of the measured (nan if there is none),
+        and over that of all readings that were fitted (None if it is not known).
     max_error_um
         Largest absolute measured - mean.
-    log_score
-        Mean log density of a reading under the sensor's distribution, nats, per um; None if it is
-        not known.
-    crps_um
-        Mean continuous ranked probability score of the sensor's distribution.
+    log_score, crps_um
+        Mean log density of a reading under the sensor's distribution, nats, per um (None if it is
+        not known), and mean continuous ranked probability score.
     width_um
         Mean width of the sensor band by level.
     interval_score_um
@@ -47,10 +43,9 @@ class Scores:
         Fraction of readings inside the sensor band, and of the noise-free displacement inside
         the displacement band, by level; None without a truth.
     coverage_error
-        Standard errors of ``coverage`` by block bootstrap, not taken as smaller where a band is
-        hardly missed than as many independent hits would have it as the window is worth. The
-        distribution of coverage is skewed: on a window of some twenty correlation times
-        coverage is more than two errors off in one of seven perfect predictions.
+        Standard errors of ``coverage`` by block bootstrap. Its distribution is skewed: on a window
+        of some twenty correlation times coverage is more than two errors off in one of seven
+        perfect predictions.
     worst_second
         Lowest coverage of the sensor band over any second, by level.
     """
