@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
-from bwbayes.diagnosis.noise import tail_nats
+from bwbayes.diagnosis.model import tail_nats
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from bwbayes.diagnosis import effects, model, noise
+from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
 
@@ -28,8 +28,8 @@ ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     effects.moving_gain,
     effects.reversed_sign,
     effects.delay,
-    noise.heavy_tails,
-    noise.growing_noise,
+    model.heavy_tails,
+    model.growing_noise,
 )
 CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     effects.saturation,

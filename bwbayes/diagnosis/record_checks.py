@@ -13,9 +13,16 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.frozen import Stuck, clipped, held, repeated
 from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
-from bwbayes.diagnosis.series_patterns import find_gross_outliers, scatter, spikes
+from bwbayes.diagnosis.series_patterns import (
+    Stuck,
+    clipped,
+    find_gross_outliers,
+    held,
+    repeated,
+    scatter,
+    spikes,
+)
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.consistency import Agreement
-from bwbayes.diagnosis.information import Learned
+from bwbayes.diagnosis.identifiability import Learned
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.diagnosis.predictive_checks import Replicated
 from bwbayes.diagnosis.scene import Explanation

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from bwbayes.diagnosis import effects, model, noise
+from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
@@ -85,8 +85,8 @@ FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
     "step": effects.step,
     "moving gain": effects.moving_gain,
     "delay": effects.delay,
-    "outliers": noise.heavy_tails,
-    "noise by speed": noise.growing_noise,
+    "outliers": model.heavy_tails,
+    "noise by speed": model.growing_noise,
     "quadratic": model.nonlinearity,
     "creep": model.creep,
 }

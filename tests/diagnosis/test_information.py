@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.information import Learned, learned
+from bwbayes.diagnosis.identifiability import Learned, learned
 from bwbayes.inference.posterior import Posterior
 from tests.inference.test_solvable import closed_form, linear_posterior, prior_moments
 

@@ -22,7 +22,7 @@ from bwbayes.app.running.predictions import judged, predictions, scoring
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
-from bwbayes.diagnosis.information import learned
+from bwbayes.diagnosis.identifiability import learned
 from bwbayes.diagnosis.predictive_checks import replicated
 from bwbayes.diagnosis.validation import Background
 from bwbayes.prediction.loops import measure_loops
