@@ -206,7 +206,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Sound:
 
 def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> None:
     common, every = sound
-    outcome = judge([one.entry() for one in every], np.random.default_rng(SEED))
+    outcome = judge([one.entry for one in every], np.random.default_rng(SEED))
     assert [] == remarks(outcome)
     assert len(outcome.unconverged) <= MOST_UNCONVERGED * len(every)
     assert together_test(every, common.posterior.prior) > LEVEL
