@@ -27,15 +27,9 @@ __all__ = ["Carried", "carried"]
 class Carried:
     """What readings leave of the discrepancy, for each draw.
 
-    Parameters
-    ----------
-    last
-        Sample of the last reading.
-    mean, gained
-        Of its state there: the mean (draws, 2), um, and by how much the covariance (draws, 2, 2) is
-        less than σ², um².
-    noise, parameters
-        The noise for the interval between samples, and its θ (draws, parameters).
+    ``last`` is the sample of the last reading; ``mean`` (draws, 2), um, that of the state there,
+    and ``gained`` (draws, 2, 2), um², by how much its covariance is less than σ²; ``noise`` is that
+    for the interval between samples, and ``parameters`` (draws, parameters) are its own.
     """
 
     last: int
@@ -44,23 +38,18 @@ class Carried:
     noise: Noise
     parameters: FloatArray
 
-    def means(self, first: int, samples: int) -> FloatArray:
-        """Mean (draws, samples) from a sample on, um; before the last reading that there."""
-        known: FloatArray = np.einsum("dtj,dj->dt", self._kept(first, samples), self.mean)
-        return known
+    def after(self, first: int, samples: int) -> tuple[FloatArray, FloatArray]:
+        """Return what is known of samples from one on, each (draws, samples).
 
-    def told(self, first: int, samples: int) -> FloatArray:
-        """Return the part (draws, samples) of the variance σ² that is known."""
-        kept = self._kept(first, samples)
-        known = np.einsum("dtj,djk,dtk->dt", kept, self.gained, kept)
+        The discrepancy's mean, um, and the part of its variance σ² that is known; before the last
+        reading those there.
+        """
+        later = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
+        row = self.noise.transition(self.parameters, later)[:, :, 0]
+        known = np.einsum("dtj,djk,dtk->dt", row, self.gained, row)
         always = self.noise.marginal_sd(self.parameters)[0][:, np.newaxis] ** 2
-        part: FloatArray = np.divide(known, always, out=np.zeros_like(known), where=always > 0)
-        return np.minimum(part, 1.0)
-
-    def _kept(self, first: int, samples: int) -> FloatArray:
-        """Return F's first row (draws, samples, 2)."""
-        after = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
-        return self.noise.transition(self.parameters, after)[:, :, 0]
+        share = np.divide(known, always, out=np.zeros_like(known), where=always > 0)
+        return np.einsum("dtj,dj->dt", row, self.mean), np.minimum(share, 1.0)
 
 
 def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) -> Carried:

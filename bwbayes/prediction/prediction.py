@@ -24,7 +24,7 @@ from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction import mixture
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import Start, Started, fitted, going_on, started
 from bwbayes.record.record import Record, Window
 
@@ -52,18 +52,6 @@ class _Draws:
     discrepancy: FloatArray
     sensor: FloatArray
     scores: FloatArray
-
-    def sds(self, kind: Kind, first: int, samples: int) -> FloatArray:
-        """Sd of a band's quantity given a draw, um: (draws, samples), (draws, 1) if all alike."""
-        variance = self.start.offset_sd[:, np.newaxis] ** 2
-        if kind != "parameter":
-            discrepancy = self.discrepancy[:, np.newaxis] ** 2
-            if self.start.carried is not None:
-                discrepancy = discrepancy * (1 - self.start.carried.told(first, samples))
-            variance = variance + discrepancy
-        if kind == "sensor":
-            variance = variance + self.sensor[:, np.newaxis] ** 2
-        return np.sqrt(variance)
 
 
 def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
@@ -258,18 +246,24 @@ def _summarized(
     mixed: _Draws, record: Record, first: int, simulated: FloatArray
 ) -> dict[str, Floating]:
     """Mean, band edges, and the judgment of the readings, each (samples,)."""
-    samples = simulated.shape[1]
-    expected, carried = simulated, mixed.start.carried
-    if carried is not None:
-        expected = simulated + carried.means(first, samples)
+    samples, start, unknown = simulated.shape[1], mixed.start, np.ones(1)
+    expected = simulated
+    if start.carried is not None:
+        remembered, known = start.carried.after(first, samples)
+        expected, unknown = simulated + remembered, 1 - known
     mean = np.mean(expected, axis=0)
     summarized: dict[str, Floating] = {"mean": mean}
     # About their mean, so that a single precision is one of the band's width.
     scores = mixed.scores.astype(np.float32)
     away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
-    for kind in KINDS:
+    offset, slow, white = (
+        sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, mixed.discrepancy, mixed.sensor)
+    )
+    variance = np.zeros(1)
+    for kind, added in zip(KINDS, (offset, slow * unknown, white), strict=True):
         means = apart if kind == "parameter" else away
-        sds = mixed.sds(kind, first, samples).astype(np.float32)
+        variance = variance + added
+        sds = np.sqrt(variance).astype(np.float32)
         ranked = mixture.ranked_values(means, sds, scores)
         for level in LEVELS:
             tail = (100 - level) / 200

@@ -206,8 +206,9 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None
     expected = gain @ (posterior.only.readings.values - simulated[0])
     known = np.sum(gain * across, axis=1) / noise[1] ** 2
     first = int(later[0])
-    np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, atol=1e-7)
-    np.testing.assert_allclose(left.told(first, 51)[0][later - first], known, atol=1e-7)
+    means, told = (values[0][later - first] for values in left.after(first, 51))
+    np.testing.assert_allclose(means, expected, atol=1e-7)
+    np.testing.assert_allclose(told, known, atol=1e-7)
 
 
 @pytest.mark.parametrize("stride", [1, 20])

@@ -47,9 +47,9 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(missing: tuple[int, .
     expected = gain @ (reading[rows] - simulated[0])
     variance = SD**2 - np.sum(gain * covariance(later, rows), axis=1)
     first = int(later[0])
-    np.testing.assert_allclose(left.means(first, 51)[0][later - first], expected, rtol=1e-9)
-    known = SD**2 * (1 - left.told(first, 51)[0][later - first])
-    np.testing.assert_allclose(known, variance, rtol=1e-9)
+    means, told = (values[0][later - first] for values in left.after(first, 51))
+    np.testing.assert_allclose(means, expected, rtol=1e-9)
+    np.testing.assert_allclose(SD**2 * (1 - told), variance, rtol=1e-9)
 
 
 def whole(seed: int) -> tuple[Posterior, Record, FloatArray]:
