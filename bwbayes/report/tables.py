@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from bwbayes.diagnosis.information import Learned
+from bwbayes.diagnosis.identifiability import Learned
 from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import Parameter
