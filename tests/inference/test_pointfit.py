@@ -17,8 +17,9 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.distributions import Distribution
 from tests.diagnosis.test_validation_end_to_end import made
-from tests.inference.problems import posterior_of, short_posterior, target
+from tests.inference.problems import posterior_of, short_posterior
 from tests.prediction.runs import Stand
+from tests.sampling.targets import target
 
 CASES = ("white", "discrepancy", "lag")
 

@@ -13,7 +13,7 @@ from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
-from tests.inference.problems import gaussian
+from tests.sampling.targets import gaussian
 
 PLAN = SamplingPlan(
     ess=400,

@@ -22,8 +22,8 @@ from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
 from tests.forks import FORKS
-from tests.inference.problems import gaussian
 from tests.sampling.chains import arrays, assert_same
+from tests.sampling.targets import gaussian
 
 POSTERIOR, POINT = gaussian(2)
 PLAN = SamplingPlan(

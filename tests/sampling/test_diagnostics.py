@@ -20,8 +20,8 @@ from bwbayes.sampling.diagnostics import (
     nested_rhat,
     pareto_k,
 )
-from tests.inference.problems import student
 from tests.sampling.hard_chains import autoregressive
+from tests.sampling.targets import student
 
 STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 16, 2
 BLOCK = 50

@@ -18,7 +18,8 @@ from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import Weighted, pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
-from tests.inference.problems import gaussian, short_posterior, student, target
+from tests.inference.problems import short_posterior
+from tests.sampling.targets import gaussian, student, target
 
 FREE, WALKERS = 3, 12
 POSTERIOR, POINT = gaussian(FREE)

@@ -28,8 +28,8 @@ from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome, check
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
-from tests.inference.problems import TARGETS, gaussian, target
 from tests.sampling.hard_chains import BLOCK, HARD, good, moved
+from tests.sampling.targets import TARGETS, gaussian, target
 
 PLAN = SamplingPlan(
     ess=200, walkers=12, block=25, least_pilot_steps=50, most_pilot_steps=200, most_steps=400

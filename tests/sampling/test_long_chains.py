@@ -28,7 +28,7 @@ from bwbayes.sampling.chain import Block, draws, log_densities
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
-from tests.inference.problems import gaussian
+from tests.sampling.targets import gaussian
 
 posterior, point = gaussian(10)
 plan = SamplingPlan(walkers=64, most_steps=int(sys.argv[2]))

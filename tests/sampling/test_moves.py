@@ -1,6 +1,6 @@
 """The moves leave a distribution as it is, alone and together, and get everywhere.
 
-How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong, is told there. In
+How sure :func:`~tests.sampling.targets.worst_score` is, and how rarely wrong, is told there. In
 four repetitions with other seeds the right moves scored at most 3.3 here and the planted defects
 at least 17, with the alarm at 7.
 """
@@ -27,7 +27,7 @@ from bwbayes.sampling.moves import (
     sampling_moves,
 )
 from bwbayes.sampling.proposals import StudentMixture
-from tests.inference.problems import ALARM, TARGETS, gaussian, target, worst_score
+from tests.sampling.targets import ALARM, TARGETS, gaussian, target, worst_score
 
 
 def planted(move: Move, wrong: Callable[[FloatArray], FloatArray]) -> Move:

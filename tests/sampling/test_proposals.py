@@ -1,6 +1,6 @@
 """Proposals propose what their density says, and their acceptance ratio keeps a distribution.
 
-How sure :func:`~tests.inference.problems.worst_score` is, and how rarely wrong, is told there; that
+How sure :func:`~tests.sampling.targets.worst_score` is, and how rarely wrong, is told there; that
 right proposals leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
 """
 
@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.moves import AmongPlaces
 from bwbayes.sampling.proposals import StudentMixture
-from tests.inference.problems import ALARM, TARGETS, Known, student, worst_score
+from tests.sampling.targets import ALARM, TARGETS, Known, student, worst_score
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
 MIXTURE = StudentMixture(

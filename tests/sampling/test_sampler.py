@@ -18,7 +18,6 @@ from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import FIRST_CHECK, first_chain, sample
-from tests.inference.problems import target
 from tests.sampling.samplings import (
     PLAN,
     POSTERIOR,
@@ -31,6 +30,7 @@ from tests.sampling.samplings import (
     new_chain,
     run,
 )
+from tests.sampling.targets import target
 
 
 @pytest.fixture(scope="module")
