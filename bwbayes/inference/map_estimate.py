@@ -21,7 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
-__all__ = ["PointFit", "approximated", "fit", "peaks"]
+__all__ = ["PointFit", "fit", "peaks"]
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
@@ -111,24 +111,6 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     log_evidence = np.array([mode.log_density for mode in modes])
     log_evidence += np.linalg.slogdet(covariances)[1] / 2
     return covariances, special.softmax(log_evidence)
-
-
-def approximated(
-    posterior: Posterior, point: PointFit, generator: np.random.Generator, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Draw from normal distributions at a point fit's optima.
-
-    Returns (modes count, free), as many at every optimum, and (count, free), by their shares.
-    """
-    covariances, shares = peaks(posterior, point)
-    candidates = np.stack(
-        [
-            generator.multivariate_normal(position, covariance, size=count)
-            for position, covariance in zip(point.optima, covariances, strict=True)
-        ]
-    )
-    which = generator.choice(len(shares), size=count, p=shares)
-    return np.concatenate(candidates), candidates[which, np.arange(count)]
 
 
 def _with_noise(

@@ -96,7 +96,7 @@ def fitted(
     posterior = posterior_of(voltage, readings, actuator, "discrepancy", FIXED)
     posterior = replace(posterior, engine="numba")
     point = pointfit.fit(posterior, source)
-    _, places = pointfit.approximated(posterior, point, source, DRAWS)
+    places = source.multivariate_normal(point.mode, point.covariance, size=DRAWS)
     return posterior, posterior.prior.constrain(places)[0], strength, frequency, source
 
 
