@@ -76,11 +76,11 @@ def finish(chain: Chain) -> None:
             chain.append(phase, blocks(phase, chain.blocks(phase)))
 
 
-def arrays(chain: ChainFile) -> dict[str, Any]:
+def arrays(chain: Chain) -> dict[str, Any]:
     """Return all that a chain holds, by name."""
-    held: dict[str, Any] = {"point density": np.array(chain.point.log_density)}
-    for name in ("mode", "covariance", "optima", "prior_covariance"):
-        held[f"point {name}"] = getattr(chain.point, name)
+    held: dict[str, Any] = {}
+    if isinstance(chain, ChainFile):
+        held |= {f"point {name}": np.array(value) for name, value in vars(chain.point).items()}
     for phase in PHASES:
         held[f"{phase} blocks"] = np.array(chain.blocks(phase))
         held[f"{phase} moves"] = np.array(list(chain.moves(phase).values()))
@@ -92,10 +92,7 @@ def arrays(chain: ChainFile) -> dict[str, Any]:
             held[f"{phase} {number} random states"] = np.stack(ends)
         mixture = chain.proposal_in_use(phase)
         if mixture is not None:
-            for name in ("weights", "centers", "factors", "freedom"):
-                held[f"{phase} {name}"] = np.array(getattr(mixture, name))
-            if mixture.bend is not None:
-                held[f"{phase} bends"] = mixture.bend.bends
+            held |= {f"{phase} {name}": value for name, value in mixture.arrays().items()}
     for kind, states in (("start", chain.starts), ("end", chain.ends)):
         for name in ("coordinates", "log_density", "random_state"):
             held[f"{kind} {name}"] = np.stack([getattr(one, name) for one in states])

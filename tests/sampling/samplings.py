@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.sampling.chain import PHASES, Chain, Phase
+from bwbayes.sampling.chain import Chain, Phase
 from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
+from tests.sampling.chains import arrays, assert_same
 from tests.sampling.targets import gaussian
 
 PLAN = SamplingPlan(
@@ -53,28 +53,8 @@ class Watched:
             self.checks.append(result)
 
 
-def assert_same_proposal(one: StudentMixture | None, two: StudentMixture | None) -> None:
-    if one is None or two is None:
-        assert one is two
-        return
-    for name in ("weights", "centers", "factors", "freedom"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-    if one.bend is None or two.bend is None:
-        assert one.bend is two.bend
-        return
-    for name in ("center", "factor", "bends"):
-        np.testing.assert_array_equal(getattr(one.bend, name), getattr(two.bend, name))
-
-
 def assert_same_chain(one: Chain, two: Chain) -> None:
-    for phase in PHASES:
-        assert one.blocks(phase) == two.blocks(phase)
-        for name in ("coordinates", "log_density", "accepted"):
-            np.testing.assert_array_equal(getattr(one, name)(phase), getattr(two, name)(phase))
-        assert one.moves(phase) == two.moves(phase)
-    for mine, yours in zip(one.ends, two.ends, strict=True):
-        np.testing.assert_array_equal(mine.random_state, yours.random_state)
-        assert_same_proposal(one.proposals[phase], two.proposals[phase])
+    assert_same(arrays(one), arrays(two))
 
 
 def assert_same_outcome(one: Outcome, two: Outcome) -> None:

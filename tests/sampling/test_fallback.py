@@ -119,9 +119,13 @@ def test_without_the_proposal_the_draws_are_the_posteriors(
 
 
 @pytest.mark.parametrize(
-    ("given_up", "planting"), [("refitted", plant_first), ("fallen_back", plant_every)]
+    ("given_up", "planting", "blocks"),
+    [
+        ("refitted", plant_first, FIRST_CHECK),
+        ("refitted", plant_first, FIRST_CHECK + 1),
+        ("fallen_back", plant_every, FIRST_CHECK),
+    ],
 )
-@pytest.mark.parametrize("blocks", [FIRST_CHECK, FIRST_CHECK + 1])
 def test_interrupted_around_the_fall_back_it_goes_on_to_the_same_end(
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
