@@ -30,6 +30,10 @@ from bwbayes.shown import brief
 __all__ = ["Gains", "Margins", "Robustness", "design", "margins"]
 
 
+# Where loops are looked at, rad per sample.
+ANGLES: FloatArray = np.geomspace(1e-5, np.pi, 1500)
+
+
 @dataclass(frozen=True)
 class Robustness:
     """What every draw must keep: a gain margin, and a phase margin in degrees.
@@ -139,10 +143,12 @@ def design(
         )
     poles = mean.sections.denominator[0, 0]
 
+    response = draws.frequency_response(ANGLES)
+
     def try_speed(speed: float) -> tuple[Gains, Margins]:
         first, second, third = (speed * poles / poles.sum()).tolist()
         gains = Gains((first, second, third), mean.actuator.interval)
-        return gains, margins(gains, draws, limits, delay)
+        return gains, _margins(gains, response, slopes, delay)
 
     # An integrator of this speed is at its limit on the steepest slope, whatever the dynamics.
     fastest = 2.0 / float(slopes[1].max())
@@ -165,17 +171,23 @@ def design(
 
 
 def margins(gains: Gains, draws: SampledModel, limits: Span, delay: int) -> Margins:
-    """Return the margins of every draw.
+    """Return the margins of every draw, the voltages within limits, V.
 
     The loop is L = k C(z) z^−delay P(z) with a slope k of the hysteresis, the linear part P and
     C = (q₀ + q₁/z + q₂/z²) / (1 − 1/z). It is looked at on a grid of angles per sample, rad, and
     taken to go straight, in log size and angle, from one to the next.
     """
-    angles = np.geomspace(1e-5, np.pi, 1500)
-    back = np.exp(-1j * angles)
+    return _margins(gains, draws.frequency_response(ANGLES), draws.slopes(limits), delay)
+
+
+def _margins(
+    gains: Gains, response: FloatArray, slopes: tuple[FloatArray, FloatArray], delay: int
+) -> Margins:
+    """Return the margins of draws with this response (draws, angles) and bounds of the slope."""
+    back = np.exp(-1j * ANGLES)
     controller = np.polyval(gains.steps[::-1], back) / (1 - back) * back**delay
-    loop = controller * draws.frequency_response(angles)
-    smallest, largest = (slope[:, np.newaxis] for slope in draws.slopes(limits))
+    loop = controller * response
+    smallest, largest = (slope[:, np.newaxis] for slope in slopes)
     size, lag = np.abs(loop), np.angle(-loop)
     with np.errstate(divide="ignore"):
         log_size = np.log(size)
@@ -203,6 +215,6 @@ def margins(gains: Gains, draws: SampledModel, limits: Span, delay: int) -> Marg
     phase = np.degrees(np.where(gain < 1, -least, least))
     circle = np.min(((1 + largest * loop) * np.conj(1 + smallest * loop)).real, axis=1)
     above = size * largest >= 1
-    last = angles[::-1][np.argmax(above[:, ::-1], axis=1)]
+    last = ANGLES[::-1][np.argmax(above[:, ::-1], axis=1)]
     crossover = np.where(above.any(axis=1), last, 0.0) / (2 * np.pi * gains.interval)
     return Margins(gain, phase, crossover, circle)

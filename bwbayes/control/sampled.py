@@ -221,8 +221,9 @@ class SampledModel:
 
         ``angles`` (frequencies,) are per sample, rad.
         """
-        powers = np.exp(-1j * np.outer(np.arange(3), angles))
-        responses = (self.sections.numerator @ powers) / (self.sections.denominator @ powers)
+        taps = (np.moveaxis(row, -1, 0) for row in self.sections[:2])
+        top, bottom = (np.polynomial.polynomial.polyval(np.exp(-1j * angles), row) for row in taps)
+        responses = top / bottom
         total: Any = np.einsum("ms,msf->mf", self.sections.gains, responses)
         return np.asarray(total)
 
