@@ -86,8 +86,8 @@ class Experiment:
         Windows (slices of a record's voltage) for which bands are predicted and held against the
         simulated record, by name; and the record that each is of, by default the first.
     others
-        Other records, by name: made with the same truth, but with a start and an offset of their
-        own, and predicted with the parameters from the posterior.
+        Other records, by name: simulated with the same truth, but with a start and an offset of
+        their own, and predicted with the parameters from the posterior.
     source
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
@@ -158,7 +158,7 @@ class Experiment:
 
 
 class Replicate(NamedTuple):
-    """One record, made and fitted: what is stored, and (RANKED, statistics) posterior draws.
+    """One record, simulated and fitted: what is stored, and (RANKED, statistics) posterior draws.
 
     The draws are empty, and nothing is ranked or covered, if there are not so many.
     """
@@ -260,7 +260,7 @@ def _simulated(
     source = experiment.truth
     theta = source.prior.theta(source.prior.draw(generator, 1))
     column = source.table.columns(theta)
-    made = {}
+    simulated = {}
     for fitted, dataset, likelihood in zip(
         experiment.posterior.datasets, source.datasets, source.likelihoods, strict=True
     ):
@@ -274,8 +274,8 @@ def _simulated(
         )[0][0]
         record = Record(dataset.voltage, fitted.displacement, dataset.actuator.interval)
         noise = dataset.table.noise(record_theta)
-        made[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
-    return column, made
+        simulated[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
+    return column, simulated
 
 
 def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`) times an
 amplitude :class:`Decay`, switched on at a start time and sampled at a rate; a step is a staircase
 of one level. The paper's own signals are made of these, and :func:`signal` finds them by
-name.
+name. A value that is not finite, or not what its description says, is an :class:`InputError`.
 """
 
 from __future__ import annotations
@@ -82,8 +82,6 @@ class Sine(_Periodic):
         Hz, above zero.
     phase : float
         Phase at the start, rad; with pi the voltage goes down first.
-
-    Raises :class:`InputError` if a value is not finite or the frequency is not above zero.
     """
 
     def __call__(self, elapsed: FloatArray) -> FloatArray:
@@ -113,8 +111,6 @@ class Staircase:
         Levels in V, in their order; at least one.
     dwell : float
         Time on each level, s, above zero.
-
-    Raises :class:`InputError` if there is no level, one is not finite or the dwell is not positive.
     """
 
     levels: tuple[float, ...]
@@ -155,8 +151,6 @@ class Decay:
         Decay rate, 1/s, not below zero.
     kind : {"linear", "exponential"}
         The law of the decay.
-
-    Raises :class:`InputError` if a value is not finite, the rate below zero or the kind unknown.
     """
 
     start: float = 0.0
@@ -196,9 +190,6 @@ class Waveform:
         Factor on the carrier; it counts time from the first sample, as the paper's q(t) does.
     bias : float
         V; it does not decay.
-
-    Raises :class:`InputError` if a value is not finite, the duration is not above zero or the start
-    is outside it.
     """
 
     carrier: Carrier

@@ -74,25 +74,25 @@ def _series(
     prefix = group.name.strip("/") + "/" * (group.name != "/")
     notes[prefix] = {key: note(group.attrs[key]) for key in NOTES if key in group.attrs}
     links = [name for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
-    objects = {name: group[name] for name in links if not name.startswith("#")}
-    for name, found in objects.items():
-        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+    items = {name: group[name] for name in links if not name.startswith("#")}
+    for name, item in items.items():
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
             continue
-        is_text = found.attrs.get("MATLAB_class") == b"char"
-        if "MATLAB_empty" in found.attrs or found.shape is None:
+        is_text = item.attrs.get("MATLAB_class") == b"char"
+        if "MATLAB_empty" in item.attrs or item.shape is None:
             continue
         if name in NOTES and is_text:
-            codes = np.asarray(found[()], dtype="<u2")
+            codes = np.asarray(item[()], dtype="<u2")
             notes[prefix][name] = codes.tobytes().decode("utf-16-le", errors="replace")
-        elif name in NOTES and name.endswith("_s") and found.size and found.dtype.kind in "iuf":
-            notes[prefix][name] = note(found[()])
+        elif name in NOTES and name.endswith("_s") and item.size and item.dtype.kind in "iuf":
+            notes[prefix][name] = note(item[()])
         elif not is_text:
-            unit = next((note(v) for k, v in found.attrs.items() if k.lower()[:4] == "unit"), "")
-            load = partial(_loaded, path, found.name)
-            yield from vectors(prefix, name, found.shape, found.dtype, load, unit)
-    for found in objects.values():
-        if isinstance(found, h5py.Group) and h5py.h5o.get_info(found.id).addr not in passed:
-            yield from _series(path, found, notes, passed)
+            unit = next((note(v) for k, v in item.attrs.items() if k.lower()[:4] == "unit"), "")
+            load = partial(_loaded, path, item.name)
+            yield from vectors(prefix, name, item.shape, item.dtype, load, unit)
+    for item in items.values():
+        if isinstance(item, h5py.Group) and h5py.h5o.get_info(item.id).addr not in passed:
+            yield from _series(path, item, notes, passed)
 
 
 def _loaded(path: Path, name: str) -> Any:

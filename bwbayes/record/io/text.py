@@ -165,9 +165,9 @@ def _layout(path: Path, lines: Sequence[str]) -> _Layout:
             [[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in split if len(row) == width]
         )
         share = float(numeric.sum()) / (width * len(split))
-        usual = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
-        if share > best and usual:
-            best, separator, fields, columns = share, candidate, width, usual
+        numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
+        if share > best and numeric_columns:
+            best, separator, fields, columns = share, candidate, width, numeric_columns
     in_a_row: list[int] = []
     for index, line in enumerate(lines if columns else []):
         if not line.strip():
