@@ -32,7 +32,7 @@ from bwbayes.model.elementwise import select
 from bwbayes.model.inverse.chain import inverse
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
-from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial_anywhere
+from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.model.step import OneStateStep
 from tests.control.compiled import Compiled
@@ -151,7 +151,7 @@ class Bent(OneState):
     def parameters(self) -> tuple[Declaration, ...]:
         """Slopes d and α, um/V, β, 1/V, k, um, u_s, V, and the start."""
         bend = positive("bend", "um", "k", "bend", lambda ranges: 0.02 * ranges.displacement)
-        return d(), alpha(), beta(), bend, WIDTH, initial_anywhere()
+        return d(), alpha(), beta(), bend, WIDTH, initial()
 
     def step(self, column: Values) -> BentStep:
         """Return the step."""

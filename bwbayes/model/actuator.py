@@ -125,7 +125,7 @@ class Actuator:
         """Names of θ's columns."""
         return tuple(declaration.name for declaration in self.declarations)
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """How many numbers say how dynamics and creep are at a record's first sample."""
         return self.filter.unknowns(self.hold) + (len(self.creep.times) if self.creep else 0)

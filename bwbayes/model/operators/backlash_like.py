@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bwbayes.arrays import FloatArray
+import numpy as np
+
+from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.scalar_memory import (
+    HIGHEST_CEILING,
     OneState,
     alpha,
     beta,
@@ -44,7 +47,7 @@ class BacklashLike(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, α, β and the initial h."""
-        return d(), alpha(), beta(), initial()
+        return d(), alpha(), beta(), initial(_ceiling)
 
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
@@ -53,3 +56,12 @@ class BacklashLike(OneState):
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""
         return column["beta"] * half_range
+
+
+def _ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
+    """Return ∓α/β, um."""
+    if "alpha" not in earlier or "beta" not in earlier:
+        return -np.inf, np.inf
+    with np.errstate(divide="ignore", over="ignore"):
+        top = np.minimum(earlier["alpha"] / earlier["beta"], HIGHEST_CEILING)
+    return -top, top

@@ -101,7 +101,7 @@ class BoucWen(OneState):
                 loop=True,
                 aliases=("n",),
             ),
-            replace(initial(), bounds=_initial_bounds),
+            initial(_initial_bounds),
         )
 
     def check(self, column: Values) -> None:

@@ -25,7 +25,7 @@ from bwbayes.model.operators.scalar_memory import (
     beta,
     d,
     gamma,
-    initial_anywhere,
+    initial,
 )
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
@@ -101,7 +101,7 @@ class BoucWenAsymmetric(OneState):
             ),
             "|gamma| <= beta",
         )
-        start = replace(initial_anywhere(), bounds=_initial_bounds)
+        start = initial(_initial_bounds)
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
         shape = beta(0.15, lambda earlier: (np.abs(earlier.get("gamma", np.zeros(1))), np.inf))
         return d(), alpha(), shape, tilt, *self._asymmetry(), start

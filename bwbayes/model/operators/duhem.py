@@ -27,7 +27,7 @@ from bwbayes.model.operators.scalar_memory import (
     alpha,
     beta,
     d,
-    initial_anywhere,
+    initial,
 )
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
@@ -89,7 +89,7 @@ class Duhem(OneState):
             loop=True,
         )
         # The bounds of α₂ and α₁ cut the joint prior, which takes small β away.
-        first, last = (d(), gains, alpha(), beta(0.3, _beta_bounds), strengths), initial_anywhere()
+        first, last = (d(), gains, alpha(), beta(0.3, _beta_bounds), strengths), initial()
         if self.odd:
             return *first, last
         even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient", 0.1)

@@ -15,7 +15,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values, positive, refuse
 from bwbayes.model.operators.extremum_memory import INITIAL
-from bwbayes.model.operators.prandtl_ishlinskii import InParallel
+from bwbayes.model.operators.prandtl_ishlinskii import Plays
 
 __all__ = ["MaxwellSlip"]
 
@@ -26,7 +26,7 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class MaxwellSlip(InParallel):
+class MaxwellSlip(Plays):
     """Elements that slip at given strains r_j, V, each holding back α_j, um/V, until it does.
 
     ::

@@ -13,7 +13,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.scalar_memory import OneState, d, initial_anywhere
+from bwbayes.model.operators.scalar_memory import OneState, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
@@ -35,7 +35,7 @@ class NoHysteresis(OneState):
     def parameters(self) -> tuple[Declaration, ...]:
         """d, and a placeholder for the initial state."""
         slope = replace(d(), default=lambda c: lognormal(c.ranges.gain, 0.6), bounds=None)
-        return slope, replace(initial_anywhere(), default=lambda _: 0.0)
+        return slope, replace(initial(), default=lambda _: 0.0)
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray

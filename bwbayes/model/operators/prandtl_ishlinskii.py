@@ -8,9 +8,7 @@ did; from a turn on its path is the first curve, twice as large (Masing's rules)
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +23,6 @@ from bwbayes.model.step import HysteresisStep
 
 __all__ = [
     "SLOPE",
-    "InParallel",
     "Plays",
     "PlaysStep",
     "PrandtlIshlinskii",
@@ -98,13 +95,37 @@ class PrandtlIshlinskii(RemembersExtrema):
 
 
 @dataclass(frozen=True)
-class InParallel(RemembersExtrema):
-    """Plays in parallel: E = d |u − u_r| + Σ w_j max(|u − u_r| − 2 r_j, 0); see :class:`Plays`."""
+class Plays(RemembersExtrema):
+    """Plays with given thresholds r_j, V, and a weight w_j, um/V, for each.
+
+    ::
+
+        w = d u + Σ w_j z_j
+
+    so that d is the slope just after a turn, and the slope grows by w_j where a branch gets longer
+    than 2 r_j. Along a branch w is piecewise linear.
+
+    Parameters
+    ----------
+    thresholds
+        Volts, positive and increasing; or how many, for r_j = U j / (count + 1) with U the
+        parameter ``threshold``, by default fixed at half the range of the record's voltage.
+
+    Raises
+    ------
+    InputError
+        No threshold, or thresholds that are not positive and increasing.
+
+    Notes
+    -----
+    Sources: K. Kuhnen, Eur. J. Control 9 (2003) 407-418; M. Brokate and J. Sprekels, Hysteresis
+    and Phase Transitions (Springer, 1996).
+    """
 
     thresholds: int | tuple[float, ...] = 10
 
     # What a weight is called: its name, its symbol, and of which element it is.
-    weight: ClassVar[tuple[str, str, str]]
+    weight: ClassVar[tuple[str, str, str]] = ("weight", "w", "play")
 
     def __post_init__(self) -> None:
         if isinstance(self.thresholds, int):
@@ -119,9 +140,14 @@ class InParallel(RemembersExtrema):
             )
         object.__setattr__(self, "thresholds", volts)
 
-    @abstractmethod
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """d, the weights, the largest threshold if it is not given, and the start."""
+        return (SLOPE, *self.elements(), INITIAL)
+
     def slope(self, column: Values) -> FloatArray:
         """Return the slope just after a turn (models,), um/V."""
+        return column["d"]
 
     @property
     def count(self) -> int:
@@ -158,16 +184,17 @@ class InParallel(RemembersExtrema):
 
     def step(self, column: Values) -> PlaysStep:
         """Return the plays."""
-        volts = np.array([self.thresholds], dtype=np.float64)
+        return PlaysStep(self.numbers(column))
+
+    def numbers(self, column: Values) -> FloatArray:
+        """Return d, all weights and all thresholds."""
+        volts: Any = self.thresholds
         if isinstance(self.thresholds, int):
             even = np.arange(1, self.count + 1) / (self.count + 1)
             volts = column["threshold"][:, np.newaxis] * even
         weights = [column[f"{self.weight[0]}_{j}"] for j in range(1, self.count + 1)]
-        return PlaysStep(self.slope(column), np.stack(weights, axis=1), volts)
-
-    def numbers(self, column: Values) -> FloatArray:
-        """Return d, all weights and all thresholds."""
-        return self.step(column).parameters
+        weighed = np.column_stack([self.slope(column), *weights])
+        return np.hstack([weighed, np.broadcast_to(volts, (len(weighed), self.count))])
 
     @staticmethod
     def everett(numbers: Any, start: Any, voltage: Any) -> Any:
@@ -183,68 +210,18 @@ class InParallel(RemembersExtrema):
 
 
 @dataclass(frozen=True)
-class Plays(InParallel):
-    """Plays with given thresholds r_j, V, and a weight w_j, um/V, for each.
-
-    ::
-
-        w = d u + Σ w_j z_j
-
-    so that d is the slope just after a turn, and the slope grows by w_j where a branch gets longer
-    than 2 r_j. Along a branch w is piecewise linear.
-
-    Parameters
-    ----------
-    thresholds
-        Volts, positive and increasing; or how many, for r_j = U j / (count + 1) with U the
-        parameter ``threshold``, by default fixed at half the range of the record's voltage.
-
-    Raises
-    ------
-    InputError
-        No threshold, or thresholds that are not positive and increasing.
-
-    Notes
-    -----
-    Sources: K. Kuhnen, Eur. J. Control 9 (2003) 407-418; M. Brokate and J. Sprekels, Hysteresis
-    and Phase Transitions (Springer, 1996).
-    """
-
-    weight = "weight", "w", "play"
-
-    @property
-    def parameters(self) -> tuple[Declaration, ...]:
-        """d, the weights, the largest threshold if it is not given, and the start."""
-        return (SLOPE, *self.elements(), INITIAL)
-
-    def slope(self, column: Values) -> FloatArray:
-        """Return d."""
-        return column["d"]
-
-
-@dataclass(frozen=True)
 class PlaysStep(HysteresisStep):
     """w = d u + Σ w_j z_j with plays z_j = max(u − r_j, min(u + r_j, z_j)); the memory are these.
 
-    Parameters
-    ----------
-    slope
-        d, (models,), um/V.
-    weights
-        w_j, (models, plays), um/V.
-    thresholds
-        r_j, (models or 1, plays), V.
+    ``parameters`` are d, all weights w_j, um/V, and all thresholds r_j, V, (models, 1 + 2 plays).
     """
 
-    slope: FloatArray
-    weights: FloatArray
-    thresholds: FloatArray
+    numbers: FloatArray
 
-    @cached_property
+    @property
     def parameters(self) -> FloatArray:
         """d, all weights, and all thresholds."""
-        volts = np.broadcast_to(self.thresholds, self.weights.shape)
-        return np.column_stack([self.slope, self.weights, volts])
+        return self.numbers
 
     @staticmethod
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
@@ -259,18 +236,23 @@ class PlaysStep(HysteresisStep):
             after[j] = play
         return w, slope
 
+    @property
+    def weights(self) -> FloatArray:
+        """w_j, (models, plays), um/V."""
+        return self.numbers[:, 1 : 1 + self.numbers.shape[1] // 2]
+
     def demagnetized(self) -> FloatArray:
         """Return all plays at zero, (models, plays)."""
         return np.zeros_like(self.weights)
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d, and d + Σ w_j."""
-        return self.slope, self.slope + self.weights.sum(axis=1)
+        return self.numbers[:, 0], self.numbers[:, 0] + self.weights.sum(axis=1)
 
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return d, the weights and the thresholds."""
+        d, *others = self.numbers[0].tolist()
+        weights, thresholds = others[: len(others) // 2], others[len(others) // 2 :]
         return {
-            "d": (float(self.slope[0]), "um/V"),
-            "weights": (self.weights[0].tolist(), "um/V"),
-            "thresholds": (self.thresholds[0].tolist(), "V"),
-        }
+            "d": (d, "um/V"), "weights": (weights, "um/V"), "thresholds": (thresholds, "V"),
+        }  # fmt: skip

@@ -9,7 +9,6 @@ states earlier drives may have left then follow.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,12 +24,10 @@ __all__ = [
     "OneState",
     "StateMemory",
     "alpha",
-    "below_ceiling",
     "beta",
     "d",
     "gamma",
     "initial",
-    "initial_anywhere",
 ]
 
 # Stands for an infinite ceiling, um.
@@ -185,30 +182,15 @@ def gamma(default: Callable[[Context], Distribution], bounds: Bounds, stated: st
     )
 
 
-def initial() -> Declaration:
-    """Declare h at the first sample, below the ceiling α/(β + γ) if α and β are known."""
+def initial(bounds: Bounds | None = None) -> Declaration:
+    """Declare h at the first sample, between bounds if all paths have them."""
     return Declaration(
         "initial",
         "um",
         r"h_0",
         "hysteretic displacement at the first sample",
         lambda context: normal(0.0, 0.3 * context.ranges.reach),
-        bounds=below_ceiling,
+        bounds=bounds,
         scope="record",
         aliases=("h0",),
     )
-
-
-def initial_anywhere() -> Declaration:
-    """Declare h at the first sample; without a ceiling that all paths have."""
-    return replace(initial(), bounds=None)
-
-
-def below_ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    """Return the bounds ∓α/(β + γ) of h, um, with γ = 0 where there is none."""
-    if "alpha" not in earlier or "beta" not in earlier:
-        return -np.inf, np.inf
-    rate = earlier["beta"] + earlier.get("gamma", 0.0)
-    with np.errstate(divide="ignore", over="ignore"):
-        top = np.minimum(earlier["alpha"] / np.maximum(rate, 0.0), HIGHEST_CEILING)
-    return -top, top
