@@ -23,7 +23,7 @@ def of(name: str, count: int, copies: int) -> tuple[Actuator, FloatArray, Sample
     return actuator, theta, SampledModel.of(actuator, np.tile(theta, (copies, 1)))
 
 
-def references(samples: int = 121) -> FloatArray:
+def references(samples: int = 81) -> FloatArray:
     time = 1e-3 * np.arange(samples)
     return np.stack([40 * np.sin(2 * np.pi * 12 * time), np.where(time < 0.05, 30.0, -20.0)])
 

@@ -105,10 +105,8 @@ def _legend(plot: figure, columns: int) -> None:
 
 def _series(bands: Bands) -> Model:
     """Draw voltage, displacement with its bands, and readings minus mean, over one time."""
-    sources = [
-        ColumnDataSource(_columns(style.choose(segment, kept(segment, bands.time.size))))
-        for segment in style.segments(bands)
-    ]
+    thinned = [style.choose(s, kept(s, bands.time.size)) for s in style.segments(bands)]
+    sources = [ColumnDataSource(_columns(segment, residuals=True)) for segment in thinned]
     voltage = _figure(130, "voltage (V)", x_range=DataRange1d(range_padding=0.01))
     residual = "band − mean (µm)" if bands.measured is None else "measured − mean (µm)"
     displacement, below = (
@@ -183,8 +181,8 @@ def kept(bands: Bands, samples: int, count: int = 500) -> IntArray:
     return np.unique(np.concatenate(chosen))
 
 
-def _columns(bands: Bands) -> dict[str, FloatArray]:
-    """Return all that is drawn, by name, in single precision."""
+def _columns(bands: Bands, *, residuals: bool) -> dict[str, FloatArray]:
+    """Return all that is drawn, by name, in single precision; less the mean, too, if need be."""
     series = {"mean": bands.mean}
     if bands.measured is not None:
         series["measured"] = bands.measured
@@ -192,7 +190,8 @@ def _columns(bands: Bands) -> dict[str, FloatArray]:
         series[f"lower_{kind}"] = bands.lower[kind, 95]
         series[f"upper_{kind}"] = bands.upper[kind, 95]
     columns = {"time": bands.time, "voltage": bands.voltage} | series
-    columns |= {f"{name}_residual": values - bands.mean for name, values in series.items()}
+    if residuals:
+        columns |= {f"{name}_residual": values - bands.mean for name, values in series.items()}
     return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
@@ -227,7 +226,7 @@ def _loop(bands: Bands) -> figure:
         plot.line(
             "voltage",
             "mean",
-            source=ColumnDataSource(_columns(along)),
+            source=ColumnDataSource(_columns(along, residuals=False)),
             color=style.MEAN_COLOR,
             line_width=1.5,
             legend_label="mean",
