@@ -193,8 +193,8 @@ def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: flo
 
 @pytest.mark.parametrize("quality", [None, 0.1, 0.45])
 def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None) -> None:
-    """Mean and variance of the discrepancy at any later sample, given all readings."""
-    posterior, place = altered(quality)
+    """Mean and variance of the discrepancy at any later sample, given all readings but a gap."""
+    posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
     rows = posterior.only.readings.rows
     simulated = posterior.simulate(theta, rows)

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.discrepancy_state import carried
 from bwbayes.prediction.prediction import Start, forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, TRUE_NOISE, decaying_sine, short_posterior, truth
@@ -23,33 +22,6 @@ SD, TIME, SENSOR = (
 
 # Samples of a record, and of what follows it.
 LEAD, LATER = 80, 120
-
-
-@pytest.mark.parametrize("missing", [(), (17, 18, 19, 60)])
-def test_what_readings_leave_is_that_of_the_dense_gaussian(missing: tuple[int, ...]) -> None:
-    """Mean and variance of the discrepancy at any later sample, given all readings."""
-    posterior = short_posterior("discrepancy", LEAD)
-    reading = posterior.only.displacement.copy()
-    reading[list(missing)] = np.nan
-    posterior = posterior.altered(displacement=reading)
-    theta = truth(posterior)
-    rows = posterior.only.readings.rows
-    simulated = posterior.simulate(theta, rows)
-    left = carried(posterior.likelihood, theta, simulated)
-    later = np.array([rows[-1], rows[-1] + 3, rows[-1] + 50])
-
-    def covariance(one: IntArray, other: IntArray) -> FloatArray:
-        apart = np.abs(np.subtract.outer(one, other)) * INTERVAL
-        return np.asarray(SD**2 * np.exp(-apart / TIME))
-
-    noisy = covariance(rows, rows) + SENSOR**2 * np.eye(rows.size)
-    gain = np.linalg.solve(noisy, covariance(rows, later)).T
-    expected = gain @ (reading[rows] - simulated[0])
-    variance = SD**2 - np.sum(gain * covariance(later, rows), axis=1)
-    first = int(later[0])
-    means, told = (values[0][later - first] for values in left.after(first, 51))
-    np.testing.assert_allclose(means, expected, rtol=1e-9)
-    np.testing.assert_allclose(SD**2 * (1 - told), variance, rtol=1e-9)
 
 
 def whole(seed: int) -> tuple[Posterior, Record, FloatArray]:
