@@ -199,7 +199,7 @@ class Likelihood:
         """The noise for the interval between readings."""
         return self.noise.at(self.actuator.interval * self.readings.stride)
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """How many numbers are unknown of the start: the offset, if any, then the dynamics'."""
         return int(self.offset_sd > 0) + (0 if self.from_rest else self.actuator.unknowns)
