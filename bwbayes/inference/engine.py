@@ -27,16 +27,11 @@ def choose(choice: EngineChoice = "auto") -> Engine:
     InputError
         ``choice`` is not an engine, or is ``"numba"`` where numba is not installed.
     """
+    if choice not in ("auto", "numpy", "numba"):
+        raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")
     installed = find_spec("numba") is not None
-    match choice:
-        case "auto":
-            return "numba" if installed else "numpy"
-        case "numpy":
-            return "numpy"
-        case "numba":
-            if not installed:
-                raise InputError(
-                    "engine: numba is not installed; pip install numba, or choose the numpy engine"
-                )
-            return "numba"
-    raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")
+    if choice == "numba" and not installed:
+        raise InputError(
+            "engine: numba is not installed; pip install numba, or choose the numpy engine"
+        )
+    return "numba" if installed and choice != "numpy" else "numpy"

@@ -26,20 +26,9 @@ __all__ = ["PointFit", "fit", "peaks"]
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
 
-# Rounds of draws of the noise parameters, and the best that the next round is drawn around.
-ROUNDS, BEST = 4, 8
-
-# Residuals that least squares looks at: more would not move an optimum it is only to find.
-RESIDUALS = 1000
-
 # An optimum less probable than the best by this much, nats, is not a place to start from: it holds
 # nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
 HOPELESS = 30.0
-
-# Optima whose sums of squares and coordinates agree to this part are one.
-SAME = 1e-2
-# A place is a mode's if the density falls by less, nats, at so many points on the straight way.
-DIP, WAY = 0.5, 33
 
 
 @dataclass(frozen=True)
@@ -121,19 +110,19 @@ def _with_noise(
     The best draw alone may lie next to a lesser mode, such as the one where all is the sensor's
     noise: so draws around the best few are tried, closer and closer.
     """
-    size = noise.shape[1]
+    size, retained = noise.shape[1], 8
     physical = np.tile(position[: position.size - size], (len(noise), 1))
     best = np.empty((0, position.size))
     density = np.empty(0)
-    for _ in range(ROUNDS):
+    for _ in range(4):
         best = np.concatenate([best, np.hstack([physical, noise])])
         density = np.concatenate([density, posterior.log_density(best[-len(noise) :])])
-        order = np.argsort(-density, kind="stable")[:BEST]
+        order = np.argsort(-density, kind="stable")[:retained]
         best, density = best[order], density[order]
         if not size:
             break
         top = best[:, -size:]
-        chosen = top[generator.integers(BEST, size=len(noise))]
+        chosen = top[generator.integers(retained, size=len(noise))]
         noise = chosen + np.std(top, axis=0) * generator.standard_normal(noise.shape)
     winner: FloatArray = best[0]
     return winner
@@ -141,12 +130,13 @@ def _with_noise(
 
 def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:
     """Keep one place for each distinct optimum of least squares, the best first."""
+    same = 1e-2  # optima whose sums of squares and coordinates agree to this part are one
     costs = least_squares.costs(np.stack(places))
     distinct: list[int] = []
     for i in np.argsort(costs, kind="stable").tolist():
         separate = [
-            np.max(np.abs(places[i] - places[j]) / least_squares.spread) > SAME
-            or costs[i] > (1 + SAME) * costs[j]
+            np.max(np.abs(places[i] - places[j]) / least_squares.spread) > same
+            or costs[i] > (1 + same) * costs[j]
             for j in distinct
         ]
         if all(separate):
@@ -168,7 +158,8 @@ class _LeastSquares:
     ) -> None:
         self.posterior, self.center, self.spread, self.steps = posterior, center, spread, steps
         self.physical = np.array([n in posterior.table.physical for n in posterior.names])
-        stride = RESIDUALS // len(posterior.datasets)
+        # More residuals would not move an optimum that is only to be found.
+        stride = 1000 // len(posterior.datasets)
         training = [dataset.readings.rows for dataset in posterior.datasets]
         self.rows = [rows[:: max(rows.size // stride, 1)] for rows in training]
         total = sum(rows.size for rows in self.rows)
@@ -289,10 +280,10 @@ def _mode(
 
 
 def _leads_to(posterior: Posterior, position: FloatArray, mode: _Mode) -> bool:
-    """Tell whether the density rises, but for a dip, all the way from a place (free,) to a mode."""
-    path = np.linspace(0.0, 1.0, WAY)[:, np.newaxis]
+    """Tell whether the density rises from a place (free,) to a mode, but for dips of half a nat."""
+    path = np.linspace(0.0, 1.0, 33)[:, np.newaxis]
     density = posterior.log_density(position + path * (mode.position - position))
-    return bool(np.all(density > np.maximum.accumulate(density) - DIP))
+    return bool(np.all(density > np.maximum.accumulate(density) - 0.5))
 
 
 def _units(posterior: Posterior, position: FloatArray, spread: FloatArray) -> FloatArray:

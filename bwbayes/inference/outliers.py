@@ -30,15 +30,6 @@ __all__ = ["LIMIT", "outliers", "surprise"]
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0
 
-# Fits at most, each to the readings that the one before retained.
-ROUNDS = 10
-
-# Median of a standard normal's distance from zero.
-MEDIAN = float(ndtri(0.75))
-
-# If they are a larger part of the readings than this, they are not isolated outliers.
-MOST = 0.05
-
 
 def outliers(
     without: Callable[[Mapping[str, IntArray]], Posterior],
@@ -69,7 +60,7 @@ def outliers(
         for name, readings in readings_of.items()
     }
     cleared = {name: np.zeros_like(mask) for name, mask in aside.items()}
-    for _ in range(ROUNDS):
+    for _ in range(10):
         posterior = without({name: readings_of[name].rows[mask] for name, mask in aside.items()})
         point = pointfit.fit(posterior, generator.spawn(1)[0])
         before = dict(aside)
@@ -80,7 +71,7 @@ def outliers(
             )
             # Spikes in a fit make its noise larger than that of most readings: theirs counts, but
             # what a later fit clears needs the whole distance from then on.
-            typical = min(1.0, float(np.median(away[~mask])) / MEDIAN)
+            typical = min(1.0, float(np.median(away[~mask]) / ndtri(0.75)))
             cleared[name] = cleared[name] | (mask & (away <= LIMIT))
             suspect = (away > LIMIT * typical) & ~mask & ~cleared[name]
             aside[name] = (away > LIMIT) | suspect
@@ -88,7 +79,7 @@ def outliers(
         if all(np.array_equal(aside[name], before[name]) for name in aside):
             break
     for mask in aside.values():
-        _require_few(mask, MOST)
+        _require_few(mask, 0.05)
     return {name: readings_of[name].rows[mask] for name, mask in aside.items()}
 
 

@@ -32,12 +32,6 @@ __all__ = ["LOG_TWO_PI", "Filtered", "Noise"]
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
-# A covariance that changes by less of itself from reading to reading has settled.
-SETTLED = 2e-15
-
-# That is looked at after so many readings.
-LOOK = 8
-
 # Of the two states, (models, series) each, and three elements of their covariance, (models,).
 _Mean = tuple[FloatArray, FloatArray]
 _Covariance = tuple[FloatArray, FloatArray, FloatArray]
@@ -164,7 +158,7 @@ class Noise(ABC):
                 variance = p + sensor
                 gain, rest = p / variance, sensor / variance
                 gain_2 = p_12 / variance if two else p_12
-                if t > first and t % LOOK == 0 and _stays(before, predicted):
+                if t > first and t % 8 == 0 and _stays(before, predicted):
                     ahead = slice(t, last)
                     gains = gain, gain_2
                     mean = _settled(step, gains, mean, series[..., ahead], white[..., ahead], two)
@@ -234,10 +228,10 @@ def _predicted(
 
 
 def _stays(before: _Covariance, after: _Covariance) -> bool:
-    """Tell whether covariances are the same, each for the size of its parts."""
+    """Tell whether covariances are the same, each for the size of its parts, to rounding."""
     scales = after[0], np.sqrt(after[0] * after[2]), after[2]
     triples = zip(before, after, scales, strict=True)
-    return all(bool(np.all(np.abs(new - old) <= SETTLED * size)) for old, new, size in triples)
+    return all(bool(np.all(np.abs(new - old) <= 2e-15 * size)) for old, new, size in triples)
 
 
 def _settled(
