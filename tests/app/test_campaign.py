@@ -39,10 +39,11 @@ BROKEN = "time_s,voltage_V,displacement_um\n0,0,x\n"
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with three records, one that is broken, and a config; for reading."""
+    """Return three good records, one that is broken, two of one name, and a config; for reading."""
     path = tmp_path_factory.mktemp("given")
     specimens(path / "records", COUNT)
-    (path / "records/broken.csv").write_text(BROKEN)
+    for name in ("broken.csv", "twice.csv", "twice.h5"):
+        (path / "records" / name).write_text(BROKEN)
     (path / "records/notes.md").write_text("no record")
     (path / "small.toml").write_text(CONFIG)
     return path
@@ -77,18 +78,19 @@ def assert_same_end(expected: Path, got: Path) -> None:
 
 def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
     table = rows(whole)
-    assert ["broken", "s000", "s001", "s002"] == list(table)
-    assert "refused" == table["broken"]["status"]
+    assert ["broken", "s000", "s001", "s002", "twice"] == list(table)
+    assert "refused" == table["broken"]["status"] == table["twice"]["status"]
+    assert "twice.h5: shares its name with another record" in table["twice"]["reason"]
     assert "broken.csv:2: displacement_um: 'x' is not a number" in table["broken"]["reason"]
     summary = json.loads((whole / "campaign.json").read_text())
     assert {
-        "refused": 1,
+        "refused": 3,
         "not converged": 0,
         "validation failed": 0,
         "validation inconclusive": 0,
         "passed": COUNT,
     } == (summary["counts"])
-    for name in list(table)[1:]:
+    for name in list(table)[1:-1]:
         own = json.loads((whole / f"records/{name}/summary.json").read_text())
         for key in ("mean", "lower_95"):
             number = own["parameters"]["d"][key]
@@ -121,7 +123,7 @@ def test_the_command_says_which_records_were_refused_and_ends_with_2(
     said = bwbayes("campaign", "records", *options, "--out", tmp_path / "batch")
     assert 2 == said.status, said.err
     assert "REFUSED: broken: broken.csv:2:" in said.err
-    assert "4 records: 1 refused, 3 passed" in said.out
+    assert "6 records: 3 refused, 3 passed" in said.out
     assert_same_end(whole, tmp_path / "batch")
 
 
@@ -229,18 +231,6 @@ def test_another_config_or_folder_is_refused(given: Path, whole: Path, tmp_path:
         start(tmp_path / "empty", "", given, tmp_path / "batch")
 
 
-def test_files_that_share_a_name_are_refused_and_others_fitted(tmp_path: Path) -> None:
-    records = tmp_path / "records"
-    specimens(records, 1)
-    for name in ("twice.csv", "twice.h5"):
-        bw.write_record(record(5), records / name)
-    (tmp_path / "small.toml").write_text(CONFIG)
-    config = config_text(tmp_path / "small.toml")
-    folder = start(records, config, tmp_path, tmp_path / "batch", pictures=False)
-    by_file = {row.file: row.status for row in ended(folder).rows}
-    assert {"s000.csv": "passed", "twice.csv": "refused", "twice.h5": "refused"} == by_file
-
-
 def test_the_population_is_that_of_the_truths(whole: Path) -> None:
     told = json.loads((whole / "campaign.json").read_text())["population"]
     assert {"d", "alpha"} == set(told)
@@ -254,46 +244,48 @@ def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     page = (whole / "campaign.html").read_text(encoding="utf-8")
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 1 == page.count("data:image/png;base64,")
-    for text in ("broken.csv:2", "1 refused", '<th scope="row">alpha</th>', "Taken for normal"):
+    for text in ("broken.csv:2", "3 refused", '<th scope="row">alpha</th>', "Taken for normal"):
         assert text in page
     row = Row("<b>x", "x.csv", "refused", "<i>why</i>", {})
     assert "<b>x" not in render(Campaign(CampaignFolder(Path("x")), (row,), "few").report(), {})
 
 
-def test_python_has_table_population_and_the_next_specimen(tmp_path: Path) -> None:
-    records = {f"r{i}": record(i) for i in range(3)}
-    keys: dict[str, Any] = {
-        "dynamics": "none",
-        "noise": "white",
-        "seed": 3,
-        "ess": 200,
-        "walkers": 12,
-    }
-    keys |= {"block": 20, "pilot_steps": 60, "parameters": tomllib.loads(CONFIG)["parameters"]}
-    campaign = bw.campaign(records, progress=False, workers=1, folder=tmp_path / "batch", **keys)
-    assert ["r0", "r1", "r2"] == list(campaign.table.index)
+def test_python_has_table_population_and_the_next_specimen(
+    given: Path, whole: Path, tmp_path: Path
+) -> None:
+    """Of a campaign that is there; it warns of what is short."""
+    shutil.copytree(whole, tmp_path / "batch")
+    with pytest.warns(InputWarning, match="broken: refused: broken.csv:2"):
+        campaign = bw.campaign(
+            given / "records",
+            config=given / "small.toml",
+            folder=tmp_path / "batch",
+            progress=False,
+            workers=1,
+        )
+    assert ["broken", "s000", "s001", "s002", "twice", "twice"] == list(campaign.table.index)
     assert {"d", "alpha"} == set(campaign.population.parameters)
     assert {"d", "alpha"} == set(campaign.population.to_pandas().index)  # type: ignore[attr-defined]
-    assert ({}, {}) == (campaign.short, campaign.outliers)
-    assert campaign.fit("r1").converged
+    assert ({"broken", "twice"}, {}) == (set(campaign.short), campaign.outliers)
     # A specimen that was not measured is less sure than one that was.
     planned = replace(record(9), displacement=None)
     bands = campaign.predict(planned, from_rest=True)
-    own = campaign.fit("r1").predict(planned, from_rest=True)
+    own = campaign.fit("s001").predict(planned, from_rest=True)
     wide, narrow = (
         np.mean(b.upper["parameter", 95] - b.lower["parameter", 95]) for b in (bands, own)
     )
     assert wide > 5 * narrow
-    assert "3 records: 3 passed" == repr(campaign)
+    assert repr(campaign).startswith("6 records: 3 refused, 3 passed")
     assert campaign.plot().axes
 
 
-def test_python_warns_of_what_is_short(tmp_path: Path) -> None:
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records/broken.csv").write_text(BROKEN)
-    with pytest.warns(InputWarning, match="broken: refused: broken.csv:2"):
-        campaign = bw.campaign(tmp_path / "records", progress=False, dynamics="none")
+def test_python_fits_records_by_name(tmp_path: Path) -> None:
+    keys = tomllib.loads(CONFIG)
+    keys |= keys.pop("model") | keys.pop("sampling")
+    del keys["record"]
+    campaign = bw.campaign({"r0": record(0)}, progress=False, workers=1, **keys)
+    assert campaign.fit("r0").converged
     with pytest.raises(InputError, match="no population: a population needs 3 records or more"):
         _ = campaign.population
     with pytest.raises(InputError, match="either config or keys"):
-        bw.campaign(tmp_path / "records", config="x.toml", dynamics="none")
+        bw.campaign(tmp_path, config="x.toml", dynamics="none")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -72,41 +73,22 @@ print(json.dumps({
 """
 
 
-@pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Return what the script saw; ``-I`` keeps the checkout out of its path as well."""
-    run = subprocess.run(
-        [sys.executable, "-I", "-c", SCRIPT],
-        cwd=small.finished(tmp_path_factory),
-        capture_output=True,
-        text=True,
-        check=False,
+def test_files_open_with_arviz_xarray_pandas_corner_and_numpy(run: Path) -> None:
+    """``-I`` keeps the checkout out of the script's path as well."""
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", SCRIPT], cwd=run, capture_output=True, text=True, check=False
     )
-    assert run.returncode == 0, run.stderr
-    values: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
-    return values
-
-
-def test_the_posterior_opens_with_arviz_and_xarray(seen: dict[str, Any]) -> None:
+    assert done.returncode == 0, done.stderr
+    seen: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     for name, mean in seen["parameters"].items():
         assert seen["mean"][name] == pytest.approx(mean, rel=1e-6)
         assert seen["xarray_mean"][name] == pytest.approx(mean, rel=1e-6)
     assert ("um/V", "um", 1) == (seen["units"]["d"], seen["units"]["offset"], seen["converged"])
     assert seen["readings"] == 300
-
-
-def test_corner_draws_it(seen: dict[str, Any]) -> None:
     assert seen["panels"] == len(seen["names"]) ** 2
-
-
-def test_the_bands_open_with_pandas(seen: dict[str, Any]) -> None:
     assert ["held-out", "sine", "training"] == seen["sets"]
     assert ["set", "time_s", "voltage_V", "displacement_um", "mean_um"] == seen["columns"][:5]
     assert 0.85 < seen["covered"] <= 1
-
-
-def test_the_chain_opens_with_numpy(seen: dict[str, Any], tmp_path_factory: Any) -> None:
-    steps = small.numbers(small.finished(tmp_path_factory))["steps"]
     assert 3 == seen["seed"]
-    assert [steps, 4, 18] == seen["chain"]
+    assert [small.numbers(run)["steps"], 4, 18] == seen["chain"]
     assert [*seen["chain"], len(seen["names"])] == seen["coordinates"]

@@ -95,10 +95,7 @@ def test_readings_scored_one_by_one_count_as_independent_ones() -> None:
     gain = 2 + 0.1 * noise(3)
     for joint, total in ((True, np.sum(gain)), (False, np.sum(gain) / 10)):
         rich, plain = (
-            replace(
-                model(name, None),
-                parts={"other": Part(scores, 200, 20.0, joint)},
-            )
+            replace(model(name, None), parts={"other": Part(scores, 200, 20.0, joint)})
             for name, scores in (("rich", COMMON + gain), ("plain", COMMON))
         )
         comparison = recommend([plain, rich])
@@ -129,10 +126,8 @@ def test_errors_cover_differences_of_correlated_blocks() -> None:
 
 
 def test_an_evidence_that_is_not_known_decides_nothing() -> None:
-    unknown = replace(
-        model("rich", COMMON + 0.1 * noise(2), free=9),
-        evidence=Evidence(np.nan, np.inf, 0.0, 0.0),
-    )
+    rich = model("rich", COMMON + 0.1 * noise(2), free=9)
+    unknown = replace(rich, evidence=Evidence(np.nan, np.inf, 0.0, 0.0))
     comparison = recommend([model("plain", COMMON, 10.0), unknown])
     assert {*comparison.tied, comparison.recommended} == {"plain", "rich"}
 
@@ -149,26 +144,20 @@ def test_without_hysteresis_it_says_so() -> None:
 
 
 def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
+    """What was only screened is in the table, and no caveat."""
     lost = Candidate("lost", "lost", False, "budget used up", 4, 1000)
-    comparison = recommend([lost, model("plain", COMMON)])
+    evidence = Evidence(-300.0, np.inf, 0.0, 0.0, 5.0, -290.0)
+    far = Candidate("far", "far", False, "", 4, 1000, evidence=evidence, screened=True)
+    comparison = recommend([lost, far, model("plain", COMMON)])
     assert comparison.recommended == "plain"
-    assert comparison.candidates[-1] is lost
-    expected = "lost has not converged (budget used up) and is not judged"
-    assert comparison.caveats[-1] == expected
+    assert comparison.candidates[1:] == (far, lost)
+    assert comparison.caveats == ("lost has not converged (budget used up) and is not judged",)
+    assert comparison.lines[0] == "plain is recommended"
+    assert comparison.lines[-1].startswith("only screened")
+    assert "about -300" in str(comparison)
     comparison = recommend([lost])
     assert comparison.recommended is None
     assert "not converged" in str(comparison)
-
-
-def test_what_was_only_screened_is_in_the_table_and_no_caveat() -> None:
-    evidence = Evidence(-300.0, np.inf, 0.0, 0.0, 5.0, -290.0)
-    far = Candidate("far", "far", False, "", 4, 1000, evidence=evidence, screened=True)
-    comparison = recommend([far, model("plain", COMMON)])
-    assert comparison.caveats == ()
-    assert comparison.lines[0] == "plain is recommended"
-    assert comparison.lines[-1].startswith("only screened")
-    assert "only screened" in str(comparison)
-    assert "about -300" in str(comparison)
 
 
 def test_a_reading_held_for_impossible_settles_it() -> None:
