@@ -9,7 +9,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.wording import as_typed
-from tests.app import small
+from bwbayes.app.jobs.simulate import simulate
 
 
 @pytest.mark.parametrize(
@@ -36,24 +36,22 @@ def test_python_becomes_what_is_typed(said: str, typed: str) -> None:
 
 
 def test_the_same_error_in_python_and_on_the_command_line(
-    tmp_path_factory: pytest.TempPathFactory,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = small.finished(tmp_path_factory)
-    fit = bw.open_run(run)
-    fit.export(tmp_path / "out")
-    with pytest.raises(bw.InputError, match=r"model\.json: exists; .* or give `overwrite=True`$"):
-        fit.export(tmp_path / "out")
-    monkeypatch.setattr("sys.argv", ["bwbayes", "export", str(run), "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert capsys.readouterr().err.endswith("exists; choose another name, or give `--overwrite`\n")
+    def refused(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["bwbayes", *arguments])
+        with pytest.raises(SystemExit):
+            cli.main()
+        return capsys.readouterr().err
+
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    record = tmp_path / "a.csv"
+    record.write_text("")
+    line = refused("simulate", str(record))
+    assert line.endswith("exists; choose another name, or give `--overwrite`\n")
+    with pytest.raises(bw.InputError, match=r"exists; .* or give `overwrite=True`$"):
+        simulate(record)
+    line = refused("resume", "nowhere")
+    assert line.endswith("no run here; start one with `bwbayes run RECORD --out nowhere`\n")
     with pytest.raises(bw.InputError, match=r"start one with `bwbayes\.fit\(RECORD, folder='"):
         bw.open_run("nowhere")
-    monkeypatch.setattr("sys.argv", ["bwbayes", "resume", "nowhere"])
-    with pytest.raises(SystemExit):
-        cli.main()
-    said = "nowhere: no run here; start one with `bwbayes run RECORD --out nowhere`\n"
-    assert capsys.readouterr().err.endswith(said)

@@ -11,26 +11,21 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.products import compensate as command
-from bwbayes.app.fit.fitted import converged
-from bwbayes.app.jobs.compensate import compensate
 from bwbayes.control.references import shaped
 from bwbayes.errors import InputError
+from tests.app.conftest import Type
 
-VOLTAGE = (-100.0, 100.0)
 
-
-def asked_file(folder: Path, values: Any, interval: float = 0.02) -> Path:
+def write_reference(folder: Path, values: Any) -> Path:
     path = folder / "asked.csv"
-    time = interval * np.arange(len(values))
-    rows = [f"{t:.9g},{x}" for t, x in zip(time, values, strict=True)]
+    rows = [f"{0.02 * i:.9g},{value}" for i, value in enumerate(values)]
     path.write_text("\n".join(["time_s,displacement_nm", *rows, ""]), encoding="utf-8")
     return path
 
 
-def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Path) -> None:
+def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
-    made = compensate(converged(run), shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
+    made = fit.compensate(shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
     files = made.save(tmp_path / "new")
     names = ["command.csv", *(f"compensation.{kind}" for kind in ("json", "csv", "html"))]
     assert names == [path.name for path in files]
@@ -53,41 +48,40 @@ def test_files_say_the_same_and_the_command_is_a_record(run: Path, tmp_path: Pat
 
 
 @pytest.mark.filterwarnings("ignore:between samples")
-def test_a_file_an_array_and_a_fit_give_one_command(run: Path, tmp_path: Path) -> None:
+def test_a_file_and_an_array_give_one_command(fit: bw.Fit, tmp_path: Path) -> None:
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
-    path = asked_file(tmp_path, [repr(float(1e3 * value)) for value in values])
-    by_file = compensate(converged(run), path, from_rest=True)
-    fit = bw.open_run(run)
-    by_array = fit.compensate(values, from_rest=True)
+    path = write_reference(tmp_path, [repr(float(1e3 * value)) for value in values])
+    by_file, by_array, again = (
+        fit.compensate(reference, from_rest=True) for reference in (path, values, values)
+    )
     np.testing.assert_allclose(by_file.asked, values, rtol=1e-12)
     np.testing.assert_allclose(by_file.voltage, by_array.voltage, atol=1e-9)
     assert "rms error" in repr(by_array)
     assert len(by_array.to_pandas()) == 200
     assert len(by_array.plot().axes) == 3
-    again = fit.compensate(values, from_rest=True)
     np.testing.assert_array_equal(by_array.compensated.rms, again.compensated.rms)
 
 
-def test_a_shape_is_that_of_the_command_line(run: Path, tmp_path: Path) -> None:
+def test_a_shape_is_that_of_the_command_line(
+    bwbayes: Type, run: Path, fit: bw.Fit, tmp_path: Path
+) -> None:
     """By its name, with the same numbers; with options left out, the same defaults."""
-    arguments = ["triangle", "--amplitude", "30", "--frequency", "1", "--periods", "2"]
-    out = ["--from-rest", "--limit", "5", "--out", str(tmp_path)]
-    assert 0 == command.main([str(run), *arguments, *out], standalone_mode=False)
-    numbers = json.loads((tmp_path / "compensation.json").read_text())
-    fit = bw.open_run(run)
+    shape = "triangle", "--amplitude", 30, "--frequency", 1, "--periods", 2
+    said = bwbayes("compensate", run, *shape, "--from-rest", "--limit", 5, "--out", "out")
+    assert 0 == said.status
+    numbers = json.loads((tmp_path / "out/compensation.json").read_text())
     options: dict[str, Any] = {"amplitude": 30, "frequency": np.int64(1), "periods": 2}
     with pytest.warns(bw.InputWarning) as warned:
         made = fit.compensate("triangle", **options, from_rest=True, limit=5)
     assert numbers == made.summary
-    assert numbers["remarks"] == [str(one.message) for one in warned]
+    assert numbers["remarks"] == [str(warning.message) for warning in warned]
     assert Path(__file__).name == Path(warned[0].filename).name
     assert "triangle" == made.reference.name
-    shape = shaped("triangle", 0.02, 30.0, 1.0, periods=2)
-    np.testing.assert_array_equal(made.asked, shape.given)
-    again = compensate(converged(run), shape, from_rest=True, limit=5)
-    assert numbers == again.summary
-    assert numbers == compensate(converged(run), made.reference, from_rest=True, limit=5).summary
+    same = shaped("triangle", 0.02, 30.0, 1.0, periods=2)
+    np.testing.assert_array_equal(made.asked, same.given)
+    with pytest.warns(bw.InputWarning):
+        assert numbers == fit.compensate(same, from_rest=True, limit=5).summary
 
 
 @pytest.mark.parametrize(
@@ -102,6 +96,8 @@ def test_a_shape_is_that_of_the_command_line(run: Path, tmp_path: Path) -> None:
         ([0.0, 1.0] * 10, {"amplitude": 1.0}, "displacements take no amplitude; leave it out, or"),
         ("a.csv", {"interval": 1.0}, "a file takes no interval; leave it out, or give one of sine"),
         (shaped("sine", 0.02, 1.0, 1.0), {"smoothed": 0.1}, "made already takes no smoothed"),
+        (shaped("sine", 0.02, 40.0, 10.0), {"slew": 500.0}, "it is faster than the amplifier's"),
+        ([0.0, *[900.0] * 49], {}, "on it is beyond the amplifier's"),
         ("sine", {"amplitud": 1.0}, "compensate: amplitud is unknown; did you mean amplitude?"),
         (
             "sine",
@@ -111,11 +107,10 @@ def test_a_shape_is_that_of_the_command_line(run: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_reference_is_one_line(
-    run: Path, reference: Any, options: dict[str, Any], line: str
+    fit: bw.Fit, reference: Any, options: dict[str, Any], line: str
 ) -> None:
-    fit = bw.open_run(run)
     with pytest.raises(InputError, match=re.escape(line)) as refused:
-        fit.compensate(reference, **options)
+        fit.compensate(reference, from_rest=True, voltage=(-100.0, 100.0), **options)
     assert "\n" not in str(refused.value)
 
 
@@ -125,20 +120,12 @@ def test_what_is_no_reference_is_one_line(
         ([0.0, 1.0, 2.0], "give one row of 10 samples or more"),
         ([5000.0] * 50, "is 5 um all along"),
         (["nan", *range(49)], "not a number; give one at every sample"),
-        ([0.0, *[9e5] * 49], r"needs .* V, and from .* s on it is beyond the amplifier's"),
         ([], "no columns of numbers in it"),
     ],
 )
-def test_references_that_cannot_be_used_are_one_line(
-    run: Path, tmp_path: Path, values: list[Any], line: str
+def test_files_that_cannot_be_used_are_one_line(
+    fit: bw.Fit, tmp_path: Path, values: list[Any], line: str
 ) -> None:
-    path = asked_file(tmp_path, values)
     with pytest.raises(InputError, match=line) as refused:
-        compensate(converged(run), path, from_rest=True, voltage=VOLTAGE)
+        fit.compensate(write_reference(tmp_path, values), from_rest=True)
     assert "\n" not in str(refused.value)
-
-
-def test_what_is_too_fast_says_where_and_how_fast(run: Path) -> None:
-    fast = shaped("sine", 0.02, 40.0, 10.0)
-    with pytest.raises(InputError, match=r"V/s, and from .* it is faster than the amplifier's"):
-        compensate(converged(run), fast, from_rest=True, voltage=VOLTAGE, slew=500.0)
