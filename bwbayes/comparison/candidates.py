@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray
 from bwbayes.comparison.evidence import Evidence
-from bwbayes.comparison.leave_future_out import Part
+from bwbayes.comparison.leave_future_out import Part, judged
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
 
-__all__ = ["Candidate", "judged"]
+__all__ = ["Candidate"]
 
 
 @dataclass(frozen=True)
@@ -149,11 +148,3 @@ class Candidate:
             "aic": self.criterion(2.0),
             "bic": self.criterion(float(np.log(self.readings))),
         }
-
-
-def judged(bands: Bands) -> BoolArray:
-    """Tell which samples of bands have a reading that is judged."""
-    assert bands.measured is not None
-    inside: BoolArray = np.isfinite(bands.measured)
-    inside[: bands.scored_from] = False
-    return inside

@@ -27,7 +27,7 @@ from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 
-__all__ = ["BLOCKS", "FUTURE", "Part", "bands_part", "cut", "leave_future_out", "log_ratios"]
+__all__ = ["BLOCKS", "FUTURE", "Part", "bands_part", "judged", "leave_future_out", "log_ratios"]
 
 # What the later half of the training readings is called.
 FUTURE = "later training"
@@ -146,19 +146,25 @@ def _path(
     return path
 
 
-def bands_part(bands: Bands, judged: BoolArray) -> Part | None:
-    """Return the part that another record is, from its bands; None without a reading.
+def judged(bands: Bands) -> BoolArray:
+    """Tell which samples of bands have a reading that is judged."""
+    assert bands.measured is not None
+    inside: BoolArray = np.isfinite(bands.measured)
+    inside[: bands.scored_from] = False
+    return inside
 
-    ``judged`` (samples,) tells which readings count.
+
+def bands_part(bands: Bands) -> Part | None:
+    """Return the part that another record is, from its bands; None without a reading to judge.
 
     What its start leaves open, each draw has an answer to of its own, so that its readings' joint
     density would be that of the luckiest draw: their own densities stand, and count as independent
     ones do.
     """
-    if bands.measured is None or bands.log_score is None or not judged.any():
+    if bands.measured is None or bands.log_score is None or not judged(bands).any():
         return None
-    residual = (bands.measured - bands.mean)[judged]
-    blocks = np.array_split(bands.log_score[judged], BLOCKS)
+    residual = (bands.measured - bands.mean)[judged(bands)]
+    blocks = np.array_split(bands.log_score[judged(bands)], BLOCKS)
     sums = np.array([block.sum() for block in blocks])
     return Part(sums, residual.size, residual.size / _correlation_time(residual), joint=False)
 

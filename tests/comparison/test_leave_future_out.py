@@ -164,8 +164,9 @@ def test_the_residuals_worth_is_their_number_over_their_correlation_time() -> No
             bands,
             measured=bands.mean + residual,
             log_score=np.full(residual.size, -1.5),
+            scored_from=0,
         )
-        part = bands_part(read, np.ones(residual.size, dtype=bool))
+        part = bands_part(read)
         assert part is not None
         assert part.worth == pytest.approx(residual.size / time, rel=0.35)
         assert np.sum(part.log_scores) == pytest.approx(-1.5 * residual.size)

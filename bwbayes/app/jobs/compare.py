@@ -32,7 +32,7 @@ from bwbayes.app.running.run import begin, draw, resume
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.calibration.replicates import as_done
-from bwbayes.comparison.candidates import Candidate, judged
+from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import evidence, screening_evidence
 from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
@@ -232,7 +232,7 @@ def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidat
     rng = generator(seed, "future")
     parts = leave_future_out(posterior, problem.plan, flat, windows, rng, pool, future=future)
     for prediction in bands:
-        part = bands_part(prediction, judged(prediction))
+        part = bands_part(prediction)
         if part is not None and problem.validations[prediction.name].record is not None:
             parts[prediction.name] = part
     extent = max(dataset.extent for dataset in posterior.datasets)
