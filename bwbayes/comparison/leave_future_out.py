@@ -140,7 +140,8 @@ def _path(
         windows = dict(training)
         for name, later in rows.items():
             end = int(later[k * later.size // BLOCKS]) if k < BLOCKS else added[name][-1].stop
-            known = training[name] + cut(added[name], end)
+            later_windows = [slice(w.start, min(w.stop, end)) for w in added[name] if w.start < end]
+            known = [*training[name], *later_windows]
             windows[name] = tuple(sorted(known, key=lambda window: window.start))
         path.append(posterior.trained(windows))
     return path
@@ -167,11 +168,6 @@ def bands_part(bands: Bands) -> Part | None:
     blocks = np.array_split(bands.log_score[judged(bands)], BLOCKS)
     sums = np.array([block.sum() for block in blocks])
     return Part(sums, residual.size, residual.size / _correlation_time(residual), joint=False)
-
-
-def cut(windows: tuple[slice, ...], end: int) -> tuple[slice, ...]:
-    """Return what windows have of the samples before ``end``."""
-    return tuple(slice(w.start, min(w.stop, end)) for w in windows if w.start < end)
 
 
 def log_ratios(
