@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
-from typing import NamedTuple, TypedDict
+from typing import TypedDict
 
 import numpy as np
 
@@ -157,11 +157,14 @@ class Experiment:
         return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
 
 
-class Replicate(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Replicate:
     """One record, simulated and fitted: what is stored, and (RANKED, statistics) posterior draws.
 
     The draws are empty, and nothing is ranked or covered, if there are not so many.
     """
+
+    __repr__ = brief
 
     entry: Entry
     draws: FloatArray

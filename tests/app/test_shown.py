@@ -58,7 +58,7 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     with ThreadPoolExecutor(1) as executor:
         (replicate,) = replicates(experiment, 1, [0], executor)
     many = population(drawn(rng).specimens, rng)
-    rows = tuple(Row(f"s{i}", f"s{i}.csv", "refused", "because " * 40, {}) for i in range(200))
+    rows = tuple(Row(f"r{i}", f"r{i}.csv", "refused", "because " * 40, {}) for i in range(200))
     return [
         fit,
         record,

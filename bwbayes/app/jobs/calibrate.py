@@ -134,10 +134,10 @@ def resume(
             path.unlink(missing_ok=True)
         shutil.rmtree(folder.path / "figures", ignore_errors=True)
         unconverged = sum(not entry["converged"] for entry in entries.values())
-        for entry, _ in batch(
+        for made in batch(
             replicate,
             [(common, seed, number) for number in range(requested) if number not in entries],
-            lambda made: "" if made.entry["converged"] else "not converged",
+            lambda result: "" if result.entry["converged"] else "not converged",
             console=console,
             kind="replicate",
             done=len(entries),
@@ -145,8 +145,8 @@ def resume(
             workers=workers,
             backend=executor,
         ):
-            entries[entry["number"]] = entry
-            _append(folder, json.dumps(entry))
+            entries[made.entry["number"]] = made.entry
+            _append(folder, json.dumps(made.entry))
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         provenance = {
