@@ -14,23 +14,26 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from bwbayes.app.running import cluster as cluster_module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
-from bwbayes.app.running.workers import executor, side_by_side
+from bwbayes.app.running.workers import executor, one_thread, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.engine import Engine
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.app import small
-from tests.inference.problems import short_posterior
+from tests.inference.problems import short_posterior, truth
 
 distributed = pytest.importorskip("distributed", reason="bwbayes[dask] is not installed")
 
@@ -147,28 +150,6 @@ def test_a_worker_killed_within_a_block_costs_no_bit(
 
 
 @pytest.mark.slow
-def test_with_the_scheduler_lost_the_chain_is_resumed_here(here: Any) -> None:
-    """One line says so, the blocks that are there stay, and the end is the same to the bit."""
-    one, begun = posterior(), chain()
-    with scheduler(1) as (address, main, _):
-
-        def watcher(*_: object) -> None:
-            if begun.blocks("pilot"):
-                main.kill()
-
-        with (
-            executor(backend=f"dask://{address}") as pool,
-            pytest.raises(BrokenExecutor, match="the scheduler is gone"),
-        ):
-            sample(one, PLAN, begun, pool, watcher)
-    assert 0 < begun.blocks("pilot")
-    assert not begun.blocks("sampling")
-    with executor(1) as pool:
-        sample(one, PLAN, begun, pool)
-    np.testing.assert_array_equal(here, draws(one, begun))
-
-
-@pytest.mark.slow
 def test_with_the_scheduler_lost_a_run_is_resumed_here(tmp_path: Path) -> None:
     expected = resume(small.begun(tmp_path / "here"), small.quiet(), workers=1, files=False)
     folder = small.begun(tmp_path / "there")
@@ -231,12 +212,30 @@ def test_a_process_that_dies_ends_the_work_at_once() -> None:
 
 def test_whoever_is_interrupted_does_not_wait_for_processes() -> None:
     begun = time.monotonic()
+
+    def interrupted() -> None:
+        with executor(1, backend="processes") as pool:
+            pool.submit(time.sleep, PATIENCE)
+            raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        _interrupted()
+        interrupted()
     assert time.monotonic() - begun < PATIENCE / 2
 
 
-def _interrupted() -> None:
-    with executor(1, backend="processes") as pool:
-        pool.submit(time.sleep, PATIENCE)
-        raise KeyboardInterrupt
+def linear_algebra_threads() -> set[int]:
+    """Return how many threads the linear algebra libraries of this process use."""
+    np.linalg.solve(np.eye(2), np.eye(2))
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_get_the_whole_model_and_use_one_thread_each(workers: int, engine: Engine) -> None:
+    model = replace(posterior(), engine=engine)
+    theta = truth(model)
+    with one_thread(), executor(workers, engine) as pool:
+        threads = [pool.submit(linear_algebra_threads) for _ in range(2 * workers)]
+        assert [{1}] * len(threads) == [future.result() for future in threads]
+        density = pool.submit(model.log_likelihood, theta).result()
+    np.testing.assert_array_equal(model.log_likelihood(theta), density)

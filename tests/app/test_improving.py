@@ -53,7 +53,7 @@ def test_a_quadratic_gain_is_added_and_the_run_says_what_it_is_worth() -> None:
     assert fit.verdicts["rest"].holds is not False
 
 
-@pytest.mark.parametrize("kind", ["good", "transient"])
+@pytest.mark.parametrize("kind", [pytest.param("good", marks=pytest.mark.slow), "transient"])
 def test_nothing_is_added_to_a_right_model_or_for_what_the_actuator_did_not_do(
     kind: str, tmp_path: Path
 ) -> None:

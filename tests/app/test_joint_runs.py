@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 import bwbayes
 from bwbayes.app.config.config import Config, dump, parse
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.config.models import models_of
 from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.jobs.calibrate import experiment
@@ -154,11 +156,10 @@ def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
         _ = made.residuals
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_a_chain_of_several_records_goes_on_and_knows_its_own(
     finished: RunFolder, tmp_path: Path
 ) -> None:
-    import shutil  # noqa: PLC0415
-
     copy = tmp_path / "run"
     shutil.copytree(finished.path, copy)
     resume(RunFolder(copy), small.quiet(), workers=1)
@@ -248,8 +249,6 @@ def measured(seed: int, gain: float = 0.6) -> Record:
 
 
 def test_python_takes_a_list_or_a_dict_of_records(tmp_path: Path) -> None:
-    from bwbayes.app.config.keywords import config_of  # noqa: PLC0415
-
     one, two = measured(1), measured(2)
     made, records = config_of([one, two], {"train": (0, 1), "dynamics": "none"})
     assert ["record_1", "record_2"] == [*made.records] == [*records]
@@ -320,25 +319,19 @@ def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
             ("gamma = { fixed = 0.0172 }", '"offset[stp]" = { fixed = 0.0 }'),
             r"parameters\.offset\[stp\]: no such parameter here; did you mean offset\[step\]",
         ),
-        (
-            ('dynamics = "none"', 'dynamics = "none"\nshared = ["initial"]'),
-            None,
-        ),
-        (
-            ("from_rest = true\ndecimate", "decimate"),
-            None,
-        ),
     ],
 )
-def test_what_several_records_cannot_be_is_refused(
-    change: tuple[str, str], message: str | None
-) -> None:
-    """Sharing initial is possible, and so is one record at rest beside another that is not."""
-    if message is None:
-        assert problem(change).posterior.names
-        return
+def test_what_several_records_cannot_be_is_refused(change: tuple[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         problem(change)
+
+
+def test_initial_may_be_shared_and_one_record_alone_be_at_rest() -> None:
+    for change in (
+        ('dynamics = "none"', 'dynamics = "none"\nshared = ["initial"]'),
+        ("from_rest = true\ndecimate", "decimate"),
+    ):
+        assert problem(change).posterior.names
 
 
 def test_files_in_another_unit_and_of_another_interval(tmp_path: Path) -> None:

@@ -226,21 +226,6 @@ def test_request_to_stop_ends_in_order(
     assert not (folder / "summary.json").exists()
 
 
-def test_second_command_for_the_same_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(small.TEXT)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/small.toml").write_text(small.TEXT)
-    command = ("run", "small.toml", "--out", "a", "--quiet", "--workers", "1")
-    with started(tmp_path, *command) as process:
-        wait(process, blocks("pilot", 1), tmp_path / "a")
-        for other in (("resume", "../a"), ("run", "small.toml", "--out", "../a", "--overwrite")):
-            status, out, err = finished(tmp_path / "other", *other, "--quiet")
-            assert (2, "") == (status, out)
-            says = "another process is writing this run; wait for it to end"
-            assert f"bwbayes: ../a: {says}\n" == err
-        assert process.is_alive()
-
-
 # Slow
 
 

@@ -9,83 +9,68 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.prediction.loops import MEASURES, Loops, measure_loops
-from bwbayes.prediction.steps import STEP_MEASURES, Step, StepResponse, measure_step
-from bwbayes.report.result import Result, summary
+from bwbayes.prediction.loops import MEASURES, measure_loops
+from bwbayes.prediction.steps import STEP_MEASURES, Step, measure_step
+from bwbayes.report.result import summary
 from tests.app import example
 from tests.app.test_report import rows
 from tests.inference.problems import decaying_sine, posterior_of
 
 
+def posterior(creep: Creep | None = None, middle: float = 0.0) -> Posterior:
+    voltage = decaying_sine(200) + middle
+    actuator = Actuator("lag", "first", 0.01, creep=creep)
+    return posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
+
+
 @pytest.fixture(scope="module")
-def measured() -> Loops:
-    voltage = decaying_sine(200) + 130.0  # does not go through zero
-    actuator = Actuator("lag", "first", 0.01)
-    of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
-    return measure_loops(of, of.prior.draw(np.random.default_rng(1), 30))
+def measured() -> dict[str, Any]:
+    """Return loops, away from zero volt, and steps without and with creep."""
+    off, steps = posterior(middle=130.0), {}
+    for name, creep in (("one", None), ("two", Creep((0.1, 1.0)))):
+        of = posterior(creep)
+        draws = of.prior.draw(np.random.default_rng(1), 20)
+        steps[name] = measure_step(of, draws, Step(50.0, 5.0))
+    loops = measure_loops(off, off.prior.draw(np.random.default_rng(1), 30))
+    return {"loops": loops, "steps": steps}
 
 
-def with_loops(measured: Loops, *, converged: bool = True) -> Result:
-    return dataclasses.replace(example.run(converged), loops=measured)
-
-
-def test_table_is_the_summarys(measured: Loops) -> None:
-    run = with_loops(measured)
-    kept: Any = summary(run)["loops"]
-    table = rows(example.page(run), "loops")
-    for name, (title, unit) in MEASURES.items():
-        *texts, shown_unit = table[title]
+@pytest.mark.parametrize(
+    ("table", "key", "measures"),
+    [("loops", "loops", MEASURES), ("steps", "step_responses", STEP_MEASURES)],
+)
+def test_the_table_is_the_summarys(
+    measured: dict[str, Any], table: str, key: str, measures: dict[str, tuple[str, str]]
+) -> None:
+    run = dataclasses.replace(example.run(), **measured)
+    columns: Any = summary(run)[key]
+    shown = rows(example.page(run), table)
+    for name, (title, unit) in measures.items():
+        *texts, shown_unit = shown[title]
         assert unit.replace("um", "µm") == shown_unit
-        for loop, cells in (("major", texts[:2]), ("minor", texts[2:])):
-            one = kept[loop][name]
-            if one is None:
+        for column, cells in zip(columns.values(), (texts[:2], texts[2:]), strict=True):
+            estimate = column[name]
+            if estimate is None:
                 assert ["–"] * 2 == cells
                 continue
-            shown = [float(text) for cell in cells for text in re.split(" ± | to ", cell)]
-            expected = [one[key] for key in ("mean", "sd", "lower_95", "upper_95")]
-            assert expected == pytest.approx(shown, abs=0.0503 * one["sd"], rel=0)
-    assert kept["major"]["opening_um"] is None
+            numbers = [float(text) for cell in cells for text in re.split(" ± | to ", cell)]
+            expected = [estimate[key] for key in ("mean", "sd", "lower_95", "upper_95")]
+            assert expected == pytest.approx(numbers, abs=0.0503 * estimate["sd"], rel=0)
 
 
-def test_without_convergence_no_loop_is_shown(measured: Loops) -> None:
-    run = with_loops(measured, converged=False)
-    assert summary(run)["loops"] is None
-    assert 'id="loops"' not in example.page(run, pictures={"loops": b""})
-    assert "loops" not in example.figures(run)
+def test_what_a_loop_or_step_has_not_is_not_there(measured: dict[str, Any]) -> None:
+    numbers: Any = summary(dataclasses.replace(example.run(), **measured))
+    assert numbers["loops"]["major"]["opening_um"] is None  # it does not go through zero
+    assert numbers["step_responses"]["one"]["creep_percent"] is None
 
 
-@pytest.fixture(scope="module")
-def steps() -> dict[str, StepResponse]:
-    voltage = decaying_sine(200)
-    outcome = {}
-    for name, creep in (("one", None), ("two", Creep((0.1, 1.0)))):
-        actuator = Actuator("lag", "first", 0.01, creep=creep)
-        of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=True)
-        draws = of.prior.draw(np.random.default_rng(1), 20)
-        outcome[name] = measure_step(of, draws, Step(50.0, 5.0))
-    return outcome
-
-
-def test_table_of_steps_is_the_summarys(steps: dict[str, StepResponse]) -> None:
-    run = dataclasses.replace(example.run(), steps=steps)
-    kept: Any = summary(run)["step_responses"]
-    table = rows(example.page(run), "steps")
-    for name, (title, _) in STEP_MEASURES.items():
-        *texts, _ = table[title]
-        for step, cells in (("one", texts[:2]), ("two", texts[2:])):
-            one = kept[step][name]
-            if one is None:
-                assert ["–"] * 2 == cells
-            else:
-                mean = float(cells[0].split(" ± ")[0])
-                assert one["mean"] == pytest.approx(mean, abs=0.0503 * one["sd"])
-    assert kept["one"]["creep_percent"] is None
-
-
-def test_without_convergence_no_step_is_shown(steps: dict[str, StepResponse]) -> None:
-    run = dataclasses.replace(example.run(converged=False), steps=steps)
-    assert summary(run)["step_responses"] is None
-    assert 'id="steps"' not in example.page(run, pictures={"steps": b""})
-    assert "steps" not in example.figures(run)
+def test_without_convergence_neither_is_shown(measured: dict[str, Any]) -> None:
+    run = dataclasses.replace(example.run(converged=False), **measured)
+    assert summary(run)["loops"] is summary(run)["step_responses"] is None
+    page = example.page(run, pictures={"loops": b"", "steps": b""})
+    assert 'id="loops"' not in page
+    assert 'id="steps"' not in page
+    assert not {"loops", "steps"} & example.figures(run).keys()

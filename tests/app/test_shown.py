@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from types import FunctionType, MethodType
@@ -19,73 +18,36 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign import Row
 from bwbayes.app.running.campaign_folder import CampaignFolder
-from bwbayes.calibration.evaluation import judge
-from bwbayes.calibration.replicates import Experiment, replicates
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, track
-from bwbayes.diagnosis.validation import Background, assess
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.noise import noise_model
-from bwbayes.model.actuator import Actuator
-from bwbayes.model.distributions import Distribution
 from bwbayes.population.population import population
-from bwbayes.prediction.initial_state import Start
-from bwbayes.prediction.loops import measure_loops
-from bwbayes.prediction.prediction import predict_record
-from bwbayes.prediction.scores import score
-from bwbayes.prediction.steps import Step, measure_step
-from bwbayes.sampling.sampler import first_chain
 from bwbayes.shown import LONGEST, MOST_LINES, brief, head
-from tests.app import small
 from tests.control import cases
 from tests.population.populations import drawn
 
 
 @pytest.fixture(scope="module")
-def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Return what public names make and public calls return."""
-    fit, folder = bw.open_run(small.finished(tmp_path_factory)), tmp_path_factory.mktemp("shown")
-    rng = np.random.default_rng(1)
+def objects(fit: bw.Fit, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """Return what public calls return; their attributes lead to all else."""
+    folder, rng = tmp_path_factory.mktemp("shown"), np.random.default_rng(1)
     time = np.arange(300) / 50
     voltage = 60 * np.sin(2 * np.pi * time) * (1 - time / 20)
     stand = bw.VirtualTestStand(sample_rate=50.0)
     record = stand.run(voltage, rng)
-    problem, posterior, draws = fit.problem, fit.problem.posterior, fit.result.flat_draws
-    background = Background.of(posterior, draws)
-    bands = predict_record(posterior, draws, record, Start(), rng)
-    point = pointfit.fit(posterior, rng)
-    experiment = Experiment(posterior, problem.plan)
-    with ThreadPoolExecutor(1) as executor:
-        (replicate,) = replicates(experiment, 1, [0], executor)
-    many = population(drawn(rng).specimens, rng)
     rows = tuple(Row(f"r{i}", f"r{i}.csv", "refused", "because " * 40, {}) for i in range(200))
+    many = population(drawn(rng).specimens, rng)
     return [
         fit,
         record,
         stand,
         bw.Record.from_arrays(np.sin(np.arange(1000)), interval=1e-3),
         bw.signal("identification"),
-        Actuator(),
-        Start(),
-        Step(10.0, 1.0),
-        noise_model("discrepancy", 0.01),
         bw.InputError("a"),
         bw.InputWarning("a"),
         bw.NotConvergedError("a"),
         *bw.inspect(bw.Record(voltage, -voltage, 0.02)),
-        point,
-        first_chain(posterior, point, problem.plan, rng),
-        background,
-        bands,
-        score(bands, rng),
-        assess(bands, background),
         fit.predict(record, lead_in=0.2),
-        measure_loops(posterior, draws),
-        measure_step(posterior, draws, Step(10.0, 1.0)),
-        experiment,
-        replicate,
-        judge([replicate.entry], rng),
-        many,
+        *fit.result.bands,
         bw.Campaign(CampaignFolder(folder), rows, many),
         fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
         fit.export(folder / "export"),
@@ -93,7 +55,6 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         *fit.design("d", candidates={"fast": voltage, "slow": 0.5 * voltage}),
         bw.compare(fit, fit, future=False, workers=1),
         parse('[record]\nfile = "a.csv"\n', "a"),
-        Distribution("normal", {"mean": 1.0, "sd": 0.1}),
     ]
 
 

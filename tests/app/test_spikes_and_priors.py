@@ -127,7 +127,7 @@ def test_exactly_the_spikes_are_set_aside_in_200_records() -> None:
     assert sum(bool(text) for text in said.values()) <= 2, said
 
 
-@pytest.mark.parametrize("size", [40.0, 1e4, 1e9])
+@pytest.mark.parametrize("size", [40.0, 1e9])
 @pytest.mark.parametrize("row", [0, 1, 20, 59])
 def test_a_spike_of_a_small_record_is_seen_and_hides_nothing(row: int, size: float) -> None:
     """What is seen of the record is what is seen without it: no wrong unit, no other relation."""

@@ -254,7 +254,7 @@ class Fit:
         """The figures: ``fit.plot.loop()``, ``bands()``, ``corner()``, ``trace()`` and more."""
         from bwbayes.app.fit.plots import Plots  # noqa: PLC0415  # matplotlib is slow to load
 
-        return Plots(self.problem, self.result, self._converged)
+        return Plots(self)
 
     predict = at_work(predict_record, before=lambda _: (), after=prediction_notes)
     compensate = at_work(compensate_fit)
@@ -262,21 +262,14 @@ class Fit:
     export = at_work(export_fit)
     track = at_work(track_fit)
 
-    def compare(
-        self,
-        *others: Fit,
-        future: bool = True,
-        workers: int | None = None,
-        executor: Any = None,
-    ) -> Comparison:
+    def compare(self, *others: Fit, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.
 
         Options and errors are as in :func:`bwbayes.compare`, which fits models, too.
         """
-        from bwbayes.app.jobs import compare  # noqa: PLC0415  # which samples
+        from bwbayes.app.fit.calls import compare  # noqa: PLC0415  # which makes fits
 
-        fits = compare.by_name((fit.name, fit) for fit in (self, *others))
-        return compare.compare(fits, future=future, workers=workers, executor=executor)
+        return compare(self, *others, **options)
 
     def resume(
         self,

@@ -29,14 +29,14 @@ from bwbayes.app.problem.parameters import (
 )
 from bwbayes.app.problem.records import (
     Slices,
+    Validation,
     findings_of,
     generator,
-    other_record,
     sampled_waveform,
     set_aside,
-    start_of,
     training_records,
     unlike,
+    validations_of,
     windows_of,
 )
 from bwbayes.arrays import IntArray
@@ -53,28 +53,11 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import OPTIONS
-from bwbayes.prediction.prediction import Start
 from bwbayes.record import Record
 from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
 
-__all__ = ["Problem", "Validation", "generator", "resolve", "sampled_waveform"]
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Held-out data: windows (slices) of a training record, or another record and its start.
-
-    ``judged`` is the window in s of another record that is judged, if not all of it. ``of`` is the
-    training record that the windows are of, or whose own parameters another record takes where
-    nothing tells its own.
-    """
-
-    windows: tuple[slice, ...] = ()
-    record: Record | None = None
-    start: Start = field(default_factory=Start)
-    judged: tuple[float, float] | None = None
-    of: str = "record"
+__all__ = ["Problem", "generator", "resolve", "sampled_waveform"]
 
 
 @dataclass(frozen=True)
@@ -222,25 +205,13 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         fitted, stand = training_records(config, folder, in_memory)
         config, fitted = joined(config, fitted)
         training, held_out = windows_of(config, fitted)
-        others = {
-            name: other_record(config, name, folder, fitted, in_memory.get(name))
-            for name, validation in config.validation.items()
-            if validation.another
-        }
+        validations = validations_of(config, folder, fitted, held_out, in_memory)
     remarks = [text for source in config.records.values() for text in source.remarks or ()]
     remarks += [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     aside = {name: source.outliers for name, source in config.records.items()}
     if config.model.outliers:
         aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
     posterior, defaults = _posterior(config, fitted, training)
-    validations = {}
-    for name, v in config.validation.items():
-        of = v.of or next(iter(fitted))
-        if v.another:
-            judged = None if v.window is None else (v.window[0][0], v.window[0][1])
-            validations[name] = Validation((), others[name], start_of(config, name), judged, of)
-        else:
-            validations[name] = Validation(held_out[name], of=of)
     plan = _plan(config, posterior)
     truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth |= config.truth

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from pathlib import Path
 
@@ -30,20 +30,36 @@ from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform,
 
 __all__ = [
     "Slices",
+    "Validation",
     "findings_of",
     "generator",
-    "other_record",
     "sampled_waveform",
     "set_aside",
-    "start_of",
     "training_records",
     "unlike",
+    "validations_of",
     "whole",
     "windows_of",
 ]
 
 
 type Slices = tuple[slice, ...]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out data: windows (slices) of a training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it. ``of`` is the
+    training record that the windows are of, or whose own parameters another record takes where
+    nothing tells its own.
+    """
+
+    windows: Slices = ()
+    record: Record | None = None
+    start: Start = field(default_factory=Start)
+    judged: tuple[float, float] | None = None
+    of: str = "record"
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
@@ -134,44 +150,49 @@ def _read(
         raise error.within(table) from None
 
 
-def other_record(
+def validations_of(
     config: Config,
-    name: str,
     folder: Path,
     training: Mapping[str, Record],
-    in_memory: Record | None,
-) -> Record:
-    """Return the record of a validation: from memory, a file, or the virtual stand."""
-    source, table = config.validation[name], f"validation.{name}"
-    if source.signal is None:
-        record = _read(source, folder, in_memory, table)
-    else:
-        stand = stand_of(config, list(training.values()))
-        record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))
-    if source.file is None or in_memory is not None:
-        require_readable(record, table)
-    # Said now: it would be a pity after the sampling.
-    key = "lead_in: "
-    try:
-        start_of(config, name).window(record)
-        key = ""
-        for start, stop in source.window or ():
-            record.window_slice(start, stop)
-    except InputError as error:
-        raise InputError(f"{table}.{key}{error}") from None
-    return record
+    held_out: Mapping[str, Slices],
+    in_memory: Mapping[str, Record],
+) -> dict[str, Validation]:
+    """Return what is held out, by name: windows, and records from memory, files or the stand.
 
-
-def start_of(config: Config, name: str) -> Start:
-    """Return what a config knows of another record's start; its hold is its own, unless given."""
-    source, hold = config.validation[name], config.model.hold
-    return Start(
-        source.from_rest,
-        source.own_offset,
-        source.lead_in,
-        source.lead_in_from,
-        None if hold == "auto" else hold,
-    )
+    Raises
+    ------
+    InputError
+        A record that cannot be used; a lead-in or window that does not fit into it, which is said
+        now: it would be a pity after the sampling.
+    """
+    validations = {}
+    for name, source in config.validation.items():
+        of, table = source.of or next(iter(training)), f"validation.{name}"
+        if not source.another:
+            validations[name] = Validation(held_out[name], of=of)
+            continue
+        if source.signal is None:
+            record = _read(source, folder, in_memory.get(name), table)
+        else:
+            stand = stand_of(config, list(training.values()))
+            record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))
+        if source.file is None or name in in_memory:
+            require_readable(record, table)
+        # Its hold is its own, unless given.
+        hold = None if config.model.hold == "auto" else config.model.hold
+        lead_in = source.lead_in, source.lead_in_from
+        start = Start(source.from_rest, source.own_offset, *lead_in, hold)
+        judged, key = None, "lead_in: "
+        try:
+            start.window(record)
+            key = ""
+            for edges in source.window or ():
+                judged = edges[0], edges[1]
+                record.window_slice(*judged)
+        except InputError as error:
+            raise InputError(f"{table}.{key}{error}") from None
+        validations[name] = Validation((), record, start, judged, of)
+    return validations
 
 
 def whole(record: Record) -> Window:

@@ -324,8 +324,7 @@ class Campaign:
             for row in self.rows:
                 if name in row.parameters:
                     own = row.parameters[name]
-                    edges = own["lower_95"], own["median"], own["upper_95"]
-                    alone[row.name] = Interval(*edges)
+                    alone[row.name] = Interval(own["lower_95"], own["median"], own["upper_95"])
             if name in self._spreads:
                 spread = self._spreads[name]
                 for record, among in spread.specimens.items():
@@ -373,19 +372,12 @@ class Campaign:
                     f"{normal} of {len(spread.specimens)}",
                 )
             )
+        columns = ("Parameter", "Unit", "Middle", "Spread", "A specimen not measured yet, 95 %")
+        judged = (TableColumn(title, on="page") for title in ("Pareto k", "Taken for normal"))
         return Table(
             "population",
             "Population",
-            (
-                "Parameter",
-                "Unit",
-                "Middle",
-                "Spread",
-                "A specimen not measured yet, 95 %",
-                TableColumn("Outliers", on="screen"),
-                TableColumn("Pareto k", on="page"),
-                TableColumn("Taken for normal", on="page"),
-            ),
+            (*columns, TableColumn("Outliers", on="screen"), *judged),
             rows,
             note="Medians, and 95 % intervals. A parameter above zero has a population that is "
             "normal in the logarithm: its middle is the median, its spread relative, in percent. "

@@ -25,9 +25,6 @@ __all__ = ["cluster", "on_client"]
 # Seconds to wait for a scheduler, and for its first worker.
 PATIENCE = 20.0
 
-# Workers that may die under one call before it is given up.
-DEATHS = 5
-
 
 def on_client(client: Any) -> ByValue:
     """Return an executor on the workers of a ``distributed.Client``, which stays open."""
@@ -36,7 +33,7 @@ def on_client(client: Any) -> ByValue:
 
 
 @contextmanager
-def cluster(address: str | None, workers: int | None) -> Iterator[ByValue]:
+def cluster(address: str, workers: int | None) -> Iterator[ByValue]:
     """Give an executor on the cluster at HOST:PORT; without one, on processes of this machine.
 
     Raises
@@ -57,25 +54,23 @@ def cluster(address: str | None, workers: int | None) -> Iterator[ByValue]:
     # What a person has to know is said in one line; the rest is for those who run the cluster.
     for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
+    scheduler: Any = f"tcp://{address}"
     settings = {
-        "distributed.scheduler.allowed-failures": DEATHS,
         "distributed.comm.timeouts.connect": PATIENCE,
-        "distributed.worker.daemon": True,
         # A posterior is, with every call.
         "distributed.admin.large-graph-warning-threshold": "1GB",
     }
     with dask.config.set(settings):
-        local = None
         try:
-            if address is None:
-                local = distributed.LocalCluster(
+            if not address:
+                scheduler = distributed.LocalCluster(
                     n_workers=workers or dask.system.CPU_COUNT,
                     threads_per_worker=1,
                     processes=True,
                     dashboard_address=None,
                     silence_logs=logging.CRITICAL,
                 )
-            client = distributed.Client(local or f"tcp://{address}", timeout=PATIENCE)
+            client = distributed.Client(scheduler, timeout=PATIENCE)
         except (OSError, TimeoutError, ValueError):
             raise InputError(
                 f"executor dask://{address}: no scheduler there; start one with `dask scheduler`"
@@ -86,14 +81,14 @@ def cluster(address: str | None, workers: int | None) -> Iterator[ByValue]:
         except CancelledError:
             raise BrokenExecutor("the scheduler is gone; resume") from None
         except distributed.scheduler.KilledWorker:
-            raise BrokenExecutor(f"{DEATHS} workers died during one call; free memory") from None
+            raise BrokenExecutor("several workers died during one call; free memory") from None
         finally:
             client.close(timeout=PATIENCE)
-            if local is not None:
-                local.close(timeout=PATIENCE)
+            if not address:
+                scheduler.close(timeout=PATIENCE)
 
 
-def _require_workers(client: Any, address: str | None) -> None:
+def _require_workers(client: Any, address: str) -> None:
     """Wait for a worker, and refuse those that would compute something else."""
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
@@ -103,13 +98,12 @@ def _require_workers(client: Any, address: str | None) -> None:
             f"executor dask://{address}: the scheduler has no worker; start some with "
             f"`dask worker {address} --nthreads 1`"
         ) from None
-    expected = _version()
-    other = next(((name, text) for name, text in versions.items() if text != expected), None)
-    if other is not None:
-        raise InputError(
-            f"executor dask://{address}: the worker {other[0]} has {other[1] or 'no bwbayes'}, "
-            f"here is {expected}; install the same"
-        )
+    for name, text in versions.items():
+        if text != _version():
+            raise InputError(
+                f"executor dask://{address}: the worker {name} has {text or 'no bwbayes'}, "
+                f"here is {_version()}; install the same"
+            )
 
 
 def _version() -> str:

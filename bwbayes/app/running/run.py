@@ -91,31 +91,22 @@ def resume(
     show: Callable[[Problem], None] | None = None,
     answer: Callable[[Fit], None] | None = None,
 ) -> Fit:
-    """Finish a run, from wherever it stands.
+    """Finish a run, from wherever it stands; progress goes to the console.
 
     Parameters
     ----------
-    folder
-        The run's folder.
-    console
-        Where progress goes.
-    workers
-        Processes for the ensembles; by default one a core. The result does not depend on it.
-    ess, steps
-        A new target and budget, if given.
-    engine
-        Resume with this engine, whatever the chain was begun with: the same posterior, but from
-        here on not the same bits.
+    workers, backend
+        As of :func:`~bwbayes.app.running.workers.executor`; the result does not depend on them.
+    ess, steps, engine
+        A new target, budget or engine. Another engine has the same posterior, but from here on not
+        the same bits.
     files
         Write what a run leaves besides its config, records and chain.
-    backend
-        Which executor, as in :func:`~bwbayes.app.running.workers.executor`.
     background
         Draw in a process of its own, if there may be several: sooner, and the same figures.
-    show
-        Is called with the problem before anything is done with it.
-    answer
-        Is called with the fit before its files are written.
+    show, answer
+        Are called with the problem before anything is done with it, and with the fit before its
+        files are written.
 
     Raises
     ------

@@ -59,26 +59,30 @@ def executor(
     if backend is not None and not isinstance(backend, str):
         yield _given(backend)
         return
-    kind = backend or "local"
     count = workers or os.cpu_count() or 1
-    if kind == "dask" or kind.startswith("dask://"):
+    kind, _, address = (backend or "local").partition("://")
+    if kind not in KINDS or (address and kind != "dask"):
+        kinds = ", ".join(KINDS)
+        raise InputError(
+            f"executor: {backend!r} is unknown; write one of {kinds}, dask://HOST:PORT"
+        )
+    if kind == "local":
+        kind = "processes" if engine == "numpy" and count > 1 else "threads"
+    if kind == "dask":
         # Here, because few have dask, and it takes a second to load.
         from bwbayes.app.running.cluster import cluster  # noqa: PLC0415
 
-        with cluster(kind.removeprefix("dask").removeprefix("://") or None, workers) as pool:
+        with cluster(address, workers) as pool:
             yield pool
-    elif kind == "processes" or (kind == "local" and engine == "numpy" and count > 1):
+    elif kind == "processes":
         with processes(count) as pool:
             yield pool
-    elif kind in KINDS:
-        threads = ThreadPoolExecutor(1 if kind == "local" and engine == "numpy" else count)
+    else:
+        threads = ThreadPoolExecutor(count)
         try:
             yield threads
         finally:
             threads.shutdown(cancel_futures=True)
-    else:
-        kinds = ", ".join(KINDS)
-        raise InputError(f"executor: {kind!r} is unknown; write one of {kinds}, dask://HOST:PORT")
 
 
 @contextmanager
