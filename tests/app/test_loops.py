@@ -39,26 +39,33 @@ def measured() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("table", "key", "measures"),
-    [("loops", "loops", MEASURES), ("steps", "step_responses", STEP_MEASURES)],
+    ("table", "key", "columns", "measures"),
+    [
+        ("loops", "loops", ("major", "minor"), MEASURES),
+        ("steps", "step_responses", ("one", "two"), STEP_MEASURES),
+    ],
 )
 def test_the_table_is_the_summarys(
-    measured: dict[str, Any], table: str, key: str, measures: dict[str, tuple[str, str]]
+    measured: dict[str, Any],
+    table: str,
+    key: str,
+    columns: tuple[str, str],
+    measures: dict[str, tuple[str, str]],
 ) -> None:
     run = dataclasses.replace(example.run(), **measured)
-    columns: Any = summary(run)[key]
+    numbers: Any = summary(run)[key]
     shown = rows(example.page(run), table)
     for name, (title, unit) in measures.items():
         *texts, shown_unit = shown[title]
         assert unit.replace("um", "µm") == shown_unit
-        for column, cells in zip(columns.values(), (texts[:2], texts[2:]), strict=True):
-            estimate = column[name]
+        for column, cells in zip(columns, (texts[:2], texts[2:]), strict=True):
+            estimate = numbers[column][name]
             if estimate is None:
                 assert ["–"] * 2 == cells
                 continue
-            numbers = [float(text) for cell in cells for text in re.split(" ± | to ", cell)]
+            said = [float(text) for cell in cells for text in re.split(" ± | to ", cell)]
             expected = [estimate[key] for key in ("mean", "sd", "lower_95", "upper_95")]
-            assert expected == pytest.approx(numbers, abs=0.0503 * estimate["sd"], rel=0)
+            assert expected == pytest.approx(said, abs=0.0503 * estimate["sd"], rel=0)
 
 
 def test_what_a_loop_or_step_has_not_is_not_there(measured: dict[str, Any]) -> None:

@@ -274,8 +274,8 @@ class Campaign:
     def _parameters(self, row: Row) -> dict[str, dict[str, Any]]:
         """Return a record's estimates by parameter: by itself, and what the population says."""
         parameters = {name: dict(estimate) for name, estimate in row.parameters.items()}
-        for name, spread in self._spreads.items():
-            among = spread.specimens.get(row.name)
+        for name in parameters.keys() & self._spreads.keys():
+            among = self._spreads[name].specimens.get(row.name)
             if among is not None:
                 parameters[name] |= {
                     "shrunk_median": among.median,
