@@ -19,13 +19,21 @@ from tests.app.conftest import Type
 
 
 def test_numbers_table_and_picture_agree(
-    bwbayes: Type, run: Path, fit: bw.Fit, tmp_path: Path
+    bwbayes: Type, run: Path, fit: bw.Fit, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """As written by the command, and the same numbers as in Python."""
+    """As the command writes what Python gives; it is worked out once for both."""
+    tracking, asked = fit.track(frequencies=(5.0,), draws=5), dict[str, Any]()
+
+    def track(_: bw.Fit, **options: Any) -> Any:
+        asked.update(options)
+        return tracking
+
+    monkeypatch.setattr("bwbayes.app.jobs.track.track", track)
     shutil.copytree(run, tmp_path / "run")
     command = "track", "run", "--frequency", "5", "--draws", "5"
     said, folder = bwbayes(*command), tmp_path / "run/track"
     assert (0, "") == (said.status, said.err)
+    assert ((5.0,), 5) == (asked["frequencies"], asked["draws"])
     for kind in ("json", "csv", "html"):
         assert f"wrote run/track/track.{kind}\n" in said.out
     numbers = json.loads((folder / "track.json").read_text())
@@ -44,7 +52,6 @@ def test_numbers_table_and_picture_agree(
     least = min(best["share"] for best in numbers["best_share"])
     share = "all" if least == 1 else f"at least {100 * least:.0f} % of the"
     assert f"in {share} draws, on every signal" in page
-    tracking = fit.track(frequencies=(5.0,), draws=5)
     assert numbers["table"] == tracking.numbers()["table"]
     assert 4 == len(fit.plot.tracking(tracking).axes)
     assert 200 < tracking.margins.gain.size <= 1000
