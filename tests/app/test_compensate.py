@@ -23,7 +23,7 @@ def write_reference(folder: Path, values: Any) -> Path:
     return path
 
 
-@pytest.mark.filterwarnings("ignore:the reference is smoothed")
+@pytest.mark.filterwarnings("ignore:the reference is smoothed", "ignore:between samples")
 def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
     made = fit.compensate(shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
