@@ -2,8 +2,8 @@
 
 Most of a record passes :func:`follow`: each sample has a reading, and the filter has settled. Where
 readings are missing, or it has not settled, or still hears of the start of the dynamics, readings
-pass :func:`take` one by one. Where ``second`` is None, the second state of the noise is left out
-when it is compiled.
+pass :func:`gain` and :func:`innovate`. Where ``second`` is None, the second state of the noise is
+left out when it is compiled.
 
 An offset never dies out, and the slowest lags of the creep hardly do. But a response r that keeps
 the part ρ of itself from reading to reading has, once the filter has settled and forgotten how r
@@ -29,7 +29,10 @@ from bwbayes.inference.compiled.lanes import (
 # fmt: on
 # isort: on
 
-__all__ = ["advance", "follow", "gather", "is_settled", "is_tracked", "skip", "take", "take_logs"]
+__all__ = [
+    "advance", "follow", "gain", "gather", "innovate", "is_settled", "is_tracked", "skip",
+    "take_logs",
+]  # fmt: skip
 
 # A covariance that changes by less of itself over a reading has settled.
 SETTLED = 2e-15
@@ -169,31 +172,80 @@ def is_settled(state: FloatArray) -> bool:
     """Tell whether no model's covariance changed by the last reading."""
     settled = True
     for i in range(LANES):
-        settled &= state[CHANGE + i] <= SETTLED
+        settled &= state[CHANGE + i] <= SETTLED * state[COVARIANCE + i]
     return settled
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-def take(state: FloatArray, second: bool | None, series: int) -> None:
-    """Take a reading of each series, and go on to the next."""
-    advance(state, second)
-    pair = PRODUCTS
-    for k in range(series):
-        at = k * LANES
-        for i in range(LANES):
-            innovation = state[VALUE + at + i] - state[ESTIMATE + at + i]
-            state[INNOVATION + at + i] = innovation
-        _estimate(state, second, KEPT, at)
-        for i in range(LANES):
-            state[ESTIMATE + at + i] += state[GAIN + i] * state[INNOVATION + at + i]
-            if second is not None:
-                state[ESTIMATE_2 + at + i] += state[GAIN_2 + i] * state[INNOVATION + at + i]
-        for j in range(k + 1):
-            other = j * LANES
+@njit(nogil=True, cache=True, error_model="numpy")
+def gain(
+    state: FloatArray,
+    second: bool | None,
+    gaps: IntArray,
+    steps: FloatArray,
+    gains: FloatArray,
+    gains_2: FloatArray,
+    inverse: FloatArray,
+) -> None:
+    """Take the covariance along samples (samples,), and write both gains and 1/variance of each.
+
+    ``gaps`` and ``steps`` are as in :func:`bwbayes.inference.compiled.kernels.sums`, the others
+    (samples times lanes,). Where there is no reading, nothing is written.
+    """
+    for t in range(gaps.size):
+        if gaps[t] > 0:
+            skip(state, second, steps[gaps[t] - 1])
+        if gaps[t] >= 0:
+            advance(state, second)
+            row = t * LANES
             for i in range(LANES):
-                product = state[INNOVATION + at + i] * state[INNOVATION + other + i]
-                state[pair + i] += product * state[INVERSE + i]
-            pair += LANES
+                gains[row + i] = state[GAIN + i]
+                gains_2[row + i] = state[GAIN_2 + i]
+                inverse[row + i] = state[INVERSE + i]
+    take_logs(state)
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def innovate(
+    second: bool | None,
+    gaps: IntArray,
+    steps: FloatArray,
+    usual: FloatArray,
+    gains: FloatArray,
+    gains_2: FloatArray,
+    estimate: FloatArray,
+    other: FloatArray,
+    values: FloatArray,
+) -> None:
+    """Turn a series' values, (samples times lanes,), into innovations, 0 where no reading is.
+
+    ``usual`` is the filter's step from reading to reading, ``estimate`` and ``other`` (lanes,) are
+    what it expects of both states of the noise. All arrays are apart, so that a compiler may take
+    several lanes at once.
+    """
+    for t in range(gaps.size):
+        row = t * LANES
+        if gaps[t] > 0:
+            over = steps[gaps[t] - 1]
+            for i in range(LANES):
+                before = estimate[i]
+                estimate[i] = over[i] * before
+                if second is not None:
+                    estimate[i] += over[LANES + i] * other[i]
+                    other[i] = over[2 * LANES + i] * other[i] - over[LANES + i] * before
+        if gaps[t] < 0:
+            for i in range(LANES):
+                values[row + i] = 0.0
+        else:
+            for i in range(LANES):
+                before = estimate[i]
+                innovation = values[row + i] - before
+                values[row + i] = innovation
+                estimate[i] = usual[i] * before + gains[row + i] * innovation
+                if second is not None:
+                    across = usual[LANES + i]
+                    estimate[i] += across * other[i]
+                    other[i] = usual[2 * LANES + i] * other[i] - across * before
+                    other[i] += gains_2[row + i] * innovation
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -219,8 +271,7 @@ def advance(state: FloatArray, second: bool | None) -> None:
         state[CHANGE + i] = p
     _predict(state, second, KEPT)
     for i in range(LANES):
-        p = state[CHANGE + i]
-        state[CHANGE + i] = abs(state[COVARIANCE + i] - p) / max(p, 1e-300)
+        state[CHANGE + i] = abs(state[COVARIANCE + i] - state[CHANGE + i])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -242,26 +293,12 @@ def _predict(state: FloatArray, second: bool | None, step: int) -> None:
 
 
 @njit(nogil=True, cache=True)
-def _estimate(state: FloatArray, second: bool | None, step: int, at: int) -> None:
-    """Take the estimates of a series on by a step, whose rows begin there."""
-    for i in range(LANES):
-        estimate = state[ESTIMATE + at + i]
-        state[ESTIMATE + at + i] = state[step + i] * estimate
-        if second is not None:
-            across, other = state[step + LANES + i], state[ESTIMATE_2 + at + i]
-            state[ESTIMATE + at + i] += across * other
-            state[ESTIMATE_2 + at + i] = state[step + 2 * LANES + i] * other - across * estimate
-
-
-@njit(nogil=True, cache=True)
-def skip(state: FloatArray, second: bool | None, step: FloatArray, series: int) -> None:
-    """Pass over missing readings by the filter's step (rows,) over them."""
+def skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
+    """Take the covariance over missing readings by the filter's step (rows,) over them."""
     take_logs(state)
     for i in range(step.size):
         state[GAP + i] = step[i]
     _predict(state, second, GAP)
-    for k in range(series):
-        _estimate(state, second, GAP, k * LANES)
 
 
 @njit(nogil=True, cache=True)

@@ -23,8 +23,9 @@ from bwbayes.inference.compiled import filter as noise
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, FREE, LANES, LOG, LOG_DETERMINANT, PAIRS,
-    PARAMETERS, PROCESS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, STATE, STRENGTH, SUMS, VALUE,
+    A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FREE, KEPT, LANES, LOG,
+    LOG_DETERMINANT, PAIRS, PARAMETERS, PROCESS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, SERIES,
+    STATE, STRENGTH, SUMS, VALUE,
 )
 # fmt: on
 # isort: on
@@ -34,13 +35,13 @@ from bwbayes.inference.compiled.stages import Kind, drive_of
 __all__ = ["sums"]
 
 # Fewer until the filter has settled and forgotten the start, which is looked at after each piece.
-SHORT_PIECE = 16
+SHORT_PIECE = 32
 
 # What is below this part of its size at the start adds nothing.
 FORGOTTEN = 1e-18
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True)
 def _one_by_one(
     state: FloatArray,
     second: bool | None,
@@ -51,30 +52,78 @@ def _one_by_one(
     lags: FloatArray,
     offset: int,
     free: int,
+    work: FloatArray,
 ) -> None:
-    """Let the filter take the readings of samples one by one, with all responses of the start."""
-    first_slow = 1 + offset + free
-    series = first_slow + lags.shape[0]
+    """Let the filter take the readings of samples one by one, with all responses of the start.
+
+    ``work`` (3 + SERIES, samples times lanes) is room for gains and innovations.
+    """
+    # Whole rows, which a compiler can tell to lie without gaps.
+    gain, gain_2, inverse = work[0], work[1], work[2]
+    noise.gain(state, second, gaps, steps, gain, gain_2, inverse)
+    usual = state[KEPT : KEPT + 3 * LANES]
+    keeping, nothing = np.empty(LANES), np.zeros(LANES)
+    for k in range(1 + offset + free + lags.shape[0]):
+        at, values = k * LANES, work[3 + k]
+        response = state[RESPONSE + at : RESPONSE + at + LANES]
+        later = state[RESPONSE_2 + at : RESPONSE_2 + at + LANES]
+        if k == 0:
+            _subtract(displacement, simulated, values)
+        elif k < 1 + offset:
+            values[:] = 1.0
+        elif k < 1 + offset + free:
+            a1, a2 = state[A1 : A1 + LANES], state[A2 : A2 + LANES]
+            _respond(gaps.size, a1, a2, response, later, values)
+        else:
+            # A slow response of the creep keeps a part of itself, and nothing of what was before.
+            keeping[:] = -lags[k - 1 - offset - free, 2]
+            _respond(gaps.size, keeping, nothing, response, later, values)
+        estimate = state[ESTIMATE + at : ESTIMATE + at + LANES]
+        other = state[ESTIMATE_2 + at : ESTIMATE_2 + at + LANES]
+        noise.innovate(second, gaps, steps, usual, gain, gain_2, estimate, other, values)
+        for j in range(k + 1):
+            pair = PRODUCTS + (k * (k + 1) // 2 + j) * LANES
+            _add_products(gaps, inverse, values, work[3 + j], state[pair : pair + LANES])
+
+
+@njit(nogil=True, cache=True)
+def _subtract(displacement: FloatArray, simulated: FloatArray, residual: FloatArray) -> None:
+    """Write readings (samples,) less what models do (samples times lanes,)."""
     for t in range(displacement.size):
+        row = t * LANES
         for i in range(LANES):
-            state[VALUE + i] = displacement[t] - simulated[t * LANES + i]
-        for k in range(1 + offset, first_slow):
-            at = k * LANES
-            for i in range(LANES):
-                x = state[RESPONSE + at + i]
-                state[RESPONSE + at + i] = state[RESPONSE_2 + at + i] - state[A1 + i] * x
-                state[RESPONSE_2 + at + i] = -state[A2 + i] * x
-                state[VALUE + at + i] = x
-        for k in range(lags.shape[0]):
-            at = (first_slow + k) * LANES
-            for i in range(LANES):
-                state[VALUE + at + i] = state[RESPONSE + at + i]
-                state[RESPONSE + at + i] *= lags[k, 2]
-        if gaps[t] > 0:
-            noise.skip(state, second, steps[gaps[t] - 1], series)
+            residual[row + i] = displacement[t] - simulated[row + i]
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _respond(
+    samples: int,
+    a1: FloatArray,
+    a2: FloatArray,
+    response: FloatArray,
+    later: FloatArray,
+    values: FloatArray,
+) -> None:
+    """Write a free response along samples (samples times lanes,), and move it on (lanes,)."""
+    for t in range(samples):
+        row = t * LANES
+        for i in range(LANES):
+            x = response[i]
+            values[row + i] = x
+            response[i] = later[i] - a1[i] * x
+            later[i] = -a2[i] * x
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _add_products(
+    gaps: IntArray, inverse: FloatArray, first: FloatArray, second: FloatArray, total: FloatArray
+) -> None:
+    """Add up eᵢ eⱼ / S of two series (samples times lanes,) to a total (lanes,)."""
+    for t in range(gaps.size):
+        row = t * LANES
         if gaps[t] >= 0:
-            noise.take(state, second, series)
-    noise.take_logs(state)
+            for i in range(LANES):
+                total[i] += first[row + i] * second[row + i] * inverse[row + i]
 
 
 @njit(nogil=True, cache=True)
@@ -93,7 +142,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
     for i in range(len(PARAMETERS) * LANES, STATE):
         state[i] = 0.0
     for i in range(LANES):
-        state[RATIO + i] = state[CHANGE + i] = 1.0
+        state[RATIO + i], state[CHANGE + i] = 1.0, np.inf
         state[COVARIANCE + i] = state[COVARIANCE_22 + i] = state[PROCESS + i]
         if offset > 0:
             state[VALUE + LANES + i] = state[RESPONSE + LANES + i] = 1.0
@@ -128,6 +177,7 @@ def _group(
     """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
     _begin(state, offset, free, slow)
     drive = _aligned(PIECE * LANES)
+    work = np.empty((3 + SERIES, PIECE * LANES))
     # Responses that stay: the offset, and those of the creep that are heard still.
     decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
     staying, pending = 0, 0
@@ -153,8 +203,9 @@ def _group(
             pending = 0
             responses = lags[:slow]
             _one_by_one(
-                state, second, readings, gaps[now:last], steps, drive, responses, offset, free
-            )
+                state, second, readings, gaps[now:last], steps, drive, responses, offset, free,
+                work,
+            )  # fmt: skip
             steady = noise.is_settled(state)
             for k in range(1 + offset, 1 + offset + free):
                 steady = steady and not _is_heard(state, k)

@@ -14,7 +14,7 @@ from bwbayes.arrays import FloatArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    A1, A2, B0, B1, B2, CREPT, CUBIC, DRIVE, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC,
+    A1, A2, B0, B1, B2, CREPT, CUBIC, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC,
     STRENGTH, X1, X2,
 )
 # fmt: on
@@ -115,7 +115,7 @@ def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
             drive[row + i] = state[LEVEL + i] + x
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@njit(nogil=True, cache=True)
 def _creep(
     state: FloatArray,
     lags: FloatArray,
@@ -125,18 +125,35 @@ def _creep(
     drive: FloatArray,
 ) -> None:
     """Let dynamics and creep follow."""
+    followed = np.empty_like(drive[: (last - first) * LANES])
     for t in range(first, last):
         row = (t - first) * LANES
         size = 1.0 if growth.size == 0 else growth[t]
         for i in range(LANES):
             w = drive[row + i] + state[EQUILIBRIUM + i]
-            state[DRIVE + i] = w * (1.0 + state[GROWTH + i] * size) - state[CREPT + i]
-        _follow(state, 1, drive[row : row + LANES])
-        for k in range(lags.shape[0]):
-            now, next_, keep = lags[k, 0], lags[k, 1], lags[k, 2]
-            at = k * LANES
-            for i in range(LANES):
-                w = state[DRIVE + i]
-                x = now * w + state[LAG + at + i]
-                state[LAG + at + i] = next_ * w + keep * x
-                drive[row + i] += state[STRENGTH + at + i] * x
+            followed[row + i] = w * (1.0 + state[GROWTH + i] * size) - state[CREPT + i]
+    _follow(state, last - first, drive)
+    for k in range(lags.shape[0]):
+        at, strength = LAG + k * LANES, STRENGTH + k * LANES
+        lag = state[at : at + LANES].copy()
+        _lag(followed, lags[k], state[strength : strength + LANES].copy(), lag, drive)
+        state[at : at + LANES] = lag
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+def _lag(
+    followed: FloatArray,
+    coefficients: FloatArray,
+    strength: FloatArray,
+    lag: FloatArray,
+    drive: FloatArray,
+) -> None:
+    """Add one of the creep's lags. The arrays are apart: a compiler may take lanes together."""
+    now, later, keep = coefficients
+    for t in range(followed.size // LANES):
+        row = t * LANES
+        for i in range(LANES):
+            w = followed[row + i]
+            x = now * w + lag[i]
+            lag[i] = later * w + keep * x
+            drive[row + i] += strength[i] * x

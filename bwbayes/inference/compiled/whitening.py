@@ -116,7 +116,7 @@ def _gains(
     settled = False
     for t in range(readings):
         if gaps[t] > 0:
-            skip(state, second, steps[gaps[t] - 1], 0)
+            skip(state, second, steps[gaps[t] - 1])
             settled = False
         if settled:
             for i in range(lanes):
