@@ -141,8 +141,8 @@ def _path(
         for name, later in rows.items():
             end = int(later[k * later.size // BLOCKS]) if k < BLOCKS else added[name][-1].stop
             later_windows = [slice(w.start, min(w.stop, end)) for w in added[name] if w.start < end]
-            known = [*training[name], *later_windows]
-            windows[name] = tuple(sorted(known, key=lambda window: window.start))
+            fitted = [*training[name], *later_windows]
+            windows[name] = tuple(sorted(fitted, key=lambda window: window.start))
         path.append(posterior.trained(windows))
     return path
 

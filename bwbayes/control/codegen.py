@@ -113,8 +113,8 @@ class _Printer(ast.NodeTransformer):
         nodes = list(ast.walk(tree))
         counters = [ast.unparse(node.target) for node in nodes if isinstance(node, ast.For)]
         stored = [n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)]
-        known = {*counters, *(argument.arg for argument in tree.args.args)}
-        numbers_of = [name for name in dict.fromkeys(stored) if name not in known]
+        declared = {*counters, *(argument.arg for argument in tree.args.args)}
+        numbers_of = [name for name in dict.fromkeys(stored) if name not in declared]
         for kind, names in (("double", numbers_of), ("int", list(dict.fromkeys(counters)))):
             if names:
                 yield f"    {kind} {', '.join(names)};"

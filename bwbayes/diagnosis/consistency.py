@@ -199,13 +199,13 @@ def _distance(
 
 def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
     """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
-    part = 1e-3
-    step = part * (joint - coordinates)
+    fraction = 1e-3
+    step = fraction * (joint - coordinates)
     places = np.stack([coordinates, joint, coordinates + step, coordinates - step])
     _, log_prior = alone.prior.constrain(places)
     log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
     # At the mode, the likelihood's slope is the prior's turned round.
-    slope = (log_prior[3] - log_prior[2]) / (2 * part)
+    slope = (log_prior[3] - log_prior[2]) / (2 * fraction)
     return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
 
 

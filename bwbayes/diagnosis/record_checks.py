@@ -191,11 +191,11 @@ def _leads(record: Record) -> bool | None:
     swing = np.abs(voltage[turns[1:-1]] - voltage[first])
     size = 2 * swing * float(np.ptp(displacement) / np.ptp(voltage)) * swing
     opening = area / size
-    usual = float(np.median(opening))
+    typical = float(np.median(opening))
     error = scatter(opening) / np.sqrt(opening.size)
-    if abs(usual) < max(0.004, 4 * error):
+    if abs(typical) < max(0.004, 4 * error):
         return None
-    return usual < 0
+    return typical < 0
 
 
 def _stuck(record: Record) -> Iterator[Finding]:
@@ -237,22 +237,22 @@ def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -
 def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that comes from elsewhere at the start, whatever the voltage does."""
     size, time = loop.decay, loop.decay_time
-    usual, extent = scatter(loop.residual), _extent(_readings(record))
+    spread, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
     # A drive before the record leaves a decay too, of at most lag times velocity.
     velocity = float(np.quantile(steps, 0.99)) / record.interval
     lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
     # Another hysteretic state at the start, which steps of the voltage do not show, is less sure.
     moving = np.count_nonzero(steps) > steps.size / 2
-    if abs(loop.start) > max(20 * usual, 0.24 * extent) and moving and abs(size) > usual:
+    if abs(loop.start) > max(20 * spread, 0.24 * extent) and moving and abs(size) > spread:
         size = loop.start
-    elif abs(size) < max(12 * usual, 0.1 * extent, 3 * lagged) or (
+    elif abs(size) < max(12 * spread, 0.1 * extent, 3 * lagged) or (
         time > LONG_DECAY * record.duration
     ):
         return
     begin = float(record.time[loop.rows[0]])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
-    over = begin + time * float(np.log(abs(size) / max(0.5 * usual, 0.001 * extent)))
+    over = begin + time * float(np.log(abs(size) / max(0.5 * spread, 0.001 * extent)))
     over = min(over, record.start + 0.9 * record.duration)
     text = (
         f"the displacement starts {abs(size):.3g} um {'above' if size > 0 else 'below'} where the "
@@ -276,12 +276,12 @@ def settle_fix(voltage: FloatArray, gone: int, leave_out: str) -> str:
 
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a trend, of which loops would imitate nine tenths at most."""
-    usual, extent = scatter(loop.residual), _extent(_readings(record))
+    spread, extent = scatter(loop.residual), _extent(_readings(record))
     size = loop.trend
     if loop.decay_time > LONG_DECAY * record.duration:
         size -= loop.decay * (1 - float(np.exp(-record.duration / loop.decay_time)))
     share = max(loop.trend_told, 1e-12)
-    if share > 0.1 and abs(size) > max(7 * usual / np.sqrt(share), 0.05 * extent):
+    if share > 0.1 and abs(size) > max(7 * spread / np.sqrt(share), 0.05 * extent):
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")

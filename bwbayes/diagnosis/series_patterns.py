@@ -53,8 +53,8 @@ def spikes(
         allowed = 2 * scipy.ndimage.maximum_filter1d(
             np.abs(_off_median(drive, ends)), 2 * NEIGHBORS + 1
         )
-    usual = scatter(off[off != 0]) if np.any(off) else 0.0
-    limit = max(8 * usual, least) + allowed
+    spread = scatter(off[off != 0]) if np.any(off) else 0.0
+    limit = max(8 * spread, least) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
     # A spike moves its neighbors' medians too. The largest comes first, and a straight line takes
     # its place before the next is judged.

@@ -144,11 +144,11 @@ class Noise(ABC):
         mean: _Mean = np.zeros(series.shape[:2]), np.zeros(series.shape[:2])
         covariance: _Covariance = always, np.zeros_like(always), always
         predicted = covariance
-        usual = self.step(theta)
+        between = self.step(theta)
         gaps = [] if skipped is None else np.flatnonzero(skipped[1:]).tolist()
         starts = [0, *(gap + 1 for gap in gaps)]
         for first, last in zip(starts, [*starts[1:], series.shape[2]], strict=True):
-            step = usual
+            step = between
             if first and skipped is not None:
                 step = self.step(theta, 1.0 + float(skipped[first]))
             for t in range(first, last):
@@ -173,7 +173,7 @@ class Noise(ABC):
                 if two:
                     mean = mean[0], expected[1] + gain_2[:, np.newaxis] * innovation
                     covariance = p * rest, p_12 * rest, p_22 - gain_2 * p_12
-                step = usual
+                step = between
         c, c_12, c_22 = covariance
         matrices = np.stack([c, c_12, c_12, c_22], axis=1).reshape(-1, 2, 2)
         return Filtered(white, log_determinant, np.stack(mean, axis=2), matrices)

@@ -52,13 +52,13 @@ class Histories:
     def with_states(self, theta: FloatArray, quantile: FloatArray) -> FloatArray:
         """Return θ (draws, parameters) with the states of its histories at quantiles (draws,)."""
         single = len(self.likelihoods) == 1
-        (begun,) = self.each(
+        (start_theta,) = self.each(
             np.column_stack([theta, quantile]),
             lambda likelihood, rows: (
                 States(likelihood, rows[:, :-1], single=single).at(rows[:, -1]),
             ),
         )
-        return begun
+        return start_theta
 
 
 def uniform(generator: np.random.Generator, draws: int) -> FloatArray:
@@ -179,8 +179,10 @@ def _by_importance(
     def density(rows: IntArray, proposed: IntArray) -> FloatArray:
         """Log density of the lead-in, of draws and proposals (any, any)."""
         histories = Histories(likelihoods, pool_which[proposed].ravel())
-        begun = histories.with_states(theta[rows.ravel()], pool_quantile[proposed].ravel())
-        (values,) = histories.each(begun, lambda likelihood, th: (likelihood.log_density(th),))
+        start_theta = histories.with_states(theta[rows.ravel()], pool_quantile[proposed].ravel())
+        (values,) = histories.each(
+            start_theta, lambda likelihood, th: (likelihood.log_density(th),)
+        )
         return np.nan_to_num(values.reshape(rows.shape), nan=-np.inf, posinf=-np.inf)
 
     of_few = density(*np.broadcast_arrays(few[:, np.newaxis], pool))

@@ -227,8 +227,8 @@ def started(
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
-    histories, begun = choose_histories(likelihoods, theta, generator)
-    informed = _informed(histories, begun, record, window, generator)
+    histories, start_theta = choose_histories(likelihoods, theta, generator)
+    informed = _informed(histories, start_theta, record, window, generator)
     return going_on(informed, whole, theta, generator) if start.after else informed
 
 
@@ -243,10 +243,10 @@ def going_on(
     model = start.model.copy()
     if start.offset_sd.any():
         model[:, column] += start.offset_sd * ndtri(uniform(generator, len(model)))
-    begun = replace(start, model=model, offset_sd=np.zeros(len(model)))
+    matched = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
-    simulated = begun.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
-    return replace(begun, carried=carried(likelihood, theta, simulated))
+    simulated = matched.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
+    return replace(matched, carried=carried(likelihood, theta, simulated))
 
 
 def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
@@ -277,8 +277,8 @@ def _unseen(
     if settled:
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
-    begun = histories.with_states(theta, uniform(generator, draws))
-    model, none = first.table.actuator(begun), np.zeros(draws)
+    start_theta = histories.with_states(theta, uniform(generator, draws))
+    model, none = first.table.actuator(start_theta), np.zeros(draws)
     actuators = tuple(likelihood.actuator for likelihood in likelihoods)
     start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
     if settled:
@@ -300,14 +300,14 @@ def _informed(
     offsets = int(likelihood.offset_sd > 0)
     mean, covariance = posterior.mean, posterior.covariance
     unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
-    begun, sd = theta, np.zeros(len(theta))
+    start_theta, sd = theta, np.zeros(len(theta))
     if offsets:
         # Given the unrest the offset is normal still.
         pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
         shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
         variance = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
         level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
-        begun = likelihood.table.replaced(theta, "offset", level)
+        start_theta = likelihood.table.replaced(theta, "offset", level)
         sd = np.sqrt(np.maximum(variance, 0.0))
     lead_in = LeadIn(
         float(record.time[window.start]),
@@ -315,7 +315,7 @@ def _informed(
         likelihood.readings.rows.size,
         _p_value(histories, theta, posterior.squares),
     )
-    model = likelihood.table.actuator(begun)
+    model = likelihood.table.actuator(start_theta)
     actuators = tuple(likelihood.actuator for likelihood in histories.likelihoods)
     from_rest, which = likelihood.from_rest, histories.which
     start = which, model, unrest, sd, from_rest, lead_in, window.stop

@@ -189,9 +189,9 @@ def _hint(names: Sequence[str], root: type[BaseModel]) -> str:
 
 def _names_in(path: Sequence[str], root: type[BaseModel]) -> list[str]:
     """Return the names of the keys of the table at a path, in which there are users' names too."""
-    known = keys(root)
-    parents, table = {key.parent for key in known}, ""
+    names = keys(root)
+    parents, table = {key.parent for key in names}, ""
     for name in path:
         inner = f"{table}.{name}".removeprefix(".")
         table = next((p for p in (f"{inner}.{ANY}", inner) if p in parents), table)
-    return [key.name for key in known if key.parent == table]
+    return [key.name for key in names if key.parent == table]

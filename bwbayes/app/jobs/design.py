@@ -164,7 +164,7 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
         "decaying triangle": Triangle(half, fastest),
     }
     if not np.isfinite(amplifier.rate):
-        levels = [half * part for part in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
+        levels = [half * factor for factor in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
         carriers["staircase"] = Staircase(tuple(levels), record.duration / len(levels))
     fading, steady = Decay(0.0, 0.9 / record.duration), Decay()
     return {

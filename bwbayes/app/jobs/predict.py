@@ -104,8 +104,8 @@ def predict(
         name = name or Path(str(record)).stem
         record = read_record(str(record), need_displacement=False)
     hold = problem.config.model.hold
-    known = None if hold == "auto" else hold
-    start = Start(from_rest, own_offset, lead_in, lead_in_from, known, after)
+    declared_hold = None if hold == "auto" else hold
+    start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
     return predict_another(problem, fit.flat_draws, record, start, name or "prediction", window, of)
 
 

@@ -279,8 +279,8 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
     fewest = 2 * prior.dimensions
     # Halves of an ensemble fill the compiled engine's lanes; with six more than the fewest
     # complementary halves span all directions.
-    usual = 64 if posterior.engine == "numba" else 32
-    walkers = settings.walkers or max(fewest + 6, usual)
+    common = 64 if posterior.engine == "numba" else 32
+    walkers = settings.walkers or max(fewest + 6, common)
     if walkers < fewest:
         raise InputError(
             f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "

@@ -87,12 +87,12 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     point
         Where that posterior is.
     """
-    usual = "discrepancy"
+    default = "discrepancy"
     if len(problem.records) > 1:
-        return usual, f"noise: {usual}, which is not chosen by evidence for several records"
+        return default, f"noise: {default}, which is not chosen by evidence for several records"
     posterior = problem.posterior
     rough = climb(posterior, point.optima)
-    worth = {usual: rough.log_evidence}
+    worth = {default: rough.log_evidence}
     for noise in NOISES.keys() - worth:
         other = problem.reconfigured({"noise": noise}, {})
         named = dict(zip(posterior.names, point.optima.T, strict=True))
@@ -101,8 +101,8 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
         worth[noise] = climb(other, places, least=rough.log_density).log_evidence
     best = max(worth, key=lambda noise: worth[noise])
-    if worth[best] < worth[usual] + TIED:
-        best = usual
+    if worth[best] < worth[default] + TIED:
+        best = default
     against = ", ".join(
         f"{worth[best] - worth[noise]:+.3g} nats against {noise}"
         for noise in NOISES

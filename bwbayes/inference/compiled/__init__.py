@@ -34,7 +34,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     free = likelihood.unknowns - offset
     column = likelihood.table.columns(theta)
     parameters = likelihood.table.noise(theta)
-    usual, process, sensor, second, gaps, steps = _filtering(noise, parameters, skipped)
+    step, process, sensor, second, gaps, steps = _filtering(noise, parameters, skipped)
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
@@ -43,7 +43,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
         named = physics(actuator, column, equilibrium, voltage)
-        named |= dict(zip(lanes.PARAMETERS[lanes.KEPT // lanes.LANES :], usual, strict=False))
+        named |= dict(zip(lanes.PARAMETERS[lanes.KEPT // lanes.LANES :], step, strict=False))
         named |= {"process": process, "sensor": sensor}
         responses = actuator.sections(column).recursions[0].free
         for unknown, tap in np.ndindex(responses.shape[1:]):
@@ -61,7 +61,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     for i in range(size):
         for j in range(i + 1):
             pairs[:, i, j] = pairs[:, j, i] = sums[i * (i + 1) // 2 + j]
-    typical = np.count_nonzero(skipped >= 0) * np.log(usual[3] + sensor)
+    typical = np.count_nonzero(skipped >= 0) * np.log(step[3] + sensor)
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
@@ -73,8 +73,8 @@ def whiten(
     Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um,
     and the readings (readings,) missing before each.
     """
-    usual, process, sensor, second, gaps, steps = _filtering(noise, theta, skipped)
-    rows = np.ascontiguousarray(usual.T)
+    step, process, sensor, second, gaps, steps = _filtering(noise, theta, skipped)
+    rows = np.ascontiguousarray(step.T)
     return whitening.whitened(rows, process, sensor, second, gaps, steps, series)
 
 

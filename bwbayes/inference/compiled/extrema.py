@@ -196,8 +196,8 @@ def _either(
 
 def rows(numbers: FloatArray, plan: ExtremaPlan, memory: Memory) -> FloatArray:
     """Return what the stage starts from, (models, rows), w₀ first."""
-    known = len(memory.extrema)
-    group = np.zeros((len(numbers), FIXED + numbers.shape[1] + max(plan.slots, known)))
+    extrema = len(memory.extrema)
+    group = np.zeros((len(numbers), FIXED + numbers.shape[1] + max(plan.slots, extrema)))
     group[:, 0] = group[:, 1] = memory.displacement
     group[:, 2], group[:, 3] = _own(memory), numbers.shape[1]
     group[:, FIXED : FIXED + numbers.shape[1]] = numbers

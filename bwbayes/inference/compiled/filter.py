@@ -209,7 +209,7 @@ def innovate(
     second: bool | None,
     gaps: IntArray,
     steps: FloatArray,
-    usual: FloatArray,
+    step: FloatArray,
     gains: FloatArray,
     gains_2: FloatArray,
     estimate: FloatArray,
@@ -218,7 +218,7 @@ def innovate(
 ) -> None:
     """Turn a series' values, (samples times lanes,), into innovations, 0 where no reading is.
 
-    ``usual`` is the filter's step from reading to reading, ``estimate`` and ``other`` (lanes,) are
+    ``step`` is the filter's step from reading to reading, ``estimate`` and ``other`` (lanes,) are
     what it expects of both states of the noise. All arrays are apart, so that a compiler may take
     several lanes at once.
     """
@@ -240,11 +240,11 @@ def innovate(
                 before = estimate[i]
                 innovation = values[row + i] - before
                 values[row + i] = innovation
-                estimate[i] = usual[i] * before + gains[row + i] * innovation
+                estimate[i] = step[i] * before + gains[row + i] * innovation
                 if second is not None:
-                    across = usual[LANES + i]
+                    across = step[LANES + i]
                     estimate[i] += across * other[i]
-                    other[i] = usual[2 * LANES + i] * other[i] - across * before
+                    other[i] = step[2 * LANES + i] * other[i] - across * before
                     other[i] += gains_2[row + i] * innovation
 
 

@@ -61,7 +61,7 @@ def _one_by_one(
     # Whole rows, which a compiler can tell to lie without gaps.
     gain, gain_2, inverse = work[0], work[1], work[2]
     noise.gain(state, second, gaps, steps, gain, gain_2, inverse)
-    usual = state[KEPT : KEPT + 3 * LANES]
+    step = state[KEPT : KEPT + 3 * LANES]
     keeping, nothing = np.empty(LANES), np.zeros(LANES)
     for k in range(1 + offset + free + lags.shape[0]):
         at, values = k * LANES, work[3 + k]
@@ -80,7 +80,7 @@ def _one_by_one(
             _respond(gaps.size, keeping, nothing, response, later, values)
         estimate = state[ESTIMATE + at : ESTIMATE + at + LANES]
         other = state[ESTIMATE_2 + at : ESTIMATE_2 + at + LANES]
-        noise.innovate(second, gaps, steps, usual, gain, gain_2, estimate, other, values)
+        noise.innovate(second, gaps, steps, step, gain, gain_2, estimate, other, values)
         for j in range(k + 1):
             pair = PRODUCTS + (k * (k + 1) // 2 + j) * LANES
             _add_products(gaps, inverse, values, work[3 + j], state[pair : pair + LANES])

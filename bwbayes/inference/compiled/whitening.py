@@ -31,7 +31,7 @@ LOOK = 16
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def whitened(
-    usual: FloatArray,
+    step: FloatArray,
     process: FloatArray,
     sensor: FloatArray,
     second: bool | None,
@@ -43,7 +43,7 @@ def whitened(
 
     Parameters
     ----------
-    usual
+    step
         (models, ``STEP``) the filter's step from reading to reading.
     process, sensor
         (models,) variances of the discrepancy and of the sensor, um².
@@ -65,7 +65,7 @@ def whitened(
         for i in range(LANES):
             model = min(first + i, models - 1)
             for row in range(STEP):
-                state[KEPT + row * LANES + i] = usual[model, row]
+                state[KEPT + row * LANES + i] = step[model, row]
                 for gap in range(steps.shape[0]):
                     over[gap, row * LANES + i] = steps[gap, model, row]
             state[SENSOR + i], state[PROCESS + i] = sensor[model], process[model]
@@ -75,17 +75,17 @@ def whitened(
         _gains(state, second, gaps, over, gains[:lanes])
         for i in range(lanes):
             model = first + i
-            logs[model] = state[LOG + i] + readings * math.log(usual[model, 3] + sensor[model])
+            logs[model] = state[LOG + i] + readings * math.log(step[model, 3] + sensor[model])
             for k in range(count):
                 _follow(
-                    usual[model], gaps, steps[:, model], gains[i], series[model, k], white[model, k]
+                    step[model], gaps, steps[:, model], gains[i], series[model, k], white[model, k]
                 )
     return white, logs
 
 
 @njit(nogil=True, cache=True)
 def _follow(
-    usual: FloatArray,
+    step: FloatArray,
     gaps: IntArray,
     steps: FloatArray,
     gains: FloatArray,
@@ -93,7 +93,7 @@ def _follow(
     white: FloatArray,
 ) -> None:
     """Write the innovations of one series (readings,), over their sds, into ``white``."""
-    a, b, d = usual[:3]
+    a, b, d = step[:3]
     estimate, other = 0.0, 0.0
     for t in range(series.size):
         if gaps[t] > 0:
