@@ -175,20 +175,19 @@ class _Sampling:
     def _tune(self) -> None:
         """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
 
-        As long as walkers take more of the proposed places than in the round before, or hardly any,
-        for 64 blocks at most. A run that goes on within a round fits again to what that round had
-        begun with.
+        At most 16 blocks, or 64 where walkers hardly take any place. A run that goes on within a
+        round fits again to what that round had begun with.
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
-        begin, end, rate, before = 0, TUNING_BLOCKS, 0.0, 0.0
-        while rate < TAKEN and end <= 64 and (rate <= 0.25 or rate > 1.1 * before):
+        begin, end, rate = 0, TUNING_BLOCKS, 0.0
+        while rate < TAKEN and end <= (16 if rate > 0.25 else 64):
             if chain.blocks("tuning") < end:
                 chain.freeze("tuning", proposal)
             while chain.blocks("tuning") < end:
                 self._extend("tuning")
             proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
-            before, rate = rate, _taken(chain.history("tuning")[begin:end])
+            rate = _taken(chain.history("tuning")[begin:end])
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
 

@@ -58,12 +58,8 @@ def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
 def test_a_long_tuning_is_fitted_to_its_last_round_and_goes_on_in_any(
     monkeypatch: pytest.MonkeyPatch, blocks: int
 ) -> None:
-    """Each is twice as long; interrupted in one or after the last, it comes to the same end.
-
-    It goes on where walkers take hardly any place or more than before, and no longer.
-    """
-    rates = {2: 0.1, 4: 0.3, 8: 0.32}
-    monkeypatch.setattr(sampler, "_taken", lambda blocks: rates[len(blocks)])
+    """Each is twice as long; interrupted in one or after the last, it comes to the same end."""
+    monkeypatch.setattr(sampler, "TAKEN", 1.1)
     expected, outcome = run()
     assert 16 == expected.blocks("tuning")
     draws, log_density = expected.coordinates("tuning"), expected.log_density("tuning")
