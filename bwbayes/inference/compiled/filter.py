@@ -29,10 +29,7 @@ from bwbayes.inference.compiled.lanes import (
 # fmt: on
 # isort: on
 
-__all__ = [
-    "advance", "follow", "gain", "gather", "innovate", "is_settled", "is_tracked", "skip",
-    "take_logs",
-]  # fmt: skip
+__all__ = ["follow", "gain", "gather", "innovate", "is_settled", "is_tracked"]
 
 # A covariance that changes by less of itself over a reading has settled.
 SETTLED = 2e-15
@@ -193,15 +190,15 @@ def gain(
     """
     for t in range(gaps.size):
         if gaps[t] > 0:
-            skip(state, second, steps[gaps[t] - 1])
+            _skip(state, second, steps[gaps[t] - 1])
         if gaps[t] >= 0:
-            advance(state, second)
+            _advance(state, second)
             row = t * LANES
             for i in range(LANES):
                 gains[row + i] = state[GAIN + i]
                 gains_2[row + i] = state[GAIN_2 + i]
                 inverse[row + i] = state[INVERSE + i]
-    take_logs(state)
+    _take_logs(state)
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
@@ -249,7 +246,7 @@ def innovate(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def advance(state: FloatArray, second: bool | None) -> None:
+def _advance(state: FloatArray, second: bool | None) -> None:
     """Take the covariance to the next reading, with the gain of this one on the way."""
     for i in range(LANES):
         p, sensor = state[COVARIANCE + i], state[SENSOR + i]
@@ -293,16 +290,16 @@ def _predict(state: FloatArray, second: bool | None, step: int) -> None:
 
 
 @njit(nogil=True, cache=True)
-def skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
+def _skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
     """Take the covariance over missing readings by the filter's step (rows,) over them."""
-    take_logs(state)
+    _take_logs(state)
     for i in range(step.size):
         state[GAP + i] = step[i]
     _predict(state, second, GAP)
 
 
 @njit(nogil=True, cache=True)
-def take_logs(state: FloatArray) -> None:
+def _take_logs(state: FloatArray) -> None:
     """Move the product of variances to the sum of logs, before it gets too large."""
     for i in range(LANES):
         state[LOG + i] += math.log(state[RATIO + i])

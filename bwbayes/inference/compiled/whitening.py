@@ -1,7 +1,7 @@
 """The noise's filter along series that come from NumPy: their innovations themselves, not sums.
 
-The gains are the same for all series of a model, so the covariance goes on once, as in
-:mod:`bwbayes.inference.compiled.filter`, and each series follows with the gains of its model.
+The recursions are those of :mod:`bwbayes.inference.compiled.filter`: the covariance goes on once
+for all series of a model, and each series follows with the gains of its model.
 """
 
 from __future__ import annotations
@@ -16,17 +16,14 @@ from bwbayes.arrays import FloatArray, IntArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    COVARIANCE, COVARIANCE_12, COVARIANCE_22, FRESH, GAIN, GAIN_2, INVERSE, KEPT, LANES, LOG,
-    PROCESS, RATIO, SENSOR, STATE, STEP,
+    COVARIANCE, COVARIANCE_12, COVARIANCE_22, KEPT, LANES, LOG, PROCESS, RATIO, SENSOR, STATE, STEP,
 )
 # fmt: on
 # isort: on
-from bwbayes.inference.compiled.filter import advance, is_settled, skip, take_logs
+from bwbayes.inference.compiled.filter import gain, innovate
+from bwbayes.inference.compiled.motion import PIECE
 
 __all__ = ["whitened"]
-
-# After so many readings it is looked at whether the gains stay as they are.
-LOOK = 16
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -59,7 +56,9 @@ def whitened(
     models, count, readings = series.shape
     white, logs = np.empty_like(series), np.empty(models)
     state, over = np.zeros(STATE), np.zeros((steps.shape[0], STEP * LANES))
-    gains = np.empty((min(models, LANES), 3, readings))
+    estimate, other = np.zeros((count, LANES)), np.zeros((count, LANES))
+    gains = np.empty((3, PIECE * LANES))
+    values = np.zeros(PIECE * LANES)
     for first in range(0, models, LANES):
         lanes = min(models - first, LANES)
         for i in range(LANES):
@@ -72,62 +71,23 @@ def whitened(
             state[COVARIANCE + i] = state[COVARIANCE_22 + i] = process[model]
             state[COVARIANCE_12 + i] = state[LOG + i] = 0.0
             state[RATIO + i] = 1.0
-        _gains(state, second, gaps, over, gains[:lanes])
-        for i in range(lanes):
-            model = first + i
-            logs[model] = state[LOG + i] + readings * math.log(step[model, 3] + sensor[model])
+        estimate[:], other[:] = 0.0, 0.0
+        usual = state[KEPT : KEPT + 3 * LANES]
+        for now in range(0, readings, PIECE):
+            ahead = gaps[now : now + PIECE]
+            gain(state, second, ahead, over, gains[0], gains[1], gains[2])
             for k in range(count):
-                _follow(
-                    step[model], gaps, steps[:, model], gains[i], series[model, k], white[model, k]
+                for i in range(lanes):
+                    for t in range(ahead.size):
+                        values[t * LANES + i] = series[first + i, k, now + t]
+                innovate(
+                    second, ahead, over, usual, gains[0], gains[1], estimate[k], other[k], values
                 )
-    return white, logs
-
-
-@njit(nogil=True, cache=True)
-def _follow(
-    step: FloatArray,
-    gaps: IntArray,
-    steps: FloatArray,
-    gains: FloatArray,
-    series: FloatArray,
-    white: FloatArray,
-) -> None:
-    """Write the innovations of one series (readings,), over their sds, into ``white``."""
-    a, b, d = step[:3]
-    estimate, other = 0.0, 0.0
-    for t in range(series.size):
-        if gaps[t] > 0:
-            a_gap, b_gap, d_gap = steps[gaps[t] - 1, :3]
-            estimate, other = a_gap * estimate + b_gap * other, d_gap * other - b_gap * estimate
-        innovation = series[t] - estimate
-        white[t] = innovation * gains[2, t]
-        estimate, other = (
-            a * estimate + b * other + gains[0, t] * innovation,
-            d * other - b * estimate + gains[1, t] * innovation,
-        )
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _gains(
-    state: FloatArray, second: bool | None, gaps: IntArray, steps: FloatArray, gains: FloatArray
-) -> None:
-    """Write both gains of each reading and one over its sd: ``gains`` (lanes, 3, readings)."""
-    lanes, _, readings = gains.shape
-    settled = False
-    for t in range(readings):
-        if gaps[t] > 0:
-            skip(state, second, steps[gaps[t] - 1])
-            settled = False
-        if settled:
-            for i in range(lanes):
-                state[RATIO + i] /= state[INVERSE + i] * (state[FRESH + i] + state[SENSOR + i])
-        else:
-            advance(state, second)
-        if t % LOOK == 0:
-            take_logs(state)
-            settled = is_settled(state)
+                for i in range(lanes):
+                    for t in range(ahead.size):
+                        row = t * LANES + i
+                        white[first + i, k, now + t] = values[row] * math.sqrt(gains[2, row])
         for i in range(lanes):
-            gains[i, 0, t] = state[GAIN + i]
-            gains[i, 1, t] = state[GAIN_2 + i]
-            gains[i, 2, t] = math.sqrt(state[INVERSE + i])
-    take_logs(state)
+            typical = step[first + i, 3] + sensor[first + i]
+            logs[first + i] = state[LOG + i] + readings * math.log(typical)
+    return white, logs
