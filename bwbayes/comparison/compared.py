@@ -154,7 +154,7 @@ class Comparison(Product):
                 # The screen has it among what speaks against the recommendation.
                 *standing_banner(self.standing, on="page"),
                 Banner(kind_of(self.standing) if self.recommended else "bad", first, others),
-                *[Banner("note", "What speaks against it", items=self.caveats, label="against it")]
+                *[Banner("note", "Caveats", items=self.caveats, label="caveat")]
                 * bool(self.caveats),
             ],
             blocks=[

@@ -147,7 +147,7 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
     screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
     if tied:
         names = _listed([recommended.name, *tied])
-        yield f"{names} cannot be told apart; the plainest of them is {recommended.name}"
+        yield f"{names} are indistinguishable; {recommended.name} is the simplest"
     elif len(comparison.differences) > 1 or screened:
         yield f"{recommended.name} is recommended"
     else:

@@ -103,9 +103,7 @@ def _plausibility(record: Record) -> Iterator[Finding]:
             yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
     spacing = np.diff(turning_points(record.voltage, 0.1 * span))
     if spacing.size >= 3 and np.median(spacing) < 6:
-        text = (
-            f"{2 * np.median(spacing):.3g} samples a period of the drive, so its turns are not seen"
-        )
+        text = f"{2 * np.median(spacing):.3g} samples a period, too few to resolve the reversals"
         fix = "sample faster (20 samples a period or more), or drive more slowly"
         yield _whole(record, "coarse sampling", text, fix)
     swings = np.abs(np.diff(record.voltage[turning_points(record.voltage, 0.02 * span)]))

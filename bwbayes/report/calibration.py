@@ -45,14 +45,14 @@ def _banners(calibration: Calibration) -> list[Banner]:
     unconverged = calibration.unconverged
     counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
     if not calibration.passed:
-        verdict = Banner("bad", "NOT PASSED", [counts], calibration.shortcomings)
+        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.shortcomings)
     elif calibration.telling:
         verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
     else:
         verdict = Banner(
             "note",
             "Passed, with too few replicates",
-            [f"{counts}; so few replicates may well miss sds a fifth too small; make more"],
+            [f"{counts}; low power: more replicates are needed to detect SDs 20% too small"],
         )
     numbers = ", ".join(str(number) for number in unconverged)
     line = f"not converged, and counted with the others: replicates {numbers}"

@@ -39,7 +39,7 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
         probabilities = parameter.prior.frozen.cdf(in_effect[parameter.name])
         # Constraints that move a quantile by less are not told from the draws' own error.
         is_cut = max(abs(probabilities - [0.025, 0.5, 0.975])) > 0.03
-        return f"{parameter.prior}" + (f"\n  in effect {effect(parameter)}" if is_cut else "")
+        return f"{parameter.prior}" + (f"\n  effective: {effect(parameter)}" if is_cut else "")
 
     def estimate(parameter: Parameter) -> str:
         return f"{point[parameter.name]:.5g}" if point and parameter.name in point else ""
@@ -62,12 +62,12 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
             *name_columns("Parameter"),
             TableColumn("Prior or value", on="page", text=_stated),
             TableColumn("Prior", on="screen", text=short),
-            TableColumn("In effect", on="page", text=effect),
-            TableColumn("Point fit", on="both" if point else "nowhere", text=estimate),
+            TableColumn("Effective", on="page", text=effect),
+            TableColumn("MAP estimate", on="both" if point else "nowhere", text=estimate),
             TableColumn("Unit", text=lambda parameter: unit_text(parameter.unit)),
         ),
         note=Markup(
-            "In effect: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. "
+            "Effective: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. "
             "The scales of default priors come from the training data's ranges of voltage and "
             "displacement and from the drive's times."
         ).format(cut),

@@ -68,7 +68,7 @@ class Result:
     explanations
         What may explain each fitted record better, by name, the best first; empty unless converged.
     learned
-        What the record taught: prior against posterior; None unless converged.
+        Information gained from the data: prior against posterior; None unless converged.
     replicated
         Each fitted record among replicated ones, by name; empty unless converged.
     facts

@@ -134,7 +134,7 @@ def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
             Text(f"Stopped: {result.outcome.stop_reason}. {_sampled(result)}"),
             Text(
                 "The chain has not converged, so no parameter or displacement intervals are shown. "
-                "What to do:"
+                "Fix:"
             ),
         ],
         items=[
@@ -144,7 +144,7 @@ def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
                 "ensembles that stay apart sit in different modes, ensembles that drift need more "
                 "steps."
             ),
-            "Check the priors: a parameter that the record does not determine wanders as far as "
+            "Check the priors: a parameter that is not identifiable wanders as far as "
             "its prior lets it; narrow its prior or fix it.",
         ],
         on="page",
@@ -242,7 +242,7 @@ def _moves(result: Result) -> str:
         f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
     )
     cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
-    return f"sampling: {check.steps} steps, accepted: {accepted}; {cover}"
+    return f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
 
 
 def _chains(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
@@ -256,21 +256,21 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
     if result.learned is not None:
         remarks = [Text(str(finding)) for finding in result.learned.findings]
         table = tables.learned_table(result, result.learned)
-        yield Section("What the record taught", [table, *remarks])
+        yield Section("Information gained from the data", [table, *remarks])
     if result.replicated:
         note = (
             "Each number of the fitted readings, among those of records that posterior draws make "
-            "anew with their own noise; p: the part of these that is larger. Odd: among the "
-            "outermost 1 %."
+            "anew with their own noise; p: the part of these that is larger. Extreme: among "
+            "the outermost 1 %."
         )
         checks = tables.replicated_tables(result)
-        yield Section("Would the model make this record?", [*checks, Text(note, note=True)])
+        yield Section("Posterior predictive checks", [*checks, Text(note, note=True)])
     if result.outcome.converged:
         yield Section("Posterior", [pictures["corner"]])
         chains = [pictures[name] for name in ("trace", "ranks")]
         yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
     yield Section("Moves", [tables.moves_table(result)])
-    yield Section("What was run", [Facts([*result.facts.items(), *_circumstances(numbers)])])
+    yield Section("Run details", [Facts([*result.facts.items(), *_circumstances(numbers)])])
 
 
 def _about(result: Result) -> str:

@@ -124,11 +124,11 @@ def learned_table(result: Result, learned: Learned) -> Table:
         rows.append((parameter_words(parameter), *shares, decided))
     return Table(
         "taught",
-        "What the record taught",
-        ("Parameter", "Contraction", "To the prior", "To the readings", "Decided by"),
+        "Information gained from the data",
+        ("Parameter", "Contraction", "Prior sensitivity", "Likelihood sensitivity", "Dominated by"),
         rows,
         note="Contraction: 1 - (posterior SD / prior SD)², in the prior's normal scores; near 1 "
-        "the record decided, near 0 it told nothing. Sensitivity of the posterior to a small "
+        "the data dominate, near 0 the prior. Sensitivity of the posterior to a small "
         "change in the weight of the prior, and of the readings; above 0.05 it is not small.",
     )
 
@@ -143,7 +143,7 @@ def replicated_tables(result: Result) -> list[Table]:
         ),
         TableColumn("Unit", text=lambda item: unit_text(STATISTICS[item[0]][1])),
         TableColumn("p", text=lambda item: f"{item[1].p:.3f}"),
-        TableColumn("Odd", text=lambda item: "odd" if item[1].odd else ""),
+        TableColumn("Extreme", text=lambda item: "extreme" if item[1].odd else ""),
     )
     return [
         Table.of(

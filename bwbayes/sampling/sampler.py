@@ -216,10 +216,10 @@ class _Sampling:
             # One whose target was made smaller has converged before its end.
             done = not missing and 0 < APART * passed <= blocks
             if done and at_end:
-                return Outcome(True, "converged on two checks in a row", latest)
+                return Outcome(True, "converged (two consecutive checks)", latest)
             if blocks == budget:
                 why = "; ".join(missing) or "only the last check passed"
-                return Outcome(False, f"budget of {plan.most_steps} steps used up: {why}", latest)
+                return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
             fitted_to = chain.set_aside if chain.refit else 0
             enough = chain.set_aside + blocks >= LEAST_STRETCH * fitted_to
             if not latest.covered and at_end and enough:

@@ -128,7 +128,7 @@ def run(
         name="bender",
         outcome=Outcome(
             converged,
-            "two good checks" if converged else "budget of 120 steps used up: R-hat 1.2",
+            "two good checks" if converged else "step limit 120 reached: R-hat 1.2",
             check(values.shape[0]),
         ),
         parameters=parameters,

@@ -131,7 +131,7 @@ def test_page_needs_nothing_else_and_escapes(whole: Path) -> None:
     assert "<b>small</b>" not in page
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert 3 == page.count("data:image/png;base64,")
-    few = "so few replicates may well miss sds a fifth too small"
+    few = "low power: more replicates are needed to detect SDs 20% too small"
     for text in ("&lt;b&gt;small&lt;/b&gt;", "Passed", few, 'class="words">other</td>', "12 tests"):
         assert text in page
 
@@ -173,7 +173,7 @@ def test_request_to_stop_is_answered_with_how_to_go_on(
     done = bwbayes("calibrate", "--resume", "a", "--workers", "2")
     assert 0 == done.status, done.err
     texts = ("log_likelihood", "opening", "95 %", "sensor", "power", "3 replicates, 0 not")
-    for text in (*texts, "so few replicates may well miss"):
+    for text in (*texts, "low power: more replicates are needed"):
         assert text in done.out
     assert "judging" in done.err
     assert_same_end(whole, tmp_path / "a")
@@ -186,12 +186,12 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
     command = "calibrate", "short.toml", "--replicates", "2", "--out", "a", "--workers", "1"
     said = bwbayes(*command)
     assert 4 == said.status
-    assert "NOT PASSED: 2 of 2 replicates did not converge, more than 1%; see " in said.err
+    assert "CALIBRATION FAILED: 2 of 2 replicates did not converge, more than 1%; see " in said.err
     assert "2 replicates, 2 not converged" in said.out
     result = json.loads((tmp_path / "a/calibration.json").read_text())
     assert (False, [0, 1]) == (result["passed"], result["unconverged"])
     page = (tmp_path / "a/calibration.html").read_text(encoding="utf-8")
-    assert "NOT PASSED" in page
+    assert "CALIBRATION FAILED" in page
     assert "replicates 0, 1" in page
 
 
@@ -205,7 +205,7 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
         (("small.toml", "--resume", "a"), "give either a CONFIG or --resume"),
         (("--resume", "none"), "none: no calibration here; start one with"),
         (("--resume", "b"), "b: no calibration here, but something else's folder"),
-        (("--resume", "a", "--seed", "1"), "goes on as begun"),
+        (("--resume", "a", "--seed", "1"), "takes no other options"),
         (("small.toml", "--replicates", "0"), "0 is not in the range x>=1"),
         (("none.toml",), "none.toml: No such file"),
         (("small.toml", "--out", "a"), "a: exists; resume with `bwbayes calibrate --resume a`"),

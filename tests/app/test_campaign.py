@@ -185,7 +185,7 @@ def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_pa
     folder = start(tmp_path / "records", config, tmp_path, tmp_path / "batch", pictures=False)
     (row,) = ended(folder).rows
     assert "not converged" == row.status
-    assert "budget of 40 steps used up" in row.reason
+    assert "step limit 40 reached" in row.reason
     assert "specimen" not in str(list(folder.run("s000").iterdir()))
     arguments = re.findall(r"`bwbayes (resume .*)`", row.reason)[0].split()
     subprocess.run(small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True)

@@ -116,7 +116,7 @@ def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
     assert "300 samples every 0.02 s" in said.out
     for name in ("alpha", "discrepancy_time", "lognormal(median", "fixed at 0.0172"):
         assert name in said.out
-    assert "Nothing wrong shows" in said.out
+    assert "No issues found" in said.out
     page = tmp_path / "results" / "small-check" / "check.html"
     assert f"report: {page.relative_to(tmp_path)}" in said.out
     assert {"small.toml", "results"} == {path.name for path in tmp_path.iterdir()}

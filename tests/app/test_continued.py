@@ -134,7 +134,7 @@ def test_a_continued_record_beside_another(tmp_path: Path) -> None:
 def test_python_fits_a_record_in_two_parts() -> None:
     first, second = parts(whole(), 170)
     keys: Any = {"dynamics": "none", "hysteresis": "linear", "block": 25, "steps": 25, "workers": 1}
-    with pytest.warns(InputWarning, match="NOT CONVERGED: budget of 25 steps"):
+    with pytest.warns(InputWarning, match="NOT CONVERGED: step limit 25"):
         made = bw.fit(chained({"first": first, "second": second}), progress=False, **keys)
     assert made.problem.record.samples == SAMPLES
     assert "offset" in made.problem.posterior.names

@@ -73,7 +73,7 @@ def fit(record: Record, keys: dict[str, Any]) -> Fit:
 def stopped(folder: Path, steps: int = 25) -> Fit:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
-    outcome = replace(made.outcome, converged=False, stop_reason=f"budget of {steps} steps used up")
+    outcome = replace(made.outcome, converged=False, stop_reason=f"step limit {steps} reached")
     return made.knowing(outcome=outcome, _loaded=None)
 
 
@@ -214,7 +214,7 @@ def test_ctrl_c_leaves_a_folder_to_go_on_from(
 
 def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path) -> None:
     made = stopped(folder)
-    line = "not converged: budget of 25 steps used up; intervals are withheld; resume with"
+    line = "not converged: step limit 25 reached; intervals are withheld; resume with"
     for ask in (
         lambda: made.summary,
         lambda: made.bands,
@@ -237,7 +237,7 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
     assert made.draws.attrs["converged"] == 0
     assert made.plot.trace().axes
     for text in (repr(made), made._repr_html_()):
-        assert "NOT CONVERGED: budget of 25 steps used up; intervals are withheld" in text
+        assert "NOT CONVERGED: step limit 25 reached; intervals are withheld" in text
         assert "95 %" not in text
 
 
@@ -249,7 +249,7 @@ def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with pytest.warns(bw.InputWarning, match="NOT CONVERGED: budget of 25 steps") as caught:
+    with pytest.warns(bw.InputWarning, match="NOT CONVERGED: step limit 25") as caught:
         made = bw.fit(record, **keys | {"steps": 25})
     assert {__file__} == {warning.filename for warning in caught}
     assert not made.converged

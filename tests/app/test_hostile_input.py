@@ -130,7 +130,7 @@ def assert_used_or_refused(one: Case, said: Said, place: Path) -> None:
         assert "out of memory" not in said.err
     else:
         assert (0, "") == (said.status, said.err)
-        assert "Point fit" in said.out
+        assert "MAP estimate" in said.out
         assert_becomes_a_run(place)
 
 

@@ -145,7 +145,7 @@ def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
     assert drawn == pictures(made.result).keys()
     assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= drawn
     page = (finished.path / "report.html").read_text()
-    assert "Do the records agree?" in page
+    assert "Consistency of the records" in page
     assert "offset[step]" in page
     tree = made.posterior
     assert {"displacement_loops", "displacement_step"} == {*tree["observed_data"].data_vars}

@@ -90,10 +90,12 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
     text = proposed(write()).text
     assert text.startswith("# mine.csv: 600 samples every 0.01 s from 0 s on\n# voltage -")
     assert "# No issues found." in text
-    assert "# from_rest = true  # it starts at 0 V, moving; say so if" in text
+    assert "# from_rest = true  # starts at 0 V, moving; say so if" in text
     assert '# voltage_is = "command"' in text
     text = proposed(write(rows=slice(20, None))).text
-    assert re.search(r"# from_rest = false  # it starts at 9\d\.\d V, moving: its history is", text)
+    assert re.search(
+        r"# from_rest = false  # starts at 9\d\.\d V, moving; the initial state is", text
+    )
 
 
 # What is held out

@@ -41,4 +41,4 @@ def test_priors_are_shown_as_the_constraints_leave_them(
     assert median > 0.02
     # Nothing cuts that of the offset.
     (place,) = (i for i, line in enumerate(lines) if "offset" in line)
-    assert "in effect" not in lines[place + 1]
+    assert "effective" not in lines[place + 1]

@@ -258,7 +258,7 @@ def test_verdict_says_why_and_what_to_do() -> None:
     resuming = {"go_on": "bwbayes resume results/a --steps 40000"}
     text = example.page(run, summary(run) | resuming, PICTURES)
     assert "<strong>NOT CONVERGED</strong>" in text
-    assert "budget of 120 steps used up: R-hat 1.2" in text
+    assert "step limit 120 reached: R-hat 1.2" in text
     assert "<code>bwbayes resume results/a --steps 40000</code>" in text
     assert {"#trace", "#ranks"} <= set(re.findall(r'href="(.*?)"', text))
 

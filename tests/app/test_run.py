@@ -53,7 +53,7 @@ def test_run_leaves_these_files(run: Path) -> None:
 
 def test_summary_says_how_the_run_ended(run: Path, summary: dict[str, Any]) -> None:
     assert summary["converged"] is True
-    assert "converged on two checks in a row" == summary["stop_reason"]
+    assert "converged (two consecutive checks)" == summary["stop_reason"]
     assert (3, RunFolder(run).problem().record.sha256) == (summary["seed"], summary["data_sha256"])
     assert 0 < summary["wall_s"]
     packages = {"python", "bwbayes", "numpy", "scipy", "emcee", "arviz", "h5py"}
@@ -164,9 +164,11 @@ def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
     progress("sampling", fit.outcome.check)  # of a run that goes on: nothing was done yet
     for _ in range(4):
         progress("sampling", None)
-    assert re.search(r" 30 models/s   ETA unknown   acceptance 0", progress.line("sampling"))
-    line = r"sampling +\d+ steps +0 models/s   ETA unknown   acceptance 0\.\d\d   R-hat 1\.\d{3}   "
-    assert re.fullmatch(line + r"ESS \d+ of 200   Pareto k -?\d\.\d\d\n", said.getvalue())
+    assert re.search(r" 30 evaluations/s   ETA unknown   acceptance 0", progress.line("sampling"))
+    line = r"sampling +\d+ steps +0 evaluations/s   ETA unknown   acceptance 0\.\d\d   "
+    assert re.fullmatch(
+        line + r"R-hat 1\.\d{3}   ESS \d+ of 200   Pareto k -?\d\.\d\d\n", said.getvalue()
+    )
 
 
 @pytest.mark.usefixtures("_without_pictures")

@@ -62,7 +62,7 @@ def test_numbers_table_and_picture_agree(
     ("options", "line"),
     [
         ({"delay": -1}, "delay: -1 samples; give 0 to 100"),
-        ({"draws": 1}, "draws: 1 say nothing"),
+        ({"draws": 1}, "draws: 1 is too few"),
         ({"gain_margin": 0.5}, "gain margin: 0.5; give a factor above 1"),
         ({"phase_margin": 120.0}, "phase margin: 120 degrees; give one between 0 and 90"),
         ({"rate": -1.0}, "rate: -1 Hz; give a number above 0"),

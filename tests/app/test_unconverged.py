@@ -37,7 +37,7 @@ def test_run_without_convergence_speaks_of_no_interval(
     assert 25 == ChainFile.read(made.chain).steps("sampling")
     seen = small.numbers(made.path)
     assert (False, None, None) == (seen["converged"], seen["parameters"], seen["validation"])
-    assert seen["stop_reason"].startswith("budget of 25 steps used up: ")
+    assert seen["stop_reason"].startswith("step limit 25 reached: ")
     bands = made.path / "bands.csv"
     assert not bands.exists() or not bands.read_text().strip()
     page = (made.path / "report.html").read_text(encoding="utf-8")
@@ -54,7 +54,7 @@ def test_line_on_the_screen_says_what_to_do(
     printed = capsys.readouterr()
     assert "" == printed.out
     assert 1 == printed.err.count("\n")
-    assert printed.err.startswith("NOT CONVERGED: budget of 25 steps used up: ")
+    assert printed.err.startswith("NOT CONVERGED: step limit 25 reached: ")
     assert f"`bwbayes resume {tmp_path / 'a'} --steps 50`" in printed.err
 
 

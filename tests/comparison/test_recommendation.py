@@ -56,7 +56,7 @@ def test_scores_that_tie_are_told_apart_by_the_evidence_if_it_is_sure() -> None:
     assert any("log evidence is lower by 10.0" in line for line in comparison.lines)
     comparison = recommend([model("plain", COMMON), model("rich", near, 2.0, 9)])
     assert (comparison.recommended, comparison.tied) == ("plain", ("rich",))
-    expected = "plain and rich cannot be told apart; the plainest of them is plain"
+    expected = "plain and rich are indistinguishable; plain is the simplest"
     assert comparison.lines[0] == expected
 
 

@@ -135,7 +135,7 @@ def test_hard_target_never_converges(name: str) -> None:
     density, point = HARD_TARGETS[name]
     _, outcome = sampled(target(density, 2), point, PLAN, seed=1)
     assert not outcome.converged
-    assert outcome.stop_reason.startswith(f"budget of {PLAN.most_steps} steps used up: ")
+    assert outcome.stop_reason.startswith(f"step limit {PLAN.most_steps} reached: ")
 
 
 def test_far_modes_converge_to_their_weights() -> None:

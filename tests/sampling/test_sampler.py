@@ -48,7 +48,7 @@ def finished(watched: Watched) -> tuple[Chain, Outcome]:
 def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
     chain, outcome = finished
     assert outcome.converged
-    assert "converged on two checks in a row" == outcome.stop_reason
+    assert "converged (two consecutive checks)" == outcome.stop_reason
     assert [] == outcome.check.shortcomings(PLAN.ess)
     assert chain.steps("sampling") == outcome.check.steps
     assert chain.proposals["sampling"] is not None
@@ -100,7 +100,7 @@ def test_it_stops_at_the_first_two_checks_that_find_nothing_missing(watched: Wat
 def test_a_used_up_budget_is_told_with_what_is_missing() -> None:
     chain, outcome = run(replace(PLAN, most_steps=60, ess=1e6))
     assert not outcome.converged
-    assert outcome.stop_reason.startswith("budget of 60 steps used up: ")
+    assert outcome.stop_reason.startswith("step limit 60 reached: ")
     assert "ESS" in outcome.stop_reason
     assert 60 == chain.steps("sampling")
 

@@ -83,9 +83,12 @@ def _failure(error: BaseException) -> tuple[str, int]:
         case BrokenExecutor():
             # Python's own says nothing of use.
             text = one_line("" if isinstance(error, BrokenProcessPool) else text)
-            text = text or "a worker process was killed; free some memory, and resume"
+            text = (
+                text
+                or "a worker process was killed, probably out of memory; free memory, then resume"
+            )
         case MemoryError():
-            text = "out of memory; take fewer samples or walkers"
+            text = "out of memory; use a shorter record or fewer `sampling.walkers`"
         case KeyboardInterrupt() | click.Abort():
             text, status = "interrupted", INTERRUPTED
         case _:

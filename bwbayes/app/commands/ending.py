@@ -58,7 +58,7 @@ def require_new_or_resumed(
     if (new is None) == (resumed is None):
         raise InputError(f"{command}: give either {either}")
     if new is None and any(value not in (None, False) for value in options.values()):
-        raise InputError(f"{command}: --resume goes on as begun; leave the other options out")
+        raise InputError(f"{command}: --resume takes no other options; remove them")
 
 
 def present(

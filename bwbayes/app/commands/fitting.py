@@ -124,7 +124,7 @@ def run(
 @options_of("bwbayes.app.fit.calls:resume", "progress")
 @quiet_option
 def resume(folder: Path, quiet: bool, executor: str | None, **options: Any) -> int:
-    """Go on with the run in FOLDER, interrupted or short of its target.
+    """Resume the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """

@@ -39,7 +39,7 @@ def simulate(out: Path, **options: Any) -> int:
 
 @click.command()
 @click.argument("config", type=FILE, required=False)
-@click.option("--resume", "resumed", type=FILE, help="Go on with the calibration in this folder.")
+@click.option("--resume", "resumed", type=FILE, help="Resume the calibration in this folder.")
 @click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
 @seed_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
@@ -55,7 +55,7 @@ def calibrate(
     replicates: int | None,
     **options: Any,
 ) -> int:
-    """Simulation-based calibration of a CONFIG: fit records simulated from its prior.
+    """Simulation-based calibration of CONFIG: fit records simulated from its prior.
 
     Each replicate draws parameters from the config's prior, simulates its record and fits it
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
@@ -87,7 +87,7 @@ def calibrate(
         return 0
     first, *others = calibration.shortcomings
     more = f", and {len(others)} more" if others else ""
-    click.echo(f"NOT PASSED: {first}{more}; see {page}", err=True)
+    click.echo(f"CALIBRATION FAILED: {first}{more}; see {page}", err=True)
     return NOT_CONVERGED
 
 
@@ -95,7 +95,7 @@ def calibrate(
 @click.argument("folder", type=FILE, required=False)
 @click.option("--config", type=FILE, help="Config of all records; default: each proposes its own.")
 @click.option("--out", type=FILE, help="The campaign's folder; default: results/NAME-OF-FOLDER.")
-@click.option("--resume", "resumed", type=FILE, help="Go on with the campaign in this folder.")
+@click.option("--resume", "resumed", type=FILE, help="Resume the campaign in this folder.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
 @options_of("bwbayes.app.jobs.campaign:resume")

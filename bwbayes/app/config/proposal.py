@@ -172,9 +172,9 @@ def _start(record: Record) -> str:
     beginning = record.voltage[: max(record.samples // 100, 2)]
     hundredth = 0.01 * float(np.ptp(record.voltage))
     motion = "moving" if float(np.ptp(beginning)) > hundredth else "at rest"
-    state = f"it starts at {beginning[0]:.3g} V, {motion}"
+    state = f"starts at {beginning[0]:.3g} V, {motion}"
     if abs(float(beginning[0])) > hundredth:
-        return f"# from_rest = false  # {state}: its history is unknown, and estimated"
+        return f"# from_rest = false  # {state}; the initial state is unknown and will be estimated"
     return (
         f"# from_rest = true  # {state}; say so if the actuator was demagnetized and nothing moved"
     )

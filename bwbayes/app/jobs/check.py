@@ -83,7 +83,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         banners=[
             Banner("note", "Problems of the record", (), problems, (), "problem", name="findings")
             if problems
-            else Banner("good", "Nothing wrong shows", [nothing]),
+            else Banner("good", "No issues found", [nothing]),
             *remarks_banner(remarks),
             *(
                 Banner("note", title, items=lists[label], label=label)
@@ -95,13 +95,13 @@ def check(config: Config, folder: Path, out: Path) -> Report:
             Text(about, on="screen"),
             *_pictures(problem),
             Section(
-                "Priors and point fit",
+                "Priors and MAP estimate",
                 [
                     priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True))),
                     Text(
                         Markup(
-                            "The point fit is the most probable set of parameters; it says nothing "
-                            "of how sure they are. <code>bwbayes run</code> does."
+                            "The MAP estimate is the most probable set of parameters, without "
+                            "intervals; these take sampling: <code>bwbayes run</code>."
                         ),
                         note=True,
                     ),

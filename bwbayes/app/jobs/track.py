@@ -73,7 +73,7 @@ def track(
     if not 0 <= delay <= 100:
         raise InputError(f"delay: {delay} samples; give 0 to 100")
     if draws < 2:
-        raise InputError(f"draws: {draws} say nothing of how sure one may be; give more")
+        raise InputError(f"draws: {draws} is too few for an uncertainty estimate; use at least 2")
     problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
     dataset = posterior.datasets[0]
     free = thinned(fit.flat_draws, generator(seed, "draws"))

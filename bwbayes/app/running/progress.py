@@ -115,17 +115,14 @@ class Progress(_Line):
         elapsed = max(time.monotonic() - self.begun, 1e-9)
         rate = self.steps * self.plan.ensembles * self.plan.walkers / elapsed
         if self.check is None:
-            return (
-                f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} models/s   "
-                "ensembles are converging"
-            )
+            return f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   burn-in"
         check = self.check
         fewest = float(np.min([check.ess_bulk, check.ess_tail]))
         # It counts down to the end that was forecast at the last check.
         remaining = "unknown" if self.end is None else _minutes(self.end - time.monotonic())
         cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
-            f"sampling  {check.steps:6d} steps   {rate:6.0f} models/s   "
+            f"sampling  {check.steps:6d} steps   {rate:6.0f} evaluations/s   "
             f"ETA {remaining}   acceptance {check.acceptance:.2f}   "
             f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}   "
             f"{cover}"

@@ -76,7 +76,7 @@ PICTURES = {
     ),
     "agreement": (
         "residuals",
-        "Do the records agree?",
+        "Consistency of the records",
         "What each record's readings are off the joint fit, and off a fit of that record alone. "
         "The chi-square compares where both fits have the shared parameters with how far apart "
         "chance may put them.",
@@ -102,21 +102,20 @@ PICTURES = {
     "coverage": (
         "coverage",
         "Coverage and PIT",
-        "Left: how much the bands cover, against what they promise; whiskers are one "
+        "Left: measured against nominal coverage of the bands; whiskers are one "
         "block-bootstrap standard error. It does not include that a record has one offset, and a "
         "posterior one estimate of the discrepancy: one record may be covered more or less than "
         "many are on average, and its PIT may lean. Right: how often readings fall at each "
-        "predicted probability. A level line is right; a hump means bands that are too wide, a "
-        "bowl too narrow, a slope a bias.",
-        "Measured against promised coverage of the bands, and a histogram of the readings' PIT",
+        "predicted probability. Flat: calibrated. Hump: bands too wide. U-shape: too narrow. "
+        "Slope: bias.",
+        "Measured against nominal coverage of the bands, and a histogram of the readings' PIT",
     ),
     "innovations": (
         "residuals",
         "Innovations",
-        "What each fitted reading adds to those before it: its residual minus what they predict "
-        "of it, over its standard deviation. If model and noise model are right these are "
-        "independent standard normal numbers: white, on the line of the normal quantiles, of one "
-        "size from the start on, and the same wherever the drive is. Whiskers are 95 % of chance.",
+        "One-step prediction errors, standardized: each fitted reading's residual minus what those "
+        "before it predict. For a correct model they are independent standard normal, of one size "
+        "from the start on and at any input voltage. Whiskers: 95 % intervals of chance.",
         "Autocorrelation, normal quantiles, course in time and size by drive of the innovations",
     ),
     "spectrum": (

@@ -38,7 +38,7 @@ def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
     panel.vlines(lags, 0, correlation, color=style.COLORS[0], lw=2)
     panel.axhline(0, color=style.MEASURED_COLOR, lw=0.8)
     reach = max(float(np.max(np.abs(correlation))), 2 * bound, 0.1) * 1.15
-    panel.set(title="Are they white?", xlabel="lag (readings)", ylabel="autocorrelation")
+    panel.set(title="Autocorrelation", xlabel="lag (readings)", ylabel="autocorrelation")
     panel.set(ylim=(-reach, reach), xlim=(0, lags[-1] + 1))
     panel.legend(loc="lower right")
 
@@ -58,7 +58,7 @@ def _draw_quantiles(panel: Axes, white: FloatArray) -> None:
     panel.fill_between(expected, low, high, color=style.CHANCE_COLOR, lw=0, label=label)
     panel.plot(expected, expected, color=style.MEAN_COLOR, lw=1)
     panel.plot(expected, np.sort(white)[at], ".", color=style.COLORS[0], ms=3, mew=0)
-    panel.set(title="Are they normal?", xlabel="normal quantile")
+    panel.set(title="Normal quantiles", xlabel="normal quantile")
     panel.legend(loc="upper left")
 
 
@@ -77,7 +77,7 @@ def _draw_time(panel: Axes, time: FloatArray, white: FloatArray) -> None:
         label = "_nolegend_" if rows[0] else "root mean square: 1 is right"
         panel.plot(centers, size, color=style.MEAN_COLOR, lw=1.5, label=label)
     panel.axhline(1, color=style.MEAN_COLOR, lw=0.8, ls=":")
-    panel.set(ylim=(-reach, reach), title="Does the record go on as it starts?")
+    panel.set(ylim=(-reach, reach), title="Stationarity")
     panel.set_xlabel("time (s)")
     panel.legend(loc="upper right")
 
@@ -113,7 +113,7 @@ def _draw_drive(panel: Axes, innovations: Innovations) -> None:
     panel.set_xticks(list(ticks), list(ticks.values()))
     low, high = panel.get_ylim()
     panel.set_ylim(min(low, -0.3), max(high, 1.3) + 0.15 * (high - low))
-    panel.set_title("Are they the same along the drive?")
+    panel.set_title("Size by input voltage")
     panel.legend(loc="center right")
 
 
