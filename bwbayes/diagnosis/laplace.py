@@ -19,10 +19,11 @@ from itertools import combinations, product
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["NONE", "Effect", "LocalFit", "Simulate", "climb"]
+__all__ = ["NONE", "Effect", "LocalFit", "Simulate", "climb", "climb_each"]
 
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
@@ -86,8 +87,10 @@ class LocalFit:
     def error(self, windows: Sequence[slice]) -> float:
         """Root mean square, um, of what it misses of the readings in windows; nan of none."""
         record = self.posterior.only
-        simulated = _Target(self.posterior, self.effect).simulate(self.coordinates[np.newaxis])[0]
-        missed = record.displacement - simulated
+        likelihood = self.posterior.likelihood
+        model = likelihood.table.actuator(self.posterior.prior.theta(self.free[np.newaxis]))
+        simulate = partial(likelihood.simulate, model)
+        missed = record.displacement - self.effect.apply(simulate, record.voltage, self.sizes)[0]
         inside = np.concatenate([np.empty(0), *(missed[window] for window in windows)])
         return float(np.sqrt(np.nanmean(inside**2))) if np.isfinite(inside).any() else np.nan
 
@@ -102,18 +105,38 @@ def climb(
     """
     target = _Target(posterior, effect)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
-    states = [target.climb(target.at(start), 2, least) for start in starts]
-    best = max(states, key=lambda state: state.density)
+    states = target.climb(target.at(np.stack(starts)), 2, least)
+    best = states.rows(np.array([np.argmax(states.density)]))
     return target.fitted(target.climb(best, ROUNDS, least))
 
 
+def climb_each(posterior: Posterior, places: FloatArray) -> list[LocalFit]:
+    """Fit from each of coordinates (places, free) of a posterior of one record."""
+    target = _Target(posterior, NONE)
+    states = target.climb(target.at(places.copy()), ROUNDS, -np.inf)
+    return [target.fitted(states.rows(np.array([row]))) for row in range(len(places))]
+
+
 @dataclass(frozen=True)
-class _State:
-    """Coordinates, their log density without the constant, and the displacement there."""
+class _States:
+    """Where climbers are: they go side by side, because a call costs more than a model in it.
+
+    Coordinates (climbers, free + sizes), their log density (climbers,) without the constant, and
+    the displacement there (climbers, readings).
+    """
 
     coordinates: FloatArray
-    density: float
+    density: FloatArray
     displacement: FloatArray
+
+    def rows(self, rows: IntArray | BoolArray) -> _States:
+        """Return some of them."""
+        return _States(self.coordinates[rows], self.density[rows], self.displacement[rows])
+
+    def put(self, rows: IntArray, states: _States) -> None:
+        """Put others in the place of some."""
+        self.coordinates[rows], self.density[rows] = states.coordinates, states.density
+        self.displacement[rows] = states.displacement
 
 
 class _Target:
@@ -133,53 +156,60 @@ class _Target:
         sizes = coordinates[:, self.free :]
         return self.posterior.prior.theta(free), density - 0.5 * np.sum(sizes**2, axis=1)
 
-    def simulate(self, coordinates: FloatArray, samples: int | None = None) -> FloatArray:
-        """Displacement (models, samples) along the record, or its first samples."""
+    def displacement(self, coordinates: FloatArray) -> FloatArray:
+        """Displacement (models, readings), um."""
         theta, _ = self.prior(coordinates)
-        voltage = self.likelihood.voltage[:samples]
-        moved = np.empty((len(theta), voltage.size))
+        readings = self.likelihood.readings
+        voltage = self.likelihood.voltage[: readings.samples]
+        moved = np.empty((len(theta), readings.rows.size))
         # An effect is worked out once for all models that have the same sizes.
         every, which = np.unique(coordinates[:, self.free :], axis=0, return_inverse=True)
         for number, sizes in enumerate(every):
-            rows = np.flatnonzero(which.ravel() == number)
-            model = self.likelihood.table.actuator(theta[rows])
-            simulate = partial(self.likelihood.simulate, model)
-            moved[rows] = self.effect.apply(simulate, voltage, sizes)
+            alike = np.flatnonzero(which.ravel() == number)
+            for batch in batches(alike.size, voltage.size):
+                rows = alike[batch]
+                model = self.likelihood.table.actuator(theta[rows])
+                simulate = partial(self.likelihood.simulate, model)
+                moved[rows] = self.effect.apply(simulate, voltage, sizes)[:, readings.where]
         return moved
 
-    def displacement(self, coordinates: FloatArray) -> FloatArray:
-        """Displacement (models, readings), um."""
-        readings = self.likelihood.readings
-        return self.simulate(coordinates, readings.samples)[:, readings.where]
+    def at(self, coordinates: FloatArray) -> _States:
+        """Return the states at coordinates (climbers, free + sizes)."""
+        theta, density = self.prior(coordinates)
+        possible = np.isfinite(density)
+        moved = np.zeros((len(theta), self.likelihood.readings.rows.size))
+        if possible.any():
+            moved[possible] = self.displacement(coordinates[possible])
+            density[possible] += self._log_likelihood(theta[possible], moved[possible])
+        return _States(coordinates, np.where(np.isfinite(density), density, -np.inf), moved)
 
-    def at(self, coordinates: FloatArray) -> _State:
-        """Return the state at coordinates (free + sizes,)."""
-        theta, prior = self.prior(coordinates[np.newaxis])
-        if not np.isfinite(prior[0]):
-            return _State(coordinates, -np.inf, np.empty(0))
-        moved = self.displacement(coordinates[np.newaxis])
-        score = self.likelihood.score(theta, np.empty((0, moved.shape[1])), moved)
-        density = float(score.log_density[0] + prior[0])
-        return _State(coordinates, density if np.isfinite(density) else -np.inf, moved[0])
+    def _log_likelihood(self, theta: FloatArray, displacement: FloatArray) -> FloatArray:
+        """Log likelihood (models,) of models θ with a displacement (models, readings)."""
+        shapes = np.empty((0, displacement.shape[1]))
+        return self.likelihood.score(theta, shapes, displacement).log_density
 
-    def climb(self, state: _State, rounds: int, least: float) -> _State:
-        """Climb for so many rounds at most, as long as these may reach ``least``."""
-        if not np.isfinite(state.density):
-            return state
+    def climb(self, states: _States, rounds: int, least: float) -> _States:
+        """Climb from each for so many rounds at most, as long as these may reach ``least``."""
+        going = np.flatnonzero(np.isfinite(states.density))
         for _ in range(rounds):
-            before = state.density
-            state = self._with_physics(self._with_noise(state))
-            if state.density < before + max(GAIN, (least - state.density) / ROUNDS):
+            if not going.size:
                 break
-        return state
+            before, now = states.density[going], states.rows(going)
+            self._step_noise(now)
+            self._step_physics(now)
+            states.put(going, now)
+            enough = np.maximum(GAIN, (least - now.density) / ROUNDS)
+            going = going[now.density >= before + enough]
+        return states
 
-    def fitted(self, state: _State) -> LocalFit:
-        """Put the evidence together."""
-        covariance, log_evidence = np.eye(state.coordinates.size), state.density
+    def fitted(self, state: _States) -> LocalFit:
+        """Put the evidence of a single state together."""
+        coordinates, log_evidence = state.coordinates[0], float(state.density[0])
+        covariance = np.eye(coordinates.size)
         # What the record does not tell keeps its prior; the noise's bend is a finite difference.
         for places, curvature, flattest in (
-            (self.physical, self._physical_bend(state)[1], 1.0),
-            (self.noise, self._noise_bend(state)[1], 1e-2),
+            (self.physical, self._physical_bend(state)[1][0], 1.0),
+            (self.noise, self._noise_bend(state)[1][0], 1e-2),
         ):
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
@@ -188,83 +218,96 @@ class _Target:
         return LocalFit(
             self.posterior,
             self.effect,
-            state.coordinates,
+            coordinates,
             covariance,
-            state.density,
+            float(state.density[0]),
             log_evidence,
-            state.displacement,
+            state.displacement[0],
         )
 
-    def _with_physics(self, state: _State) -> _State:
+    def _step_physics(self, states: _States) -> None:
         """Step in the physical coordinates and the sizes, by Fisher scoring."""
-        slope, curvature = self._physical_bend(state)
-        step = np.linalg.solve(curvature, slope)
+        slope, curvature = self._physical_bend(states)
+        step = np.linalg.solve(curvature, slope[:, :, np.newaxis])[:, :, 0]
+        waiting = np.arange(len(step))
         for fraction in FRACTIONS:
-            coordinates = state.coordinates.copy()
-            coordinates[self.physical] += fraction * step
+            if not waiting.size:
+                break
+            coordinates = states.coordinates[waiting]
+            coordinates[:, self.physical] += fraction * step[waiting]
             tried = self.at(coordinates)
-            if tried.density > state.density:
-                return tried
-        return state
+            higher = tried.density > states.density[waiting]
+            states.put(waiting[higher], tried.rows(higher))
+            waiting = waiting[~higher]
 
-    def _physical_bend(self, state: _State, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
+    def _physical_bend(self, states: _States, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the physical coordinates.
 
         ``step`` may be small: a simulation has no noise but rounding.
         """
-        steps = step * np.eye(state.coordinates.size)[self.physical]
-        sides = np.concatenate([state.coordinates + steps, state.coordinates - steps])
+        steps = step * np.eye(states.coordinates.shape[1])[self.physical]
+        sides = states.coordinates[:, np.newaxis, np.newaxis] + np.stack([steps, -steps])
+        shape, sides = sides.shape[:3], sides.reshape(-1, sides.shape[3])
         possible = np.isfinite(self.prior(sides)[1])
-        moved = np.tile(state.displacement, (len(sides), 1))
+        moved = np.repeat(states.displacement, 2 * len(steps), axis=0)
         moved[possible] = self.displacement(sides[possible])
-        width = step * np.maximum(np.sum(possible.reshape(2, -1), axis=0), 1)
-        slopes = (moved[: len(steps)] - moved[len(steps) :]) / width[:, np.newaxis]
-        theta, _ = self.prior(state.coordinates[np.newaxis])
-        score = self.likelihood.score(theta, slopes, state.displacement[np.newaxis])
-        slope = score.pull[0] - state.coordinates[self.physical]
-        return slope, score.information[0] + np.eye(slope.size)
+        forth, back = np.moveaxis(moved.reshape(*shape, -1), 1, 0)
+        width = step * np.maximum(np.sum(possible.reshape(shape), axis=1), 1)
+        slopes = (forth - back) / width[:, :, np.newaxis]
+        theta, _ = self.prior(states.coordinates)
+        score = self.likelihood.score(theta, slopes, states.displacement)
+        slope = score.pull - states.coordinates[:, self.physical]
+        return slope, score.information + np.eye(len(steps))
 
-    def _with_noise(self, state: _State) -> _State:
+    def _step_noise(self, states: _States) -> None:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
+        going = np.arange(len(states.density))
         for _ in range(6 if self.noise.size else 0):
-            slope, curvature = self._noise_bend(state)
+            now = states.rows(going)
+            slope, curvature = self._noise_bend(now)
             values, vectors = np.linalg.eigh(curvature)
-            step = vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), 1.0))
-            step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
-            steps = FRACTIONS[:, np.newaxis] * step
-            gains = self._noise_gains(state, steps)
-            best = int(np.argmax(gains))
-            if gains[best] <= GAIN / 4:
+            along = np.einsum("mji,mj->mi", vectors, slope) / np.maximum(np.abs(values), 1.0)
+            step = np.einsum("mij,mj->mi", vectors, along)
+            step /= np.maximum(1.0, np.max(np.abs(step), axis=1, keepdims=True) / 0.5)
+            steps = FRACTIONS[:, np.newaxis] * step[:, np.newaxis]
+            gains = self._noise_gains(now, steps)
+            best, every = np.argmax(gains, axis=1), np.arange(going.size)
+            higher = gains[every, best] > GAIN / 4
+            going, every, best = going[higher], every[higher], best[higher]
+            if not going.size:
                 break
-            coordinates = state.coordinates.copy()
-            coordinates[self.noise] += steps[best]
-            state = _State(coordinates, state.density + float(gains[best]), state.displacement)
-        return state
+            states.coordinates[going[:, np.newaxis], self.noise] += steps[every, best]
+            states.density[going] += gains[every, best]
 
-    def _noise_gains(self, state: _State, steps: FloatArray) -> FloatArray:
-        """By how much steps (models, noise) in the noise's coordinates raise the log density."""
-        coordinates = np.tile(state.coordinates, (len(steps), 1))
-        coordinates[:, self.noise] += steps
-        theta, density = self.prior(coordinates)
+    def _noise_gains(self, states: _States, steps: FloatArray) -> FloatArray:
+        """By how much steps in the noise's coordinates raise the log density.
+
+        ``steps`` are (climbers or 1, steps, noise), the gains (climbers, steps).
+        """
+        count = steps.shape[1]
+        coordinates = np.repeat(states.coordinates[:, np.newaxis], count, axis=1)
+        coordinates[:, :, self.noise] += steps
+        theta, density = self.prior(coordinates.reshape(-1, coordinates.shape[2]))
         possible = np.isfinite(density)
-        moved = np.broadcast_to(state.displacement, (int(possible.sum()), state.displacement.size))
-        shapes = np.empty((0, moved.shape[1]))
-        density[possible] += self.likelihood.score(theta[possible], shapes, moved).log_density
-        return np.where(np.isfinite(density), density, -1e12) - state.density
+        moved = np.repeat(states.displacement, count, axis=0)
+        density[possible] += self._log_likelihood(theta[possible], moved[possible])
+        density = np.where(np.isfinite(density), density, -1e12).reshape(-1, count)
+        return density - states.density[:, np.newaxis]
 
-    def _noise_bend(self, state: _State, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
+    def _noise_bend(self, states: _States, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the noise's coordinates.
 
         The posterior's sds are hundredths of the prior's, which are one.
         """
-        size = self.noise.size
+        size, climbers = self.noise.size, len(states.density)
         if not size:
-            return np.zeros(0), np.zeros((0, 0))
+            return np.zeros((climbers, 0)), np.zeros((climbers, 0, 0))
         single, pairs = np.eye(size), [*combinations(range(size), 2)]
         steps = step * np.stack([*single, *(single[i] + single[j] for i, j in pairs)])
-        plus, minus = np.split(self._noise_gains(state, np.concatenate([steps, -steps])), 2)
+        sides = np.concatenate([steps, -steps])[np.newaxis]
+        plus, minus = np.split(self._noise_gains(states, sides), 2, axis=1)
         bend = plus + minus
-        curvature = np.diag(bend[:size])
-        for (i, j), together in zip(pairs, bend[size:], strict=True):
-            curvature[i, j] = curvature[j, i] = (together - bend[i] - bend[j]) / 2
-        return (plus - minus)[:size] / (2 * step), -curvature / step**2
+        curvature = bend[:, :size, np.newaxis] * np.eye(size)
+        for (i, j), together in zip(pairs, bend.T[size:], strict=True):
+            curvature[:, i, j] = curvature[:, j, i] = (together - bend[:, i] - bend[:, j]) / 2
+        return (plus - minus)[:, :size] / (2 * step), -curvature / step**2

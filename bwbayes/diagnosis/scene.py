@@ -12,7 +12,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
+from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb, climb_each
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
@@ -133,10 +133,9 @@ class Scene:
             places = np.concatenate([optima, point.optima])
         except InputError:
             pass  # the rest has too few readings for these priors
-        fits = [climb(posterior, optimum[np.newaxis]) for optimum in places]
-        best = max(fits, key=lambda fit: fit.log_evidence)
+        best = max(climb_each(posterior, places), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
-        starts = np.concatenate([best.coordinates[np.newaxis], places])
+        starts = pointfit.distinct([best.coordinates, *places], best.covariance)
         return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
 
     @property

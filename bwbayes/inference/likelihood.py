@@ -149,7 +149,8 @@ class Likelihood:
     ) -> Score:
         """Say what shapes (shapes, readings) in the readings, um, would explain at θ.
 
-        With the whitened shapes S, and as in :meth:`start`:
+        Each model may have shapes of its own, (models, shapes, readings). With the whitened shapes
+        S, and as in :meth:`start`:
 
             u = Sᵀ (z₀ − Z μ),   I = Sᵀ S − Sᵀ Z C Zᵀ S.
 
@@ -158,7 +159,7 @@ class Likelihood:
         """
         products, log_determinant = self._with_numpy(theta, shapes, displacement)
         start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
-        series = [0, *range(end, end + len(shapes))]
+        series = [0, *range(end, products.shape[1])]
         across = products[:, 1:end][:, :, series]
         explained = np.einsum("mui,muv,mvj->mij", across, start.covariance, across)
         unexplained = products[:, series][:, :, series] - explained
@@ -240,9 +241,10 @@ class Likelihood:
 
         ``displacement`` is as in :meth:`score`.
         """
-        readings, n_series = self.readings, 1 + self.unknowns + len(shapes)
+        readings, n_series = self.readings, 1 + self.unknowns + shapes.shape[-2]
         # Shapes are many: a model's series are to stay in the cache.
-        elements = 1 << 16 if len(shapes) else 1 << 23
+        elements = 1 << 16 if shapes.size else 1 << 23
+        every = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
         results = []
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
@@ -258,7 +260,7 @@ class Likelihood:
             if not self.from_rest:
                 sections = self.actuator.sections(self.actuator.columns(model))
                 parts.append(sections.free_responses(readings.samples)[..., readings.where])
-            parts.append(np.broadcast_to(shapes, (len(model), *shapes.shape)))
+            parts.append(every[batch])
             series = np.concatenate(parts, axis=1)
             white, log_determinant = self.whiten(noise, series)
             # Sums, not dot products: a linear algebra library may split those over threads.

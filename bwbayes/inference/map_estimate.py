@@ -21,7 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
-__all__ = ["PointFit", "fit", "peaks"]
+__all__ = ["PointFit", "distinct", "fit", "peaks"]
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
@@ -82,7 +82,7 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
     worth = [m.position for m in modes if m.log_density > best.log_density - HOPELESS]
-    optima = _distinct(worth, best.covariance)
+    optima = distinct(worth, best.covariance)
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 
 
@@ -359,8 +359,8 @@ class _Surface:
         return _Surface(self.posterior, center, axes)
 
 
-def _distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
-    """Keep the places that lie more than a standard deviation or so from those before them."""
+def distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
+    """Keep the places (free,) that lie more than an sd or so from those before them."""
     with warnings.catch_warnings():
         # A discrepancy of which a record shows nothing is far less sure than a gain.
         warnings.simplefilter("ignore", linalg.LinAlgWarning)
