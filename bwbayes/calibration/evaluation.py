@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
-from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray
 from bwbayes.calibration.replicates import RANKED, Entry
@@ -250,13 +249,14 @@ def smooth_power(count: int, level: float, width: float) -> float:
     z = np.linspace(-9, 9, 4001)
     weight = np.exp(-0.5 * z**2)
     weight /= np.sum(weight)
-    b = _legendre(ndtr(z / width))
+    b = _legendre(scipy.special.ndtr(z / width))
     mean = b @ weight
     sd = np.sqrt(((b - mean[:, np.newaxis]) ** 2) @ weight)
     # By symmetry b1 has no mean and both are uncorrelated: integrate over the mean of b1.
     rest = np.sqrt(np.maximum(-2 * np.log(level) - (sd[0] * z) ** 2, 0))
     shift = mean[1] * np.sqrt(count)
-    beyond = ndtr((shift - rest) / sd[1]) + ndtr((-shift - rest) / sd[1])
+    below, above = scipy.special.ndtr((np.stack([shift, -shift]) - rest) / sd[1])
+    beyond = below + above
     return float(np.where(rest > 0, beyond, 1) @ weight)
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.designed import Promise
@@ -149,4 +149,4 @@ def _updated(covariance: FloatArray, information: FloatArray, offset_sd: float) 
     # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
     factor = np.linalg.cholesky(covariance)
     inner = np.eye(len(factor)) + factor.T @ products @ factor
-    return np.asarray(factor @ linalg.solve(inner, factor.T, assume_a="pos"))
+    return np.asarray(factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos"))

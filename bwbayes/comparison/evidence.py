@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import PointFit
@@ -186,8 +186,8 @@ def _fixed_point(
     for _ in range(1000):  # some ten where the two distributions overlap at all
         at_draws = -np.logaddexp(from_posterior + draws, from_reference + log_r)
         at_places = places - np.logaddexp(from_posterior + places, from_reference + log_r)
-        top = logsumexp(at_places) - np.log(places.size)
-        before, log_r = log_r, float(top - (logsumexp(at_draws) - np.log(draws.size)))
+        top = scipy.special.logsumexp(at_places) - np.log(places.size)
+        before, log_r = log_r, float(top - (scipy.special.logsumexp(at_draws) - np.log(draws.size)))
         if not abs(log_r - before) > 1e-10:  # nan too
             break
     return log_r, (at_draws, at_places)

@@ -15,7 +15,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.inference.map_estimate import PointFit
@@ -201,15 +201,15 @@ def log_ratios(
     logs = np.log([*counts.values()])[:, np.newaxis]
     log_z = np.zeros((len(sampled), 1))
     for _ in range(1000):
-        mixture = logsumexp(logs + log_likelihood[sampled] - log_z, axis=0)
+        mixture = scipy.special.logsumexp(logs + log_likelihood[sampled] - log_z, axis=0)
         before = log_z
-        log_z = logsumexp(log_likelihood[sampled] - mixture, axis=1, keepdims=True)
+        log_z = scipy.special.logsumexp(log_likelihood[sampled] - mixture, axis=1, keepdims=True)
         log_z -= log_z[0]
         if np.max(np.abs(log_z - before)) < 1e-8:
             break
     weights = log_likelihood - mixture
-    ratios = logsumexp(weights, axis=1)
-    effective = np.exp(2 * ratios - logsumexp(2 * weights, axis=1))
+    ratios = scipy.special.logsumexp(weights, axis=1)
+    effective = np.exp(2 * ratios - scipy.special.logsumexp(2 * weights, axis=1))
     return ratios - ratios[0], effective
 
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import scipy
-from scipy.linalg import block_diag
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -253,7 +252,7 @@ class SampledModel:
             b.append(entry)
             c.append(gain * np.eye(1, order))
         return scipy.signal.StateSpace(
-            block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
+            scipy.linalg.block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
         )
 
     def _section_drives(self, w: FloatArray, voltage: FloatArray) -> FloatArray:

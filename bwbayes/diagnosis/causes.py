@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.explanations import likely_causes
@@ -147,7 +147,7 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     # Twice the mean to the readings: then they are its opposite.
     nats["sign"] = weigh(shapes["offset"], residual + 2 * mean)[0] - plain
     starts = [weigh(3 * shapes["offset"] * np.exp(-along / decay))[0] for decay in DECAYS]
-    nats["start"] = float(logsumexp(starts)) - np.log(len(DECAYS)) - plain
+    nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))

@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
@@ -177,10 +176,10 @@ def _distance(
     ]
     rows = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
-    precision = linalg.inv(point.covariance)[np.ix_(physical, physical)]
-    taken = own.covariance - linalg.inv(precision)[np.ix_(rows, rows)]
-    added = linalg.inv(own.covariance) - linalg.inv(own.prior_covariance)
-    weights = np.maximum(linalg.eigvals(added @ taken).real, 0.0)
+    precision = scipy.linalg.inv(point.covariance)[np.ix_(physical, physical)]
+    taken = own.covariance - scipy.linalg.inv(precision)[np.ix_(rows, rows)]
+    added = scipy.linalg.inv(own.covariance) - scipy.linalg.inv(own.prior_covariance)
+    weights = np.maximum(scipy.linalg.eigvals(added @ taken).real, 0.0)
     # What a record tells by itself alone differs by rounding: then nothing can be compared.
     smallest = 0.05
     if not weights.sum() > smallest:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy.special import betainc, ndtr, ndtri
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.reversals import rate
@@ -148,8 +147,8 @@ class Standardized:
                 scales = np.sqrt(self.noise_size / scipy.stats.chi2.ppf(chance, self.noise_size))
             # The binomial distribution function, for a number of readings that is not whole.
             inside = covered * self.square_size
-            outside = 2 * ndtr(ndtri((1 - nominal) / 2) / scales)
-            chances = betainc(self.square_size - inside, inside + 1, outside)
+            outside = 2 * scipy.special.ndtr(scipy.special.ndtri((1 - nominal) / 2) / scales)
+            chances = scipy.special.betainc(self.square_size - inside, inside + 1, outside)
             text = f"the {level}% sensor band covers {percent(covered)} of readings"
             yield text, float(np.mean(chances))
 

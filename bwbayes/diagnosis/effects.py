@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.laplace import Effect, Simulate, climb
 from bwbayes.diagnosis.record_checks import settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
-from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference import map_estimate
 
 __all__ = [
     "add_shapes",
@@ -156,7 +156,7 @@ def reversed_sign(scene: Scene) -> Iterator[Explanation]:
     if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) >= 0:
         return
     turned = scene.posterior.altered(displacement=-record.displacement)
-    fit = climb(turned, pointfit.fit(turned, scene.generator).mode)
+    fit = climb(turned, map_estimate.valleys(turned, scene.generator))
     text, fix = "reversed sign of the displacement", "change its sign in the file"
     yield scene.explained("sign", text, fix, fit)
 

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.conflict import normal_scores
@@ -104,9 +104,9 @@ def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatAr
     steps[:, columns] *= [_prior_sd(prior, prior.free[column], values) for column in columns]
     stepped = prior.theta(np.concatenate([free + steps, free - steps]))
     information = sum(_information(posterior, data, theta, stepped) for data in posterior.datasets)
-    remaining = linalg.inv(np.eye(len(columns)) + information)
+    remaining = scipy.linalg.inv(np.eye(len(columns)) + information)
     loop = [columns.index(column) for column in _columns(posterior, posterior.table.loop)]
-    variance, directions = linalg.eigh(remaining[np.ix_(loop, loop)])
+    variance, directions = scipy.linalg.eigh(remaining[np.ix_(loop, loop)])
     return np.sqrt(variance[::-1]), directions[:, ::-1]
 
 
@@ -333,7 +333,7 @@ def _combinations(
     eigenvectors of the posterior's covariance relative to the prior's.
     """
     prior, posterior = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
-    variances, directions = linalg.eigh(posterior, prior)
+    variances, directions = scipy.linalg.eigh(posterior, prior)
     for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
         sd = float(np.sqrt(max(variances[i], 0.0)))
         if sd >= LEFT_OPEN:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.scene import Explanation, Scene
-from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 
 __all__ = [
@@ -88,9 +87,8 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         posterior = scene.rebuilt(changes)
         if posterior is None or type(posterior.only.actuator.hysteresis) is present:
             continue
-        fit = scene.extended(
-            posterior=posterior, places=pointfit.fit(posterior, scene.generator).optima
-        )
+        places = map_estimate.valleys(posterior, scene.generator)
+        fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
         yield scene.explained(f"operator {name}", text, _lines(changes), fit, changes=changes)
 
@@ -153,7 +151,7 @@ def tail_nats(white: FloatArray) -> float:
     normal = float(np.sum(scipy.stats.norm.logpdf(white)))
     # The scale is paid for as its sd of a half over the root of the readings, of a prior's of one.
     cost_of_scale = 0.5 * np.log(2 * white.size)
-    return float(logsumexp(densities) - np.log(len(tried)) - cost_of_scale) - normal
+    return float(scipy.special.logsumexp(densities) - np.log(len(tried)) - cost_of_scale) - normal
 
 
 def growing_noise(scene: Scene) -> Iterator[Explanation]:

@@ -14,7 +14,6 @@ from functools import partial
 
 import numpy as np
 import scipy
-from scipy.special import ndtr
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
@@ -152,7 +151,7 @@ def _statistics(
     frequency, power = scipy.signal.periodogram(residual, detrend="constant")
     relative = frequency / frequency[-1]
     slow, fast = (np.sum(power[:, band], axis=1) for band in (relative <= 0.01, relative > 0.1))
-    pit = ndtr(residual / sd)
+    pit = scipy.special.ndtr(residual / sd)
     # ∮ y du, by trapezes; turns of either direction count with their sign.
     area = np.sum(0.5 * (readings[:, 1:] + readings[:, :-1]) * np.diff(voltage), axis=1)
 

@@ -14,7 +14,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb, climb_each
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.record.io.grid import clock
@@ -129,13 +129,15 @@ class Scene:
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
         places = optima
         try:
-            point = pointfit.fit(posterior.altered(training=later), generator)
-            places = np.concatenate([optima, point.optima])
+            rest = posterior.altered(training=later)
+            fits = climb_each(rest, map_estimate.valleys(rest, generator))
+            best = max(fits, key=lambda fit: fit.log_density)
+            places = np.concatenate([optima, best.coordinates[np.newaxis]])
         except InputError:
             pass  # the rest has too few readings for these priors
         best = max(climb_each(posterior, places), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
-        starts = pointfit.distinct([best.coordinates, *places], best.covariance)
+        starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
         return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
 
     @property

@@ -14,14 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy import linalg, special
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
-__all__ = ["PointFit", "distinct", "fit", "peaks"]
+__all__ = ["PointFit", "distinct", "fit", "peaks", "valleys"]
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
@@ -57,25 +56,9 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     InputError
         No prior draw has a finite posterior density.
     """
-    prior = posterior.prior
-    draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
-    center, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
-    density = posterior.log_density(draws[:DRAWS])
-    if not np.isfinite(density).any():
-        raise InputError("priors: no draw has a finite posterior density; check priors and record")
-    valleys = []
-    for steps in (False, True):
-        least_squares = _LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
-        starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
-        valleys += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
-    noise = draws[:DRAWS, ~least_squares.physical]
-    places = [_with_noise(posterior, valley, noise, generator) for valley in valleys]
-    # A place that least squares allows may still have no density: the noise is another one there.
-    possible = np.isfinite(posterior.log_density(np.stack(places)))
-    likeliest = draws[int(np.argmax(density))]
-    climbed = [position for position, is_so in zip(places, possible, strict=True) if is_so]
+    places, spread = _places(posterior, generator)
     modes: list[_Mode] = []
-    for position in climbed or [likeliest]:
+    for position in places:
         mode = _mode(posterior, position, spread, modes)
         if mode is not None:
             modes.append(mode)
@@ -84,6 +67,17 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     worth = [m.position for m in modes if m.log_density > best.log_density - HOPELESS]
     optima = distinct(worth, best.covariance)
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
+
+
+def valleys(posterior: Posterior, generator: np.random.Generator) -> FloatArray:
+    """Find coordinates (places, free) near every mode of a posterior: those of least squares.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit`.
+    """
+    return np.stack(_places(posterior, generator)[0])
 
 
 def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -99,7 +93,31 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
     covariances = np.stack([mode.covariance for mode in modes])
     log_evidence = np.array([mode.log_density for mode in modes])
     log_evidence += np.linalg.slogdet(covariances)[1] / 2
-    return covariances, special.softmax(log_evidence)
+    return covariances, scipy.special.softmax(log_evidence)
+
+
+def _places(
+    posterior: Posterior, generator: np.random.Generator
+) -> tuple[list[FloatArray], FloatArray]:
+    """Return places (free,) to climb from, and the covariance of prior draws."""
+    prior = posterior.prior
+    draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
+    center, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
+    density = posterior.log_density(draws[:DRAWS])
+    if not np.isfinite(density).any():
+        raise InputError("priors: no draw has a finite posterior density; check priors and record")
+    optima = []
+    for steps in (False, True):
+        least_squares = _LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
+        starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
+        optima += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
+    noise = draws[:DRAWS, ~least_squares.physical]
+    places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
+    # A place that least squares allows may still have no density: the noise is another one there.
+    possible = np.isfinite(posterior.log_density(np.stack(places)))
+    likeliest = draws[int(np.argmax(density))]
+    climbed = [position for position, is_so in zip(places, possible, strict=True) if is_so]
+    return climbed or [likeliest], spread
 
 
 def _with_noise(
@@ -326,8 +344,8 @@ class _Surface:
     def inwards(self, position: FloatArray) -> FloatArray:
         with warnings.catch_warnings():
             # Axes of very different lengths are as they should be.
-            warnings.simplefilter("ignore", linalg.LinAlgWarning)
-            w: FloatArray = linalg.solve(self.axes, position - self.center)
+            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+            w: FloatArray = scipy.linalg.solve(self.axes, position - self.center)
         return w
 
     def values(self, w: FloatArray) -> FloatArray:
@@ -353,7 +371,7 @@ class _Surface:
 
     def rescaled(self, center: FloatArray, curvature: FloatArray) -> _Surface:
         """Return the same surface, measured so that its curvature is the identity."""
-        size, directions = linalg.eigh((curvature + curvature.T) / 2)
+        size, directions = scipy.linalg.eigh((curvature + curvature.T) / 2)
         # Where the surface is flat or bends the wrong way, keep the old unit of length.
         axes = self.axes @ (directions / np.sqrt(np.maximum(size, 1e-2)))
         return _Surface(self.posterior, center, axes)
@@ -363,8 +381,8 @@ def distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
     """Keep the places (free,) that lie more than an sd or so from those before them."""
     with warnings.catch_warnings():
         # A discrepancy of which a record shows nothing is far less sure than a gain.
-        warnings.simplefilter("ignore", linalg.LinAlgWarning)
-        inverse = linalg.inv(covariance)
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+        inverse = scipy.linalg.inv(covariance)
     distinct: list[FloatArray] = []
     for position in places:
         distances = [(position - other) @ inverse @ (position - other) for other in distinct]

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -71,7 +71,7 @@ def outliers(
             )
             # Spikes in a fit make its noise larger than that of most readings: theirs counts, but
             # what a later fit clears needs the whole distance from then on.
-            typical = min(1.0, float(np.median(away[~mask]) / ndtri(0.75)))
+            typical = min(1.0, float(np.median(away[~mask]) / scipy.special.ndtri(0.75)))
             cleared[name] = cleared[name] | (mask & (away <= LIMIT))
             suspect = (away > LIMIT * typical) & ~mask & ~cleared[name]
             aside[name] = (away > LIMIT) | suspect

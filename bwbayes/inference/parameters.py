@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -135,7 +135,7 @@ class Parameter:
     def mass_between(self) -> tuple[float, float]:
         """The prior's cumulative probability at both ends of the support."""
         assert self.prior is not None
-        ends = ndtr(self.prior.form.score(np.array(self.support)))
+        ends = scipy.special.ndtr(self.prior.form.score(np.array(self.support)))
         return float(ends[0]), float(ends[1])
 
 

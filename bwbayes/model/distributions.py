@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import erf, erfc, erfcinv, erfinv, ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -69,15 +68,17 @@ class Tails:
     def score(self, x: FloatArray) -> FloatArray:
         """Return z of values x."""
         below, above = self.cdf(x), self.sf(x)
-        return np.where(below < above, ndtri(below), -ndtri(above))
+        return np.where(below < above, scipy.special.ndtri(below), -scipy.special.ndtri(above))
 
     def value(self, score: FloatArray) -> FloatArray:
         """Return x of scores z."""
+        ndtr = scipy.special.ndtr
         return np.where(score < 0, self.ppf(ndtr(score)), self.isf(ndtr(-score)))
 
 
 def _mass(low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the probability between two normal scores, from the tail in which they lie."""
+    ndtr = scipy.special.ndtr
     between = np.where(low < 0, ndtr(high) - ndtr(low), ndtr(-low) - ndtr(-high))
     return np.maximum(between, 0.0)
 
@@ -132,7 +133,8 @@ class Distribution:
         below, above = _mass(low, score), _mass(score, high)
         with np.errstate(divide="ignore", invalid="ignore"):
             near = np.minimum(below, above) / (below + above)
-        return np.asarray(np.where(below <= above, 1, -1) * ndtri(np.clip(near, 0, 1)))
+        score = scipy.special.ndtri(np.clip(near, 0, 1))
+        return np.asarray(np.where(below <= above, 1, -1) * score)
 
     def from_normal(
         self, z: FloatArray, lower: FloatArray, upper: FloatArray
@@ -145,10 +147,10 @@ class Distribution:
         if scalar and self.support == (float(lower), float(upper)):  # the bounds cut nothing
             return self.form.value(z), np.ones_like(z)
         low, high = self.form.score(lower), self.form.score(upper)
-        mass = _mass(low, high)
+        mass, ndtr = _mass(low, high), scipy.special.ndtr
         below, above = ndtr(low) + ndtr(z) * mass, ndtr(-high) + ndtr(-z) * mass
         # The smaller probability is the one that keeps its precision.
-        score = ndtri(np.minimum(below, above))
+        score = scipy.special.ndtri(np.minimum(below, above))
         x = self.form.value(np.where(below < above, score, -score))
         return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
 
@@ -174,10 +176,10 @@ class Distribution:
             case "halfnormal":
                 scale = math.sqrt(2) * get("scale")
                 return Tails(
-                    lambda x: erf(np.maximum(x, 0.0) / scale),
-                    lambda x: erfc(np.maximum(x, 0.0) / scale),
-                    lambda p: scale * erfinv(p),
-                    lambda p: scale * erfcinv(p),
+                    lambda x: scipy.special.erf(np.maximum(x, 0.0) / scale),
+                    lambda x: scipy.special.erfc(np.maximum(x, 0.0) / scale),
+                    lambda p: scale * scipy.special.erfinv(p),
+                    lambda p: scale * scipy.special.erfcinv(p),
                 )
         return Tails(self.frozen.cdf, self.frozen.sf, self.frozen.ppf, self.frozen.isf)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.shown import brief
@@ -97,8 +97,8 @@ class Bands:
 
     def sd(self, kind: Kind) -> FloatArray:
         """Sd (samples,) of a normal distribution whose 90 % band is as wide, um."""
-        width: FloatArray = (self.upper[kind, 90] - self.lower[kind, 90]) / (2 * ndtri(0.95))
-        return width
+        width: FloatArray = self.upper[kind, 90] - self.lower[kind, 90]
+        return width / float(2 * scipy.special.ndtri(0.95))
 
     def covers(self, kind: Kind, level: int, values: FloatArray) -> BoolArray:
         """Tell which values (samples,), um, a band covers; its edges belong to it."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
@@ -186,7 +186,7 @@ def _by_importance(
         return np.nan_to_num(values.reshape(rows.shape), nan=-np.inf, posinf=-np.inf)
 
     of_few = density(*np.broadcast_arrays(few[:, np.newaxis], pool))
-    pooled = logsumexp(of_few - evidence[:, np.newaxis], axis=0)
+    pooled = scipy.special.logsumexp(of_few - evidence[:, np.newaxis], axis=0)
     # Spread evenly over the pool, from another start for each draw.
     distance = pool.size * np.arange(64) // 64
     proposed = generator.permutation(pool)[

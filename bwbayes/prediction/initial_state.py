@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -242,7 +241,7 @@ def going_on(
     column = start.actuators[0].parameters.index("offset")
     model = start.model.copy()
     if start.offset_sd.any():
-        model[:, column] += start.offset_sd * ndtri(uniform(generator, len(model)))
+        model[:, column] += start.offset_sd * scipy.special.ndtri(uniform(generator, len(model)))
     matched = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
     simulated = matched.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
@@ -348,7 +347,7 @@ def _normal(mean: FloatArray, covariance: FloatArray, generator: np.random.Gener
     values, vectors = np.linalg.eigh(covariance)
     score = np.zeros_like(mean)
     for i in range(mean.shape[1]):
-        score[:, i] = ndtri(uniform(generator, len(mean)))
+        score[:, i] = scipy.special.ndtri(uniform(generator, len(mean)))
     spread = np.sqrt(np.maximum(values, 0.0)) * score
     drawn: FloatArray = mean + np.einsum("mij,mj->mi", vectors, spread)
     return drawn

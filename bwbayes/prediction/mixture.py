@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from bwbayes.arrays import FloatArray, Floating
 
@@ -35,7 +35,8 @@ def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     """
     each = -(-VALUES // draws)
     ranks = rng.permuted(np.tile(np.arange(draws), (each, 1)), axis=1)
-    scores: FloatArray = ndtri((np.arange(each)[:, np.newaxis] + (ranks + 0.5) / draws) / each)
+    below = (np.arange(each)[:, np.newaxis] + (ranks + 0.5) / draws) / each
+    scores: FloatArray = scipy.special.ndtri(below)
     return scores
 
 

@@ -18,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
@@ -272,7 +272,7 @@ def _summarized(
         if kind == "sensor" and record.displacement is not None:
             reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
             z = (reading - means) / sds
-            summarized["pit"] = np.mean(ndtr(z), axis=0, dtype=np.float64)
+            summarized["pit"] = np.mean(scipy.special.ndtr(z), axis=0, dtype=np.float64)
             summarized["crps"] = mixture.crps(ranked, reading)
             summarized["log_score"] = mixture.log_density(z, sds)
     return summarized

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import ndtri
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.shown import brief
@@ -279,7 +278,7 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     tail are worth another number.
     """
     # A comparison would take what is not a number for a draw beyond the tail.
-    tails = [np.where(np.isnan(scores), np.nan, scores <= ndtri(p)) for p in TAIL]
+    tails = [np.where(np.isnan(scores), np.nan, scores <= scipy.special.ndtri(p)) for p in TAIL]
     means = np.mean(values, axis=2)
     series = (scores, *tails, as_chains(values), means.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -324,7 +323,9 @@ def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     with np.errstate(invalid="ignore"):
         folded = np.abs(chains - np.median(chains))
     scores, folded_scores = (
-        ndtri((scipy.stats.rankdata(draws).reshape(chains.shape) - 3 / 8) / (chains.size + 1 / 4))
+        scipy.special.ndtri(
+            (scipy.stats.rankdata(draws).reshape(chains.shape) - 3 / 8) / (chains.size + 1 / 4)
+        )
         for draws in (chains, folded)
     )
     return scores, folded_scores

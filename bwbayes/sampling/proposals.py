@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from scipy.special import gammaln
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
@@ -136,7 +135,7 @@ class StudentMixture:
     def _log_scales(self) -> FloatArray:
         """Log wⱼ / |Lⱼ| and the constant of a Student-t distribution, (components,)."""
         freedom, free = self.freedom, self.centers.shape[1]
-        constant = gammaln((freedom + free) / 2) - gammaln(freedom / 2)
+        constant = scipy.special.gammaln((freedom + free) / 2) - scipy.special.gammaln(freedom / 2)
         constant -= 0.5 * free * np.log(freedom * np.pi)
         return np.asarray(np.log(self.weights) - self._log_volumes + constant)
 

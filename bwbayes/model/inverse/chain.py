@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
@@ -255,4 +255,4 @@ class _Single:
             reach *= 2
         if not above:
             return center
-        return float(brentq(excess, center, end, xtol=math.ulp(abs(center) + reach)))
+        return float(scipy.optimize.brentq(excess, center, end, xtol=math.ulp(abs(center) + reach)))
