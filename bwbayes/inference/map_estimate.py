@@ -11,14 +11,17 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
+
+if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
 
 __all__ = ["PointFit", "distinct", "fit", "peaks", "valleys"]
 

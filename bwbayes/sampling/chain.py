@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.shown import brief
+
+if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
 
 __all__ = [
     "MOVES",

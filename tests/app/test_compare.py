@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import warnings
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -162,7 +161,7 @@ def test_other_readings_are_refused(
 ) -> None:
     """Before anything is worked out, so that it does not matter what the draws are of."""
     config, records = config_of(record, KEYS | keys)
-    other = replace(fits[1], problem=resolve(config, Path(), records))
+    other = fits[1].knowing(problem=resolve(config, Path(), records))
     with pytest.raises(InputError, match=line):
         fits[0].compare(other)
 

@@ -61,8 +61,8 @@ SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
 
 def fit_of(problem: Problem, flat: FloatArray) -> Fit:
     """Return a fit with draws (draws, free) that come from no chain."""
-    fit = Fit(problem, cast(Any, None), RunFolder(Path()))
-    return fit.knowing(flat_draws=flat, standing=Standing())
+    fit = Fit(cast(Any, None), RunFolder(Path()))
+    return fit.knowing(problem=problem, flat_draws=flat, standing=Standing())
 
 
 @cache

@@ -10,40 +10,16 @@ import shutil
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
+from types import MethodType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
-from bwbayes.app.fit.surroundings import Scratch, console_of, warn
-from bwbayes.app.jobs.at_work import at_work
-from bwbayes.app.jobs.compensate import compensate as compensate_fit
-from bwbayes.app.jobs.design import design as design_fit
-from bwbayes.app.jobs.export import export as export_fit
-from bwbayes.app.jobs.predict import predict as predict_record
-from bwbayes.app.jobs.predict import prediction_notes
-from bwbayes.app.jobs.track import track as track_fit
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.running.assembling import assemble, load_result
-from bwbayes.app.running.figure_worker import Artist
-from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import Prediction
-from bwbayes.app.running.workers import executor
-from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.diagnosis.validation import Verdict
 from bwbayes.errors import InputError, NotConvergedError
-from bwbayes.inference.engine import Engine
-from bwbayes.prediction.loops import Loops
-from bwbayes.report.outputs import posterior_tree
-from bwbayes.report.page import fragment
-from bwbayes.report.report import Report
-from bwbayes.report.result import Result, summary
-from bwbayes.report.run import run_report
-from bwbayes.report.screen import as_text
 from bwbayes.sampling.chain import draws, log_densities
-from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.shown import head
 
@@ -51,9 +27,44 @@ if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
+    from bwbayes.app.fit.surroundings import Scratch
+    from bwbayes.app.jobs.at_work import at_work
+    from bwbayes.app.jobs.compensate import compensate as compensate_fit
+    from bwbayes.app.jobs.design import design as design_fit
+    from bwbayes.app.jobs.export import export as export_fit
+    from bwbayes.app.jobs.predict import predict as predict_record
+    from bwbayes.app.jobs.track import track as track_fit
+    from bwbayes.app.problem.problem import Problem
+    from bwbayes.app.running.predictions import Prediction
+    from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
+    from bwbayes.diagnosis.standing import Standing
+    from bwbayes.diagnosis.validation import Verdict
+    from bwbayes.inference.engine import Engine
+    from bwbayes.prediction.loops import Loops
+    from bwbayes.report.report import Report
+    from bwbayes.report.result import Result
+    from bwbayes.sampling.diagnostics import Outcome
 
 __all__ = ["Fit", "converged", "finished"]
+
+
+class _JobOf:
+    """A job as the method of a fit, as ``at_work`` makes it, loaded when it is asked for.
+
+    Its module has its name, and a function ``after`` of what it warns of, if any.
+    """
+
+    def __init__(self, name: str, *, carried: bool = True, after: str = "") -> None:
+        self.name, self.carried, self.after = name, carried, after
+
+    def __get__(self, fit: Fit | None, _: object = None) -> Any:
+        from bwbayes.app.jobs.at_work import at_work
+
+        module = import_module(f"bwbayes.app.jobs.{self.name}")
+        after = {"after": getattr(module, self.after)} if self.after else {}
+        method = at_work(getattr(module, self.name), carried=self.carried, **after)
+        return method if fit is None else MethodType(method, fit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,8 +73,6 @@ class Fit:
 
     Parameters
     ----------
-    problem
-        What was fitted: config in explicit numbers, record, priors.
     chain
         The draws.
     folder
@@ -75,10 +84,9 @@ class Fit:
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
     :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them. What
-    follows from them is worked out when it is first asked for.
+    follows from them is worked out, and what it needs is loaded, when it is first asked for.
     """
 
-    problem: Problem
     chain: ChainFile
     folder: RunFolder
     seconds: float = 0.0
@@ -90,6 +98,21 @@ class Fit:
         fit.__dict__.update(results)  # a cached property is a plain attribute
         return fit
 
+    @cached_property
+    def problem(self) -> Problem:
+        """What was fitted: config in explicit numbers, record, priors.
+
+        Raises
+        ------
+        InputError
+            Config or records were edited, so that the chain is another posterior's.
+        """
+        from bwbayes.app.running.fingerprint import require_own
+
+        problem = self.folder.problem()
+        require_own(problem, self.folder.chain, self.chain.attributes())
+        return problem
+
     @property
     def name(self) -> str:
         """The name of its config, or else of its operator."""
@@ -100,7 +123,8 @@ class Fit:
         """How the sampling ended, or stands."""
         if self._loaded is not None:
             return self._loaded.outcome
-        from bwbayes.sampling.sampler import sample  # noqa: PLC0415  # emcee is slow to load
+        from bwbayes.app.running.workers import executor
+        from bwbayes.sampling.sampler import sample
 
         plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
         with executor(1) as pool:
@@ -129,6 +153,8 @@ class Fit:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What to know of the record, the priors and the fit, one line each."""
+        from bwbayes.app.running.fingerprint import version_remarks, versions
+
         written = self.folder.numbers()
         if "result" in self.__dict__ or not written:
             return self.result.remarks
@@ -145,10 +171,14 @@ class Fit:
     @cached_property
     def result(self) -> Result:
         """The run in numbers and arrays, as the report is made of."""
+        from bwbayes.app.running.assembling import assemble
+
         return self._loaded or assemble(self.problem, self.chain, self.outcome)
 
     @cached_property
     def _loaded(self) -> Result | None:
+        from bwbayes.app.running.assembling import load_result
+
         return load_result(self.folder.result, self.problem, self.chain)
 
     @cached_property
@@ -172,6 +202,9 @@ class Fit:
     @property
     def numbers(self) -> dict[str, object]:
         """The run's numbers, as its ``summary.json`` holds them."""
+        from bwbayes.app.running.fingerprint import versions
+        from bwbayes.report.result import summary
+
         return summary(self.result) | {
             "seed": self.problem.config.seed,
             "go_on": None if self.converged else self.resuming,
@@ -183,6 +216,8 @@ class Fit:
     @cached_property
     def posterior(self) -> Any:
         """The draws as arviz has them, an xarray.DataTree; its ``converged`` is 1 or 0."""
+        from bwbayes.report.outputs import posterior_tree
+
         return posterior_tree(self.result, self.log_likelihood, self.problem.records)
 
     @property
@@ -202,7 +237,9 @@ class Fit:
         NotConvergedError
             The sampling has not converged.
         """
-        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
+        import pandas as pd
+
+        from bwbayes.report.result import summary
 
         numbers: Any = summary(self._converged())["parameters"]
         return pd.DataFrame.from_dict(numbers, orient="index")
@@ -216,6 +253,8 @@ class Fit:
         NotConvergedError
             The sampling has not converged.
         """
+        from bwbayes.app.running.predictions import Prediction
+
         scores, verdicts = self._converged().scores, self.result.verdicts
         return {
             bands.name: Prediction(
@@ -231,7 +270,7 @@ class Fit:
         nan where nothing was predicted or read. Of several records this raises an InputError: take
         ``fit.bands[NAME].residuals``.
         """
-        import xarray as xr  # noqa: PLC0415  # slow to load, and only needed here
+        import xarray as xr
 
         if len(self.problem.records) > 1:
             raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
@@ -252,22 +291,27 @@ class Fit:
     @property
     def plot(self) -> Plots:
         """The figures: ``fit.plot.loop()``, ``bands()``, ``corner()``, ``trace()`` and more."""
-        from bwbayes.app.fit.plots import Plots  # noqa: PLC0415  # matplotlib is slow to load
+        from bwbayes.app.fit.plots import Plots
 
         return Plots(self)
 
-    predict = at_work(predict_record, before=lambda _: (), after=prediction_notes)
-    compensate = at_work(compensate_fit)
-    design = at_work(design_fit)
-    export = at_work(export_fit)
-    track = at_work(track_fit)
+    if TYPE_CHECKING:
+        predict = at_work(predict_record)
+        compensate = at_work(compensate_fit)
+        design = at_work(design_fit)
+        export = at_work(export_fit)
+        track = at_work(track_fit)
+    else:
+        predict = _JobOf("predict", carried=False, after="prediction_notes")
+        compensate, design = _JobOf("compensate"), _JobOf("design")
+        export, track = _JobOf("export"), _JobOf("track")
 
     def compare(self, *others: Fit, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.
 
         Options and errors are as in :func:`bwbayes.compare`, which fits models, too.
         """
-        from bwbayes.app.fit.calls import compare  # noqa: PLC0415  # which makes fits
+        from bwbayes.app.fit.calls import compare
 
         return compare(self, *others, **options)
 
@@ -285,7 +329,8 @@ class Fit:
 
         Parameters and errors are as in :func:`bwbayes.resume`.
         """
-        from bwbayes.app.running import run  # noqa: PLC0415  # which makes fits
+        from bwbayes.app.fit.surroundings import console_of, warn
+        from bwbayes.app.running import run
 
         fit = run.resume(
             self.folder,
@@ -308,7 +353,8 @@ class Fit:
         InputError
             The folder exists and ``overwrite`` is not given, or it cannot be written.
         """
-        from bwbayes.app.running import run  # noqa: PLC0415  # which makes fits
+        from bwbayes.app.running import run
+        from bwbayes.app.running.figure_worker import Artist
 
         copied = RunFolder.create(Path(folder), self.problem, overwrite)
         with copied.locked():
@@ -349,30 +395,34 @@ class Fit:
         return head(str(self))
 
     def __str__(self) -> str:
+        from bwbayes.report.screen import as_text
+
         return f"{self._title}\n{as_text(self.report())}"
 
     def _repr_html_(self) -> str:
+        from bwbayes.report.page import fragment
+
         return fragment(replace(self.report(), title=self._title))
 
     def report(self) -> Report:
         """Return what the page of the run says."""
+        from bwbayes.report.run import run_report
+
         return run_report(self.result, self.numbers)
 
 
 def finished(folder: RunFolder) -> Fit:
-    """Return the fit that a run's folder holds, as far as its chain goes: nothing is worked out.
+    """Return the fit that a run's folder holds, as far as its chain goes: only that is read.
 
     Raises
     ------
     InputError
         The chain is missing, damaged or still in its pilot.
     """
-    problem = folder.problem()
     chain = ChainFile.read(folder.chain)
-    require_own(problem, folder.chain, chain.attributes())
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
-    return Fit(problem, chain, folder, folder.numbers().get("wall_s", 0.0))
+    return Fit(chain, folder, folder.numbers().get("wall_s", 0.0))
 
 
 def converged(path: Path) -> Fit:

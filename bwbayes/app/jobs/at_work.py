@@ -10,22 +10,26 @@ from typing import TYPE_CHECKING, Any, Concatenate
 import numpy as np
 
 from bwbayes.app.fit.surroundings import warn
-from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.operator import Span
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.problem.problem import Problem
 
 __all__ = ["at_work", "command_limits", "limits_of"]
 
 
 def at_work[**P, R](
     job: Callable[Concatenate[Fit, P], R],
-    before: Callable[[Fit], Iterable[str]] = lambda fit: fit.standing.said,
+    *,
+    carried: bool = True,
     after: Callable[[Any], Iterable[str]] = lambda product: getattr(product, "remarks", ()),
 ) -> Callable[Concatenate[Fit, P], R]:
-    """Make a job the method of a fit: it needs convergence, and warns as a command prints."""
+    """Make a job the method of a fit: it needs convergence, and warns as a command prints.
+
+    Of what the run's bands do not hold if that is ``carried``, and of what its product says.
+    """
     options = [*signature(job).parameters][1:]
 
     @wraps(job)
@@ -34,7 +38,7 @@ def at_work[**P, R](
             if name not in options:
                 raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")
         fit.require_converged()
-        warn(before(fit), 3)
+        warn(fit.standing.said if carried else (), 3)
         product = job(fit, *args, **kwargs)
         warn(after(product), 3)
         return product

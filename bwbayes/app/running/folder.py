@@ -13,15 +13,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from filelock import FileLock, Timeout
 
-from bwbayes.app.config.config import dump, load
-from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
-from bwbayes.record import write_record
+
+if TYPE_CHECKING:
+    from bwbayes.app.problem.problem import Problem
+    from bwbayes.diagnosis.standing import Standing
 
 __all__ = ["CalibrationFolder", "FileOf", "Folder", "RunFolder"]
 
@@ -173,6 +173,9 @@ class RunFolder(Folder):
         InputError
             It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
         """
+        from bwbayes.app.config.config import dump
+        from bwbayes.record import write_record
+
         cls.require_free(path, overwrite)
         folder = cls(path)
         with folder.drafted() as draft:
@@ -189,6 +192,9 @@ class RunFolder(Folder):
 
     def problem(self) -> Problem:
         """Return what its config and records say."""
+        from bwbayes.app.config.config import load
+        from bwbayes.app.problem.problem import resolve
+
         return resolve(load(self.config), self.path)
 
     def numbers(self) -> dict[str, Any]:
@@ -200,6 +206,8 @@ class RunFolder(Folder):
 
     def standing(self) -> Standing:
         """Return whether the bands of the run hold, which is finished."""
+        from bwbayes.diagnosis.standing import Standing
+
         self.require_finished()
         return Standing.read(self.numbers())
 

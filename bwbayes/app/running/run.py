@@ -177,7 +177,7 @@ def _drawn(
         f"sampled {models} models, {models / fewest:.1f} for each of {fewest:.0f} effective draws",
         highlight=False,
     )
-    return Fit(problem, chain, folder).knowing(outcome=outcome)
+    return Fit(chain, folder).knowing(problem=problem, outcome=outcome)
 
 
 def _chain(
