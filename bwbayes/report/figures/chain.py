@@ -37,7 +37,7 @@ def draw_corner(result: Result) -> Figure:
     low, high = 1.3 / side, 1 - 0.2 / side
     figure.subplots_adjust(low, low, high, high, wspace=0.05, hspace=0.05)
     grid = figure.add_gridspec(free, free)
-    for row, column in zip(*np.tril_indices(free), strict=True):
+    for row, column in ((i, j) for i in range(free) for j in range(i + 1)):
         panel = figure.add_subplot(grid[row, column])
         panel.set_xlim(*ranges[column])
         panel.xaxis.set_major_locator(ticks[column])
@@ -48,7 +48,9 @@ def draw_corner(result: Result) -> Figure:
         if (truth := truths[column]) is not None:
             panel.axvline(truth, color=style.TRUTH_COLOR)
         if row == column:
-            panel.hist(flat[:, row], 20, ranges[row], histtype="step", color=style.COLORS[0])
+            panel.hist(
+                flat[:, row], bins=20, range=ranges[row], histtype="step", color=style.COLORS[0]
+            )
             panel.set_yticks([])
             continue
         _draw_pair(panel, flat[:, column], flat[:, row], ranges[column], ranges[row])
