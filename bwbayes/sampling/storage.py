@@ -30,7 +30,6 @@ import numpy as np
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.earlier import read_earlier
 from bwbayes.sampling.proposals import StudentMixture
 
 __all__ = ["ChainFile"]
@@ -232,6 +231,8 @@ def _load(folder: Path, name: str) -> Arrays | None:
 
 def _earlier_files(path: Path) -> dict[str, Arrays]:
     """Return the files that a chain of an earlier version would be today."""
+    from bwbayes.sampling.earlier import read_earlier  # noqa: PLC0415  # h5py is slow to load
+
     files: dict[str, Arrays] = {**read_earlier(path)}
     start = dict(files["start"])
     text = {"format": FORMAT, "block": start.pop("block"), "attributes": start.pop("attributes")}

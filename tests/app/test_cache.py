@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from io import BytesIO
@@ -16,8 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bwbayes as bw
-from bwbayes.app.fit import fitted
-from bwbayes.app.running.assembling import assemble
+from bwbayes.app.running import assembling
 from bwbayes.app.running.cache import load, save
 from bwbayes.sampling import sampler
 
@@ -48,8 +49,8 @@ def refuse(*_: object) -> None:
 
 def test_an_opened_run_works_nothing_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = bw.open_run(run)
-    worked_out = assemble(expected.problem, expected.chain, expected.outcome)
-    monkeypatch.setattr(fitted, "assemble", refuse)
+    worked_out = assembling.assemble(expected.problem, expected.chain, expected.outcome)
+    monkeypatch.setattr(assembling, "assemble", refuse)
     monkeypatch.setattr(sampler, "sample", refuse)
     opened = bw.open_run(run)
     assert opened.converged
@@ -57,6 +58,14 @@ def test_an_opened_run_works_nothing_out(run: Path, monkeypatch: pytest.MonkeyPa
         assert_same(getattr(worked_out, name), getattr(opened.result, name))
     assert opened.bands
     assert "converged" in str(opened)
+
+
+def test_to_open_a_run_is_to_read_files(run: Path) -> None:
+    """Half a second is what the libraries take that only its use needs."""
+    code = f"import bwbayes, sys; bwbayes.open_run({str(run)!r}); print(*sys.modules)"
+    opened = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    slow = {"arviz", "emcee", "h5py", "matplotlib", "numba", "pandas", "pydantic", "scipy.special"}
+    assert not slow & set(opened.stdout.decode().split())
 
 
 @pytest.mark.parametrize("damage", ["cut", "missing", "config"])
@@ -73,7 +82,7 @@ def test_what_is_damaged_or_of_another_state_is_worked_out_again(
     else:
         config = (folder / "config.toml").read_text(encoding="utf-8")
         (folder / "config.toml").write_text(f'name = "other"\n{config.partition(chr(10))[2]}')
-    monkeypatch.setattr(fitted, "assemble", refuse)
+    monkeypatch.setattr(assembling, "assemble", refuse)
     with pytest.raises(AssertionError, match="worked out again"):
         _ = bw.open_run(folder).result
 
