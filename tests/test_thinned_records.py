@@ -217,28 +217,6 @@ def nested(
     return compared
 
 
-def test_the_variances_to_compare_with_are_those_of_dense_covariances() -> None:
-    """Exactly for the simulation's parameters; Whittle's are a long record's."""
-    lag, interval = LAGS[1], EVERY[-1] / RATE
-    moves = slopes(lag, interval)
-    derivatives = np.column_stack(list(moves.values()))
-    time = interval * np.arange(len(derivatives))
-    away = np.abs(time[:, np.newaxis] - time)
-    memory = TRUTH["discrepancy_time"]
-    slow = TRUTH["discrepancy_sd"] ** 2 * np.exp(-away / memory)
-    white = SENSOR**2 * np.eye(time.size)
-    inverse = linalg.inv(slow + white)
-    told = derivatives.T @ inverse @ derivatives
-    told[-1, -1] += START_SD**-2
-    expected = np.diag(linalg.inv(told))
-    np.testing.assert_allclose(list(of_simulation(lag, interval).values()), expected, 1e-6)
-    changes = [inverse @ change for change in (2 * white, 2 * slow, slow * away / memory)]
-    told = np.array([[np.sum(one * other.T) / 2 for other in changes] for one in changes])
-    told[2, 2] += TIME_SIGMA**-2
-    expected = np.diag(linalg.inv(told))
-    np.testing.assert_allclose(list(of_noise(interval).values()), expected, 0.1)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", LAGS)
 def test_every_kth_sample_of_a_record_at_5_khz_gives_its_answer(tmp_path: Path, lag: float) -> None:

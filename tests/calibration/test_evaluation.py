@@ -73,17 +73,6 @@ def test_smooth_test_has_the_power_that_is_stated(count: int, width: float) -> N
     assert abs(result - expected) < 0.02 + 4 * np.sqrt(0.25 / 4_000)
 
 
-def test_power_without_a_defect_is_the_level() -> None:
-    assert smooth_power(300, 0.01, 1.0) == pytest.approx(0.01, rel=1e-3)
-
-
-def test_smooth_test_of_one_value_is_its_formula() -> None:
-    u = 0.3
-    b1, b2 = np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u**2 - 6 * u + 1)
-    result = smooth_test(np.array([[u]]))
-    np.testing.assert_allclose(np.exp(-0.5 * (b1**2 + b2**2)), result[0], rtol=1e-12)
-
-
 def test_holm_is_the_textbooks() -> None:
     p = np.array([0.01, 0.04, 0.03, 0.005])
     np.testing.assert_allclose([0.03, 0.06, 0.06, 0.02], holm(p))
@@ -130,10 +119,6 @@ def test_ranks_among_199_draws_have_200_places() -> None:
         entry["ranks"] = dict.fromkeys(NAMES, rank)
     places = judged(made).positions * (RANKED + 1)
     np.testing.assert_array_equal(np.arange(200)[:, np.newaxis] * np.ones(len(NAMES)), places // 1)
-
-
-def test_too_few_replicates_say_that_they_have_no_power() -> None:
-    assert judged(entries(scores(20) / 0.8)).power["20 % too small"] < 0.05
 
 
 def test_unconverged_replicates_are_counted_and_fail_beyond_one_per_cent() -> None:

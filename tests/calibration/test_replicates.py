@@ -16,7 +16,6 @@ from bwbayes.calibration.replicates import (
     RANKED,
     Experiment,
     Replicate,
-    as_done,
     replicate,
     replicates,
 )
@@ -110,29 +109,6 @@ def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     assert {} == entry["ranks"] == entry["covered"]
 
 
-def test_only_so_many_are_under_way_together() -> None:
-    """Who stops after the first has to wait for no more than those."""
-    waiting = ((number,) for number in range(100))
-    with ThreadPoolExecutor(4) as executor:
-        done = as_done(executor, 2, abs, waiting)
-        results = {next(done)}
-        assert (2,) == next(waiting)
-        assert {0, 1, *range(3, 100)} == results | set(done)
-
-
-def test_draws_that_are_ranked_are_an_autocorrelation_time_apart() -> None:
-    steps, time = 300, 20.0
-    kept = np.exp(-1 / (time / 2))
-    generator = np.random.default_rng(1)
-    chain = generator.standard_normal((steps, 4, 12, 1))
-    for step in range(1, steps):
-        chain[step] = kept * chain[step - 1] + np.sqrt(1 - kept**2) * chain[step]
-    spacing, chosen = module._independent(chain, time, np.random.default_rng(2))
-    assert (20, (RANKED, 1)) == (spacing, chosen.shape)
-    assert RANKED == np.unique(chosen).size
-    assert np.isin(chosen, chain[::-20]).all()
-
-
 # Simulated records
 
 
@@ -195,21 +171,6 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
     within, across = (np.corrcoef(last, other)[0, 1] for other in (last_but_one, first))
     assert across > 0.5
     assert across == pytest.approx(within, abs=0.2)
-
-
-def test_a_record_that_starts_in_motion_is_simulated_so() -> None:
-    """The dynamics' state at the first sample has the spread that the likelihood expects."""
-    posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
-    moving = Experiment(posterior.altered(from_rest=False), PLAN)
-    names = posterior.only.actuator.parameters
-    away = []
-    for seed in range(300):
-        theta, records = module._simulated(moving, np.random.default_rng(seed))
-        model = records["record"].model
-        rest = theta["d"][0] * posterior.only.voltage[0] - theta["initial"][0] + theta["offset"][0]
-        away.append((model[0] - rest) / (theta["d"][0] * np.ptp(posterior.only.voltage) / 2))
-    assert "lag" in names
-    assert np.std(away) == pytest.approx(1.0, rel=0.2)
 
 
 # Loop measures

@@ -127,25 +127,6 @@ def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
     assert (0.0, 0.0) == log_prior_mass(alone, np.random.default_rng(1))
 
 
-def test_the_bridge_between_two_normals_is_exact() -> None:
-    """Of p = 7 N(1, 1), q = N(0, 1.5²): log r = log 7 within five errors, and a small one."""
-    source = np.random.default_rng(4)
-    p, q = stats.norm(1, 1), stats.norm(0, 1.5)
-    x, y = p.rvs((500, 4, 8), source), q.rvs(10_000, source)
-    made = bridge(np.log(7) + p.logpdf(x) - q.logpdf(x), np.log(7) + p.logpdf(y) - q.logpdf(y))
-    assert abs(made.log_integral - np.log(7)) < 5 * made.error
-    assert made.error < 0.02
-    assert made.effective > 8000
-
-
-def test_too_few_draws_are_not_told() -> None:
-    posterior = linear_posterior(("d", "offset"), "white")
-    once = np.broadcast_to(prior_moments(posterior)[0], (3, 4, 2, 2))
-    made = evidence(posterior, once, np.zeros((3, 4, 2)), np.random.default_rng(1))
-    assert np.isnan(made.log_evidence)
-    assert np.isinf(made.error)
-
-
 def reference(name: str) -> Any:
     return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
 

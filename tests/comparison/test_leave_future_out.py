@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy import linalg, stats
 
 from bwbayes.app.running.workers import one_thread
@@ -15,7 +14,6 @@ from bwbayes.comparison.leave_future_out import (
     BLOCKS,
     FUTURE,
     Part,
-    bands_part,
     leave_future_out,
     log_ratios,
 )
@@ -28,7 +26,6 @@ from tests.inference.test_solvable import (
     linear_posterior,
     prior_moments,
 )
-from tests.prediction.records import bands_of, made
 
 PLAN = SamplingPlan(ess=400, walkers=24, block=25)
 
@@ -149,25 +146,3 @@ def test_the_ratios_of_normal_integrals_are_those_of_their_volumes() -> None:
     assert np.min(effective) > 1000
     _, alone = log_ratios(log_likelihood[:, :4000], {0: 4000})
     assert alone[-1] < 600 < alone[0]
-
-
-def test_the_residuals_worth_is_their_number_over_their_correlation_time() -> None:
-    """Of an AR(1) process with a time of (1 + 0.9) / (1 − 0.9) = 19 readings, within a third."""
-    rng = np.random.default_rng(4)
-    bands = bands_of(made(rng, length=40.0))
-    white = rng.normal(size=bands.mean.size)
-    walk = np.zeros_like(white)
-    for k in range(1, white.size):
-        walk[k] = 0.9 * walk[k - 1] + white[k]
-    for residual, time in ((white, 1.0), (walk, 19.0)):
-        read = replace(
-            bands,
-            measured=bands.mean + residual,
-            log_score=np.full(residual.size, -1.5),
-            scored_from=0,
-        )
-        part = bands_part(read)
-        assert part is not None
-        assert part.worth == pytest.approx(residual.size / time, rel=0.35)
-        assert np.sum(part.log_scores) == pytest.approx(-1.5 * residual.size)
-        assert not part.joint

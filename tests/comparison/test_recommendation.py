@@ -125,13 +125,6 @@ def test_errors_cover_differences_of_correlated_blocks() -> None:
     assert naive > 0.25 * 400
 
 
-def test_an_evidence_that_is_not_known_decides_nothing() -> None:
-    rich = model("rich", COMMON + 0.1 * noise(2), free=9)
-    unknown = replace(rich, evidence=Evidence(np.nan, np.inf, 0.0, 0.0))
-    comparison = recommend([model("plain", COMMON, 10.0), unknown])
-    assert {*comparison.tied, comparison.recommended} == {"plain", "rich"}
-
-
 def test_without_hysteresis_it_says_so() -> None:
     linear = model("linear", COMMON, 2.0, 3, hysteresis=False)
     rich = model("rich", COMMON + 0.1 * noise(2))
@@ -158,12 +151,6 @@ def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
     comparison = recommend([lost])
     assert comparison.recommended is None
     assert "not converged" in str(comparison)
-
-
-def test_a_reading_held_for_impossible_settles_it() -> None:
-    broken = np.where(np.arange(10) == 7, -np.inf, COMMON)
-    comparison = recommend([model("broken", broken), model("fine", COMMON, 0.0, 9)])
-    assert comparison.recommended == "fine"
 
 
 def test_table_numbers_and_page_have_every_model() -> None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.diagnosis.consistency import Agreement, _cost, agreements, disagreements
+from bwbayes.diagnosis.consistency import Agreement, agreements, disagreements
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
-from tests.inference.test_solvable import linear_posterior
 from tests.measured import keep
 
 
@@ -65,16 +62,6 @@ def test_a_record_with_another_noise_is_named_and_no_other() -> None:
     )
 
 
-def test_what_a_record_costs_is_the_quadratic_form_where_all_is_normal() -> None:
-    """A linear model: D = δᵀ A δ, with the precision that the record adds to its prior's."""
-    posterior = linear_posterior(("d", "offset"), "white")
-    own = pointfit.fit(posterior, np.random.default_rng(1))
-    added = np.linalg.inv(own.covariance) - np.eye(2)
-    moved = np.array([0.3, -0.2])
-    expected = moved @ added @ moved
-    assert _cost(posterior, own.mode, own.mode + moved) == pytest.approx(expected, rel=1e-4)
-
-
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_they_should_be() -> None:
     """Of 100 pairs of records of one actuator 5 % lie beyond the 95 % of the chi-square.
@@ -102,15 +89,3 @@ def test_false_alarms_are_as_rare_as_they_should_be() -> None:
     assert alarms <= 2
     assert np.mean(named) > 0.9
     assert stats.kstest(p[:, 0], "uniform").pvalue > 1e-3
-
-
-def test_records_that_share_nothing_have_nothing_to_compare() -> None:
-    both = pair(2)
-    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "exponent": 1.0}
-    fixed = [
-        replace(p, prior=None, fixed=known[p.name]) if p.name in known else p
-        for p in both.prior.parameters
-    ]
-    prior = type(both.prior)(fixed, both.prior.constraint)
-    every = compared(replace(both, prior=prior))
-    assert all(one.degrees == 0 and one.p_value == 1.0 for one in every.values())

@@ -66,19 +66,6 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
         np.testing.assert_allclose(fitted.log_evidence, exact, rtol=1e-6)
 
 
-def test_a_climb_ends_at_the_point_fit_with_its_laplace_evidence(tmp_path: Path) -> None:
-    """From a place that is a tenth of a prior sd off in each coordinate."""
-    write_record(plant("good", (5, 3), seconds=4.0), tmp_path / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
-    rng = np.random.default_rng(1)
-    point = pointfit.fit(problem.posterior, rng)
-    place = point.mode + 0.1 * rng.choice([-1.0, 1.0], point.mode.size)
-    fitted = climb(problem.posterior, place[np.newaxis])
-    assert abs(fitted.log_density - point.log_density) < 0.05
-    laplace = point.log_density + 0.5 * np.linalg.slogdet(point.covariance)[1]
-    assert abs(fitted.log_evidence - laplace) < 1.5
-
-
 FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
     "transient": effects.transient,
     "drift": effects.drift,

@@ -52,12 +52,6 @@ def kinds(posterior: Posterior, voltage: FloatArray, interval: float) -> list[st
     return [finding.kind for finding in beyond_training(posterior, voltage, interval)]
 
 
-def test_step_is_faster_than_a_sine_and_no_sine_than_a_step() -> None:
-    step = np.repeat([0.0, 150.0], 100)
-    assert "speed" in kinds(fitted(sine(1.0, 0.01), 0.01), step, 0.01)
-    assert "speed" not in kinds(fitted(step, 0.01), sine(5.0, 0.01), 0.01)
-
-
 def test_range_and_speed_are_said_one_by_one() -> None:
     assert ["range", "speed"] == kinds(SLOW, sine(5.0, 1e-3, 100.0), 1e-3)
     (wide,) = beyond_training(SLOW, sine(0.1, 0.05, 100.0), 0.05)
@@ -103,14 +97,6 @@ def test_rest_small_drives_and_long_ones_of_the_same_frequency_are_not_slow() ->
     repeated = np.tile(FAST.only.voltage, 4)
     assert ["duration"] == kinds(FAST, repeated, 0.005)
     assert [] == kinds(fitted(repeated, 0.005), FAST.only.voltage, 0.005)
-
-
-def test_a_hold_counts_from_where_it_begins_and_the_slowest_record_counts() -> None:
-    """Predicted is the end of a hold; a fit that saw one as long knows it."""
-    held = np.where(TIME < 1, 75 * np.sin(4 * np.pi * TIME), 75.0)
-    end = slice(TIME.size * 3 // 4, None)
-    assert ["slow"] == [finding.kind for finding in beyond_training(FAST, held, 0.005, end)]
-    assert [] == beyond_training(fitted(held, 0.005), held, 0.005, end)
 
 
 @pytest.mark.slow

@@ -112,31 +112,3 @@ def test_decaying_amplitudes_leave_less_open_than_a_sine_the_more_of_them_the_le
     twenty = left(measured(signal("identification")))
     assert (four < 0.9 * constant).all()
     assert (twenty < 0.9 * four).all()
-
-
-def test_more_periods_of_the_same_loop_tell_hardly_more() -> None:
-    """Each distinct stretch counts once; only the sensor noise averages out."""
-    short, long = (left(measured(sine(100.0, 1.0, periods))) for periods in (4.0, 16.0))
-    np.testing.assert_allclose(short, long, rtol=0.1)
-
-
-def test_what_comes_after_the_training_window_does_not_matter() -> None:
-    """Periods that the likelihood does not see are no reason to count those it sees less."""
-    posterior = measured(sine(100.0, 1.0))
-    seen = slice(0, 2250)
-    alone = posterior.altered(
-        voltage=posterior.only.voltage[seen],
-        displacement=posterior.only.displacement[seen],
-    )
-    expected, got = (left(p.altered(training=(seen,))) for p in (alone, posterior))
-    np.testing.assert_allclose(expected, got, rtol=0.05)
-
-
-def at_rest(posterior: Posterior) -> Posterior:
-    return posterior.altered(voltage=0 * posterior.only.voltage)
-
-
-def test_a_constant_voltage_tells_nothing_about_the_loop() -> None:
-    posterior = at_rest(short_posterior(samples=200))
-    assert ("d", "alpha", "beta", "gamma") == posterior.names[:4]
-    np.testing.assert_allclose(1, left(posterior), atol=1e-6)

@@ -68,15 +68,3 @@ def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
     assert () == departures(result)
     assert 3000 == result.numbers["readings"]
     assert {"rate", "voltage", "direction"} == set(result.numbers["by"])  # type: ignore[call-overload]
-
-
-@pytest.mark.parametrize("share", [1.0, 0.6])
-def test_the_density_of_white_noise_is_flat(share: float) -> None:
-    """The sd times √(2 / sampling rate), whether readings are missing or not, within 6 %."""
-    rng = np.random.default_rng(7)
-    time = 0.002 * np.flatnonzero(rng.random(16000) < share).astype(np.float64)
-    white = rng.normal(size=time.size)
-    series = Innovations(time, white, white, white, 0.5 * white, 0.002)
-    frequency, density = series.residual_density()
-    assert np.sqrt(np.mean(density**2)) == pytest.approx(0.5 * np.sqrt(0.004), rel=0.06)
-    assert frequency[-1] == pytest.approx(250.0, abs=0.1)

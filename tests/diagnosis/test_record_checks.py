@@ -150,26 +150,10 @@ def test_a_spike_is_where_it_is_said_to_be() -> None:
     assert "outliers = true under [model]" == finding.fix
 
 
-def test_missing_readings_are_no_fault() -> None:
-    record = looping(0)
-    assert () == inspect(record.exclude([(1.0, 1.5), (3.0, 3.2)]))
-    assert () == inspect(record.decimate(5))
-
-
 def test_a_planned_voltage_is_looked_at_too() -> None:
     steady = 5e4 * np.sin(np.arange(3000) / 30)
     kinds = [finding.kind for finding in inspect(Record(steady, None, 1e-3))]
     assert ["wrong units", "one amplitude"] == kinds
-
-
-def test_spikes_are_neither_edges_nor_turns() -> None:
-    noise = 0.01 * np.random.default_rng(1).standard_normal(400)
-    triangle = np.abs(np.arange(400) % 80 - 40) / 10
-    assert [] == spikes(triangle + noise, triangle).tolist()
-    assert [] == spikes(np.sign(triangle - 2) + noise).tolist()
-    pulses = triangle + 5.0 * (np.arange(400) % 100 == 50)
-    assert [] == spikes(pulses + noise, pulses).tolist()
-    assert [200] == spikes(triangle + noise + 2.0 * (np.arange(400) == 200), triangle).tolist()
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -118,28 +118,6 @@ def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: boo
     assert max(shares) < 0.99, shares
 
 
-def test_free_exponent_widens_beta_and_no_more_than_its_own_prior_says() -> None:
-    ranges = Ranges(100.0, 60.0, 0.0, 0.5)
-
-    def sigma(exponent: float | Distribution) -> float:
-        return prior("beta", ranges, exponent).arguments["sigma"]
-
-    wide, narrow = (Distribution("normal", {"mean": 2.0, "sd": sd}) for sd in (0.5, 0.001))
-    assert sigma(1.0) == sigma(3.0) == pytest.approx(sigma(narrow), rel=1e-3)
-    assert sigma(wide) > 1.05 * sigma(1.0)
-
-
-@pytest.mark.parametrize("offset", [12_345.6, -98_765.4321, 1e-4])
-def test_offset_is_as_exact_as_the_displacements_range_asks(offset: float) -> None:
-    """A sensor far from its zero: the prior's mean is off by a hundredth of its sd at most."""
-    voltage = drive(1.0)
-    reading = displacement(voltage, offset=offset)
-    ranges = ranges_of(voltage, reading, 1e-3)
-    result = prior("offset", ranges).arguments
-    assert abs(result["mean"] - ranges.middle) < 0.01 * result["sd"]
-    assert len(f"{result['mean']:.12g}") <= 12
-
-
 def test_missing_readings_do_not_matter() -> None:
     voltage = drive()
     whole = displacement(voltage)

@@ -148,25 +148,6 @@ def test_halves_with_a_discrepancy_are_the_whole() -> None:
     assert np.sqrt(wrong.covariance[place, place]) > 1.2 * sd[one.names.index("offset")]
 
 
-def test_own_parameters_change_their_own_record_alone() -> None:
-    both = joint(LOOPS, SLOW, per_record=("sensor_sd",))
-    theta = drawn(both, 3)
-    moved = theta.copy()
-    for name in ("offset[slow]", "sensor_sd[slow]"):
-        moved[:, both.table.names.index(name)] += 1.0
-    before, after = (both.simulate(t, record="loops") for t in (theta, moved))
-    np.testing.assert_array_equal(before, after)
-    away = both.simulate(moved, record="slow") - both.simulate(theta, record="slow")
-    assert np.abs(away).min() > 0
-    changes = [
-        likelihood.log_density(both.table.of(moved, name))
-        - likelihood.log_density(both.table.of(theta, name))
-        for name, likelihood in zip(both.table.records, both.likelihoods, strict=True)
-    ]
-    assert not changes[0].any()
-    assert changes[1].all()
-
-
 def test_bounds_hold_in_every_record() -> None:
     """With alpha of each record its own: 0 < alpha < d, and |gamma| <= beta."""
     both = joint(LOOPS, SLOW, per_record=("alpha", "gamma"))

@@ -17,10 +17,10 @@ from scipy import linalg
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.likelihood import Likelihood, _inverse
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Hold, first_order_lag, second_order
+from bwbayes.model.linear import Hold
 from tests.inference.problems import (
     INTERVAL,
     decaying_sine,
@@ -140,20 +140,6 @@ def test_a_shape_takes_what_an_unknown_of_that_shape_would(
     )
 
 
-def test_what_shapes_take_does_not_depend_on_their_coordinates() -> None:
-    posterior = moving()
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 70))
-    place = np.linspace(-1, 1, posterior.only.readings.rows.size)
-    shapes = np.stack([place, place**2, place**3])
-    others = np.array([[2.0, 0.0, 1.0], [0.0, -1.0, 1.0], [1.0, 1.0, 1.0]]) @ shapes
-    likelihood = replace(posterior.likelihood, offset_sd=3.0)
-    np.testing.assert_allclose(
-        likelihood.score(theta, shapes).together,
-        likelihood.score(theta, others).together,
-        rtol=1e-6,
-    )
-
-
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("missing", [0.1, 0.7])
 @pytest.mark.parametrize("stride", [1, 8])
@@ -169,18 +155,6 @@ def test_missing_readings_are_left_out_and_nothing_else(
     for row, one in enumerate(theta):
         density, _, _ = dense(likelihood, one)
         assert abs(density - got[row]) < 1e-7 * (200 + abs(density))
-
-
-def test_a_long_memory_is_not_cut_short() -> None:
-    """A lag of two records' lengths, a discrepancy that hardly fades: both engines keep it."""
-    posterior = moving(fixed={"lag": 4.0, "discrepancy_time": 50.0, "sensor_sd": 2.0})
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(8), 5))
-    engines: tuple[Engine, ...] = ("numpy", "numba")
-    for engine in engines:
-        likelihood = replace(posterior.likelihood, engine=engine)
-        got = likelihood.log_density(theta)
-        expected = [dense(likelihood, one)[0] for one in theta]
-        np.testing.assert_allclose(got, expected, rtol=1e-7)
 
 
 def test_from_rest_means_a_path_from_zero_volts() -> None:
@@ -203,52 +177,6 @@ def test_from_rest_means_a_path_from_zero_volts() -> None:
     )
     wrong = at_rest.altered(voltage=voltage - 50).log_likelihood(theta)
     assert np.min(np.abs(wrong - at_rest.log_likelihood(theta))) > 1
-
-
-def test_a_transient_at_the_start_does_not_bias_the_gain() -> None:
-    """The twin: taken for a record from rest, the same transient is far less probable."""
-    posterior = moving()
-    names = posterior.prior.names
-    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(11), 1))
-    known = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "lag": 0.03}
-    known |= {"initial": 0.0, "offset": 0.0, "sensor_sd": 0.3}
-    known |= {"discrepancy_sd": 0.8, "discrepancy_time": 0.2}
-    theta[0] = [known.get(name, 1.0) for name in names]
-    unknown, rest = (posterior.altered(from_rest=known) for known in (False, True))
-    assert unknown.log_likelihood(theta)[0] > rest.log_likelihood(theta)[0] + 10
-
-
-@pytest.mark.parametrize("dynamics", ["lag", "complex"])
-def test_free_responses_are_those_of_the_differential_equation(dynamics: str) -> None:
-    """A unit of displacement, and of speed in units of the natural frequency, dying out."""
-    time = np.arange(50) * INTERVAL
-    if dynamics == "lag":
-        recursion = first_order_lag(np.array([0.03]), INTERVAL, "zero")
-        np.testing.assert_allclose(
-            recursion.free_responses(50)[0], np.exp(-time / 0.03)[np.newaxis], atol=1e-12
-        )
-        return
-    m, b, k = (np.array([COMPLEX[name]]) for name in ("mass", "damping", "stiffness"))
-    recursion = second_order(m, b, k, INTERVAL, "first")
-    loss, natural = b[0] / (2 * m[0]), np.sqrt(k[0] / m[0])
-    ringing = np.sqrt(natural**2 - loss**2)
-    fade, sine = np.exp(-loss * time), np.sin(ringing * time) / ringing
-    expected = [fade * (np.cos(ringing * time) + loss * sine), natural * fade * sine]
-    np.testing.assert_allclose(recursion.free_responses(50)[0], expected, atol=1e-11)
-
-
-@pytest.mark.parametrize(("size", "error"), [(1e3, 1e-6), (1e7, 0.02), (1e12, 1e-6)])
-def test_unknowns_that_look_alike_are_integrated_out_however_little_is_known(
-    size: float, error: float
-) -> None:
-    """(1 + v vᵀ)⁻¹ = 1 - v vᵀ / (1 + |v|²); with a v of 1e7 and more the one is rounded away."""
-    v = size * np.array([[1.0, 1.0, 0.5], [1.0, -1.0, 0.5]])
-    squares = 1 + np.sum(v**2, axis=1)
-    products = v[:, :, np.newaxis] * v[:, np.newaxis, :]
-    inverse, log_determinant = _inverse(np.eye(3) + products)
-    np.testing.assert_allclose(np.log(squares), log_determinant, atol=error)
-    expected = np.eye(3) - products / squares[:, np.newaxis, np.newaxis]
-    np.testing.assert_allclose(expected, inverse, atol=error)
 
 
 @settings(max_examples=60, deadline=None)

@@ -48,18 +48,6 @@ def test_what_is_left_is_the_posterior_without_those_readings() -> None:
     )
 
 
-def test_the_sensors_sd_grows_without_it() -> None:
-    """The twin: left in, ten spikes make the sensor several times noisier."""
-    good = short_posterior(samples=800)
-    spiky = spoilt(good, list(range(30, 800, 77)))
-    sds = []
-    for posterior in (good, spiky):
-        point = pointfit.fit(posterior, np.random.default_rng(6))
-        free = posterior.prior.constrain(point.mode[np.newaxis])[0][0]
-        sds.append(free[posterior.names.index("sensor_sd")])
-    assert sds[1] > 3 * sds[0]
-
-
 def test_a_record_full_of_outliers_is_refused() -> None:
     posterior = short_posterior(samples=400)
     noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)

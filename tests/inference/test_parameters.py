@@ -154,13 +154,6 @@ def test_gamma_beyond_beta_is_outside_unless_the_model_need_not_be_passive() -> 
     assert np.mean(free.draw(np.random.default_rng(13), 2000)[:, 3] > 0.02) > 0.1
 
 
-def test_far_coordinates_have_no_density() -> None:
-    prior = PRIORS["default"]
-    z = np.zeros((4, prior.dimensions))
-    z[:, 0] = [36.0, 38.0, np.inf, np.nan]
-    assert [True, False, False, False] == np.isfinite(prior.constrain(z)[1]).tolist()
-
-
 def test_draws_have_the_density_that_log_density_says() -> None:
     """Means of draws against importance sampling, z-scores below 4.
 

@@ -10,7 +10,6 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.map_estimate import PointFit, fit, peaks
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.posterior import Posterior
@@ -18,8 +17,6 @@ from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.distributions import Distribution
 from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.problems import posterior_of, short_posterior
-from tests.prediction.runs import Stand
-from tests.sampling.targets import target
 
 CASES = ("white", "discrepancy", "lag")
 
@@ -64,13 +61,6 @@ def test_the_covariance_is_that_of_the_curvature(fits: Fits, name: str) -> None:
             pp, pm, mp, mm = posterior.log_density(np.array(corners))
             hessian[i, j] = -(pp - pm - mp + mm) / (4 * step**2)
     np.testing.assert_allclose(np.eye(size), hessian, atol=0.15)
-
-
-def test_the_mode_does_not_depend_on_the_seed(fits: Fits) -> None:
-    posterior, point = fits["white"]
-    other = fit(posterior, np.random.default_rng(6))
-    apart = other.mode - point.mode
-    assert apart @ np.linalg.inv(point.covariance) @ apart < 0.01
 
 
 @dataclass(frozen=True)
@@ -133,14 +123,6 @@ def test_the_mode_is_the_best_of_the_optima_and_one_not_much_worse_is_kept() -> 
     assert 3 < density[0] - density[1] < 30
 
 
-def test_an_optimum_that_is_much_worse_is_no_place_to_start_from() -> None:
-    """With residuals of 2 um instead of 0.3: two nats per sample."""
-    posterior = mirrored(worse=2.0)
-    point = fit(posterior, np.random.default_rng(7))
-    free, _ = posterior.prior.constrain(point.optima)
-    np.testing.assert_allclose([6.0], free[:, 1], atol=0.15)
-
-
 class Impossible(WhiteNoise):
     """A noise that no residual can have."""
 
@@ -160,48 +142,6 @@ def test_without_a_finite_density_there_is_no_fit() -> None:
     posterior = posterior.altered(noise=Impossible())
     with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
         fit(posterior, np.random.default_rng(9))
-
-
-def test_the_noise_is_not_taken_for_the_sensors_alone() -> None:
-    """Whatever the seed: a lesser mode has all of it in the sensor.
-
-    The best of the first draws is next to that mode one time in five, and tens of nats worse.
-    """
-    generator = np.random.default_rng(97)
-    time = 0.01 * np.arange(800)
-    record = Stand(discrepancy=0.3, memory=0.25, sensor=0.5).measure(
-        100 * np.sin(4 * np.pi * time), generator
-    )
-    assert record.displacement is not None
-    posterior = posterior_of(
-        record.voltage, record.displacement, Actuator("lag", "first", 0.01), "discrepancy"
-    )
-    point = fit(posterior, np.random.default_rng(1))
-    noise = ~np.array([name in posterior.table.physical for name in posterior.names])
-    for seed in range(12):
-        source = np.random.default_rng(seed)
-        draws = posterior.prior.unconstrain(posterior.prior.draw(source, 128))[:, noise]
-        place = pointfit._with_noise(posterior, point.mode, draws, source)
-        assert posterior.log_density(place[np.newaxis])[0] > point.log_density - 4
-
-
-def test_modes_have_shares_by_height_and_width() -> None:
-    """Two normal distributions of two coordinates: 0.2 of one, 0.8 of one a third as wide."""
-    places, sds, weights = np.array([[-4.0, 0.0], [4.0, 1.0]]), (0.9, 0.3), (0.2, 0.8)
-
-    def log_density(x: FloatArray) -> FloatArray:
-        squares = [np.sum((x - p) ** 2, axis=1) / sd**2 for p, sd in zip(places, sds, strict=True)]
-        logs = [
-            np.log(w / sd**2) - one / 2 for w, sd, one in zip(weights, sds, squares, strict=True)
-        ]
-        density: FloatArray = np.logaddexp(*logs)
-        return density
-
-    point = PointFit(places[1], np.eye(2), 0.0, places, np.eye(2))
-    covariances, shares = peaks(target(log_density, 2), point)
-    np.testing.assert_allclose([0.2, 0.8], shares, atol=1e-3)
-    expected = [sd**2 * np.eye(2) for sd in sds]
-    np.testing.assert_allclose(expected, covariances, atol=1e-3)
 
 
 @pytest.mark.parametrize(("number", "least"), [(97, 0.05), (106, 0.3)])

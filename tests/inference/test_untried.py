@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import optimize
 from scipy.signal import fftconvolve, lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.untried import ALIKE, with_creep
+from bwbayes.inference.untried import with_creep
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.prediction.bands import Bands
@@ -143,49 +142,6 @@ def test_an_ordinary_plan_keeps_its_band(
     before, after = predicted(posterior, draws, plan), extended(posterior, draws, plan)
     assert width(after) == pytest.approx(width(before), rel=0.05)
     assert np.sqrt(np.mean((after.mean - before.mean) ** 2)) < 0.1 * width(before)
-
-
-def test_bands_grow_with_the_time_that_was_not_tried(
-    fit: tuple[Posterior, FloatArray, float, float, np.random.Generator],
-) -> None:
-    posterior, draws, *_ = fit
-    plans = [Record(held([60.0], each, each / 500), None, each / 500) for each in (20, 200, 2000)]
-    ends = [
-        np.ptp([side["displacement", 95][-1] for side in (bands.lower, bands.upper)])
-        for bands in (extended(posterior, draws, plan) for plan in plans)
-    ]
-    assert ends == sorted(ends)
-    assert ends[-1] > 1.5 * ends[0]
-
-
-def test_strengths_are_those_of_the_longer_model_at_its_mode(
-    fit: tuple[Posterior, FloatArray, float, float, np.random.Generator],
-) -> None:
-    """Against a search of the longer posterior, which knows nothing of slopes or shapes."""
-    posterior, draws, *_ = fit
-    many = np.repeat(draws, 10, axis=0)
-    longer, drawn = with_creep(posterior, many, 100.0, np.random.default_rng(1))
-    places = longer.prior.unconstrain(drawn)
-    creep = [i for i, name in enumerate(longer.names) if name.startswith("creep")]
-    moving = [i for i, name in enumerate(longer.names) if name in longer.table.physical]
-    precision, begin = np.eye(len(longer.names)), places.mean(axis=0)
-    apart = np.abs(np.subtract.outer(np.arange(len(creep)), np.arange(len(creep))))
-    precision[np.ix_(creep, creep)] = np.linalg.inv(ALIKE**apart)
-
-    def cost(moves: FloatArray) -> float:
-        place = begin.copy()
-        place[moving] += moves
-        theta = longer.prior.theta(longer.prior.constrain(place[np.newaxis])[0])
-        return float(place @ precision @ place / 2 - longer.log_likelihood(theta)[0])
-
-    found = optimize.minimize(cost, np.zeros(len(moving)), method="Powell", options={"xtol": 1e-4})
-    best = begin.copy()
-    best[moving] += found.x
-    spread = places[:, creep].std(axis=0)
-    assert (np.abs(best - begin)[creep] < 0.1 * spread).all()
-    # The first strength is learned, the slowest one is not.
-    assert spread[0] < 0.7
-    assert 0.7 < spread[-1] < 1.1
 
 
 def test_a_model_that_creeps_stays_as_it_is() -> None:

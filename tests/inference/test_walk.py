@@ -16,8 +16,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from tests.inference.test_gain_and_creep import PARTS, WAYS
 from tests.inference.test_likelihood import moving
-from tests.inference.test_stages import models
-from tests.model.operators.slow import SPAN, paths
+from tests.model.operators.slow import SPAN, drawn, paths
 from tests.model.operators.test_memory import CASES
 
 # Not of one length, and one of them a sample.
@@ -65,7 +64,7 @@ def as_theta(actuator: Actuator, column: dict[str, FloatArray]) -> FloatArray:
 def test_pinned_walls_walk_as_with_numpy(operator: Pinned, path: str, parts: str) -> None:
     """NumPy takes the same pieces: an integrator's steps end where a piece does."""
     actuator = Actuator("lag", "first", 1e-3, operator, **PARTS.get(parts, {}), span=SPAN)
-    theta, voltage = as_theta(actuator, models(operator, 3)), paths()[path]
+    theta, voltage = as_theta(actuator, drawn(operator, LANES, 3)), paths()[path]
     begun, state = walk(actuator, theta, voltage), None
     assert begun is not None
     for first, last in pairwise([*(cut for cut in CUTS if cut < voltage.size), voltage.size]):

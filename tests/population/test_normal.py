@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
@@ -39,18 +37,6 @@ def test_posterior_of_the_spread_is_that_of_an_integral_on_a_dense_grid() -> Non
     assert np.mean(drawn[1]) == pytest.approx(
         np.sum(density * spread), abs=5 * np.std(drawn[1]) / 141
     )
-
-
-@given(st.floats(0.01, 3.0), st.floats(-2.0, 2.0), st.floats(0.05, 2.0))
-@settings(max_examples=30)
-def test_a_record_given_a_population_is_a_convolution(
-    spread: float, mean: float, sd: float
-) -> None:
-    one = NormalLikelihoods(np.array([0.3]), np.array([sd**-2.0]))
-    y = np.linspace(-30, 30, 60_001)
-    product = stats.norm.pdf(0.3, y, sd) * stats.norm.pdf(y, mean, spread)
-    result = one.marginal(np.array([mean]), np.array([spread]))[0, 0]
-    assert np.exp(result) == pytest.approx(np.trapezoid(product, y), rel=1e-5, abs=1e-12)
 
 
 def test_a_record_that_tells_nothing_is_the_population_and_moves_nothing() -> None:

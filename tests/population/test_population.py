@@ -110,19 +110,6 @@ def test_a_specimen_off_the_population_is_an_outlier_and_taken_for_normal() -> N
     assert shrunk.upper < shrunk.own_upper
 
 
-def test_without_trust_in_weights_all_are_taken_for_normal(monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = drawn(np.random.default_rng(8), 0.3, 0.15)
-    monkeypatch.setattr(
-        module, "smoothed_weights", lambda logs: (np.full(logs.size, 1 / logs.size), 2.0)
-    )
-    result = of(truth.specimens)
-    assert all(one.normal for one in result.specimens.values())
-    assert 2.0 == result.pareto_k
-    normal = likelihoods(truth.specimens, NAME)
-    mean, _ = spreads(normal, Hyperprior(0.0, 1.0, 1.0)).draw(np.random.default_rng(9), 4000)
-    assert stats.ks_2samp(result.mean, mean).pvalue > 1e-4
-
-
 def test_few_specimens_or_none_in_common_are_refused() -> None:
     generator = np.random.default_rng(10)
     three = [normal_specimen(f"s{i}", 0.1, 0.1, generator) for i in range(3)]

@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bwbayes.arrays import FloatArray
 from bwbayes.model.operator import Span
-from bwbayes.prediction.histories import Histories, _by_grids, choose_histories
+from bwbayes.prediction.histories import choose_histories
 from bwbayes.prediction.initial_state import started
 from bwbayes.prediction.prediction import Start
 from bwbayes.record.record import Record
@@ -105,58 +104,3 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
     assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
-
-
-def test_many_draws_choose_by_importance_what_they_would_choose_on_grids() -> None:
-    """A draw with a larger offset starts lower, as often in each history: within 4.5 errors.
-
-    The twin: histories and states that are handed to other draws have lost that.
-    """
-    record, draws = record_after(60.0), POSTERIOR.prior.theta(np.empty((400, 0)))
-    assert record.displacement is not None
-    posterior = POSTERIOR.altered(
-        voltage=record.voltage, displacement=record.displacement, training=(slice(0, 10),)
-    )
-    spans = [Span(-40.0, 40.0), Span(-60.0, 60.0), Span(-95.0, 95.0)]
-    several = tuple(
-        replace(
-            posterior.likelihood,
-            from_rest=False,
-            actuator=replace(posterior.only.actuator, span=span),
-        )
-        for span in spans
-    )
-    table, generator = several[0].table, np.random.default_rng(6)
-    offset = np.random.default_rng(5).standard_normal(400)
-    theta = table.replaced(draws, "offset", offset)
-    which, place, _ = _by_grids(several, theta, generator)
-    by_grids = Histories(several, which).with_states(theta, place)
-    histories, by_importance = choose_histories(several, theta, generator)
-
-    def apart(first: FloatArray, second: FloatArray) -> float:
-        """Distance of the means of what two sets of draws say, in standard errors."""
-        error = np.sqrt((np.var(first) + np.var(second)) / first.size)
-        return float(abs(np.mean(first) - np.mean(second)) / error)
-
-    def beginning(histories: Histories, begun: FloatArray) -> FloatArray:
-        """Displacement at the first sample without the offset, (draws,), um."""
-        (first,) = histories.each(
-            begun,
-            lambda likelihood, rows: (
-                likelihood.actuator.displacement(table.actuator(rows), record.voltage[:1])[:, 0],
-            ),
-        )
-        return first - offset
-
-    states = [
-        beginning(Histories(several, which), by_grids),
-        beginning(histories, by_importance),
-    ]
-    assert np.corrcoef(states[0], offset)[0, 1] < -0.3
-    assert apart(*states) < 4.5
-    pulled = [offset * (state - np.mean(state)) for state in states]
-    assert apart(*pulled) < 4.5
-    assert apart(pulled[0], offset * generator.permutation(states[1] - np.mean(states[1]))) > 4.5
-    for number in range(len(spans)):
-        chance = [(each == number).astype(float) for each in (which, histories.which)]
-        assert apart(*chance) < 4.5 or np.allclose(np.mean(chance, axis=1), 0, atol=0.02)

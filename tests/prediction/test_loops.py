@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Operator, Span
@@ -19,7 +18,6 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.prediction.loops import (
-    MEASURES,
     Traced,
     initial_curve,
     measure_loops,
@@ -27,9 +25,6 @@ from bwbayes.prediction.loops import (
     steady_loop,
 )
 from tests.inference.problems import decaying_sine, posterior_of
-
-# One of each kind of memory.
-FAST = ["bouc-wen", "duhem", "plays", "preisach"]
 
 
 def still(operator: Operator | None = None, gain: PolynomialGain | None = None) -> Actuator:
@@ -155,23 +150,6 @@ def test_plays_are_measured_as_in_a_slow_loop(low: float, high: float) -> None:
         assert value == pytest.approx(got[name], rel=1e-4), name
 
 
-@pytest.mark.parametrize("name", FAST)
-def test_what_is_measured_does_not_depend_on_the_sampling_of_the_path(name: str) -> None:
-    """From 401 to 1601 voltages a branch: by less than a thousandth of range and voltage."""
-    of, draws = problem(name)
-    coarse, fine = measure_loops(of, draws, 401), measure_loops(of, draws, 1601)
-    for one, other in ((coarse.major, fine.major), (coarse.minor, fine.minor)):
-        size, half = one.estimates["range_um"], one.amplitude
-        assert size is not None
-        units = {"um": abs(size.mean), "V": half, "um V": abs(size.mean) * half, "%": 100.0}
-        for key, (_, unit) in MEASURES.items():
-            a, b = one.estimates[key], other.estimates[key]
-            assert a is not None
-            assert b is not None
-            assert a.mean == pytest.approx(b.mean, abs=1e-3 * units[unit]), key
-    np.testing.assert_array_equal(coarse.major.rising.mean, fine.major.rising.mean[::4])
-
-
 def problem(name: str, draws: int = 40) -> tuple[Any, FloatArray]:
     """Return a posterior with an operator, and draws from a prior that is narrow about its median.
 
@@ -185,31 +163,6 @@ def problem(name: str, draws: int = 40) -> tuple[Any, FloatArray]:
     free = of.prior.draw(np.random.default_rng(2), 400)
     away = np.sum(np.log(np.abs(free) / np.median(np.abs(free), axis=0)) ** 2, axis=1)
     return of, free[np.argsort(away)[:draws]]
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.floats(-20, 20), st.floats(-10, 10))
-def test_a_gain_without_memory_changes_neither_area_nor_opening(q2: float, q3: float) -> None:
-    known = {"d": 0.7, "alpha": 0.36, "beta": 0.027, "gamma": 0.017, "exponent": 1.0}
-    plain = still()
-    bent = still(gain=PolynomialGain(reference=Span(-100.0, 100.0)))
-    without = measured(steady_loop(plain, columns(plain, **known), -100.0, 100.0))
-    column = columns(bent, **known, quadratic=q2, cubic=q3)
-    got = measured(steady_loop(bent, column, -100.0, 100.0))
-    for name in ("area_um_V", "opening_um"):
-        assert without[name] == pytest.approx(got[name], rel=1e-10), name
-    assert without["range_um"] + 2 * q3 == pytest.approx(got["range_um"], rel=1e-10)
-    assert without["remanence_um"] - q2 == pytest.approx(got["remanence_um"], rel=1e-9)
-
-
-def test_a_displacement_that_falls_with_the_voltage_has_a_coercive_voltage_too() -> None:
-    voltage = np.linspace(-1.0, 1.0, 201)
-    up, down = -(voltage - 0.2), -(voltage + 0.2)
-    ends = np.minimum(1.0, 5 * (1 - np.abs(voltage)))
-    middle = -voltage
-    traced = Traced(voltage, *((middle + ends * (b - middle))[np.newaxis] for b in (up, down)))
-    assert 0.2 == pytest.approx(measured(traced)["coercive_V"])
-    assert -2.0 == pytest.approx(measured(traced)["range_um"])
 
 
 def test_loops_are_those_of_the_whole_range_and_of_half_of_it() -> None:
@@ -259,15 +212,3 @@ def test_summary_holds_mean_sd_and_interval_of_the_draws() -> None:
             curve["lower_95_um"], curve["mean_um"], curve["upper_95_um"], strict=True
         )
     )
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "points", "message"),
-    [(1.0, 1.0, 201, "is not a range"), (0.0, 1.0, 200, "an odd number"), (0.0, 1.0, 1, "an odd")],
-)
-def test_what_cannot_be_a_loop_is_refused(
-    low: float, high: float, points: int, message: str
-) -> None:
-    actuator = still()
-    with pytest.raises(InputError, match=message):
-        steady_loop(actuator, columns(actuator, d=1.0), low, high, points)

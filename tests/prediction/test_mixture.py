@@ -96,16 +96,6 @@ def test_scores_are_stratified_in_every_draw_and_in_all(number: int) -> None:
     np.testing.assert_allclose(np.sort(scores.ravel()), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("number", [1, 64, 500])
-def test_crps_of_one_normal_distribution_is_the_closed_form(number: int) -> None:
-    y = np.linspace(-3, 5, 9)
-    z = (y - 0.4) / 1.7
-    expected = 1.7 * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
-    means, sds = np.full((number, 9), 0.4), np.full((number, 1), 1.7)
-    got = crps(ranked_values(means, sds, stratified_scores(number, random())), y)
-    np.testing.assert_allclose(got, expected, atol=1e-4)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_crps_is_the_double_sum_over_values(kind: str) -> None:
     ranked = values(kind)[:, ::5]

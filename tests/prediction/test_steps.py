@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
-from bwbayes.prediction.prediction import forecast, predict_windows
+from bwbayes.prediction.prediction import forecast
 from bwbayes.prediction.steps import Step, measure_step, measure_steps, step_of
 from bwbayes.record.record import Record
 from bwbayes.record.waveforms import signal
@@ -124,39 +122,6 @@ def test_the_papers_steps_are_recognized(name: str) -> None:
 def test_what_is_no_step_from_zero_is_left_alone(voltage: FloatArray) -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
     assert {} == measure_steps(of, draws, {"other": Record(voltage, None, INTERVAL)})
-
-
-def test_summary_names_the_steps() -> None:
-    of, draws = problem(Actuator("lag", "first", INTERVAL))
-    record = Record(np.repeat([0.0, 50.0], 100), None, INTERVAL)
-    numbers: Any = measure_steps(of, draws, {"up": record})["up"].numbers
-    assert [50.0, 1.0] == pytest.approx([numbers["height_V"], numbers["held_s"]])
-    assert {"mean", "sd", "lower_95", "upper_95"} == set(numbers["rise_s"])
-
-
-def test_a_forecast_is_the_end_of_a_record_that_goes_on() -> None:
-    """State, offset and random draws are those of the whole record's simulation.
-
-    With a discrepancy that is forgotten within a sample, for else a forecast carries it on.
-    """
-    actuator = Actuator("lag", "first", INTERVAL, creep=Creep((0.1, 1.0, 10.0)))
-    of, draws = problem(actuator)
-    draws[:, of.names.index("discrepancy_time")] = INTERVAL / 100
-    record = Record(of.only.voltage, of.only.displacement, INTERVAL, start=3.0)
-    planned = np.full(500, 40.0)
-    got = forecast(of, draws, record, planned, np.random.default_rng(5))
-    whole = Record(np.concatenate([of.only.voltage, planned]), None, INTERVAL, start=3.0)
-    (expected,) = predict_windows(
-        of, draws, whole, {"all": slice(0, 800)}, np.random.default_rng(5)
-    )
-    for one, other in ((got.mean, expected.mean), (got.time, expected.time)):
-        np.testing.assert_allclose(one, other[300:])
-    np.testing.assert_allclose(
-        got.lower["sensor", 95], expected.lower["sensor", 95][300:], rtol=1e-3
-    )
-    assert "forecast" == got.name
-    assert got.measured is None
-    assert not got.training
 
 
 @pytest.mark.parametrize("voltage", [np.zeros((2, 2)), np.array([]), np.array([1.0, np.nan])])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,12 +18,10 @@ from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import Weighted, pilot_moves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 from tests.inference.problems import short_posterior
-from tests.sampling.targets import gaussian, student, target
+from tests.sampling.targets import gaussian, target
 
 FREE, WALKERS = 3, 12
 POSTERIOR, POINT = gaussian(FREE)
-PROPOSAL = student(np.zeros(FREE), np.eye(FREE))
-MOVES = {"pilot": pilot_moves(), "sampling": sampling_moves(PROPOSAL)}
 
 
 def begin(seed: int = 1) -> EnsembleState:
@@ -33,38 +30,6 @@ def begin(seed: int = 1) -> EnsembleState:
 
 def alone(moves: Weighted, state: EnsembleState, steps: int) -> Block:
     return advance(POSTERIOR, [moves], [state], steps)[0]
-
-
-def assert_same_state(one: EnsembleState, two: EnsembleState) -> None:
-    np.testing.assert_array_equal(one.coordinates, two.coordinates)
-    np.testing.assert_array_equal(one.log_density, two.log_density)
-    np.testing.assert_array_equal(one.random_state, two.random_state)
-
-
-@pytest.mark.parametrize("phase", MOVES)
-def test_the_input_is_not_modified(phase: str) -> None:
-    state = begin()
-    before = copy.deepcopy(state)
-    alone(MOVES[phase], state, 40)
-    assert_same_state(before, state)
-
-
-@pytest.mark.parametrize("phase", MOVES)
-@pytest.mark.parametrize("cuts", [(1, 59), (7, 13, 40)])
-def test_blocks_in_a_row_are_one_long_block(phase: str, cuts: tuple[int, ...]) -> None:
-    whole = alone(MOVES[phase], begin(), 60)
-    state, blocks = begin(), []
-    for steps in cuts:
-        blocks.append(alone(MOVES[phase], state, steps))
-        state = blocks[-1].end
-    joined = np.concatenate([block.coordinates for block in blocks])
-    np.testing.assert_array_equal(whole.coordinates, joined)
-    np.testing.assert_array_equal(
-        whole.log_density, np.concatenate([block.log_density for block in blocks])
-    )
-    np.testing.assert_array_equal(whole.accepted, np.sum([b.accepted for b in blocks], axis=0))
-    np.testing.assert_array_equal(whole.moves, np.sum([b.moves for b in blocks], axis=0))
-    assert_same_state(whole.end, state)
 
 
 EMCEES: dict[str, Callable[[], Weighted]] = {

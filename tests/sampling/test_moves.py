@@ -8,7 +8,6 @@ at least 17, with the alarm at 7.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import emcee
@@ -19,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import (
     AmongPlaces,
     SnookerMove,
@@ -27,7 +25,7 @@ from bwbayes.sampling.moves import (
     sampling_moves,
 )
 from bwbayes.sampling.proposals import StudentMixture
-from tests.sampling.targets import ALARM, TARGETS, gaussian, target, worst_score
+from tests.sampling.targets import ALARM, TARGETS, worst_score
 
 
 def planted(move: Move, wrong: Callable[[FloatArray], FloatArray]) -> Move:
@@ -93,31 +91,6 @@ def test_moves_leave_the_right_distribution(kind: str, name: str) -> None:
 @pytest.mark.parametrize("kind", WRONG)
 def test_twin_a_wrong_move_is_found(kind: str, name: str) -> None:
     assert worst_score(TARGETS[name], WRONG[kind](name), steps=60) > ALARM
-
-
-def spread_score(move: Move) -> float:
-    """Return the t-score of the variance of an ensemble's mean: one coordinate, four walkers.
-
-    Exact draws to start from, twelve ensembles of 1,500 steps. Four walkers are the fewest, and
-    show best what is wrong between them; the variance must be a quarter.
-    """
-    normal = target(lambda x: -0.5 * np.sum(x**2, axis=1), 1)
-    _, point = gaussian(1)
-    variances = []
-    for child in np.random.SeedSequence(5).spawn(12):
-        generator = np.random.default_rng(child)
-        state = start(normal, point, 0, 4, generator)
-        draws = generator.standard_normal((4, 1))
-        state = replace(state, coordinates=draws, log_density=normal.log_density(draws))
-        chain = advance(normal, [[(move, 1.0)]], [state], 1500)[0].coordinates
-        variances.append(np.mean(np.mean(chain, axis=(1, 2)) ** 2))
-    error = np.std(variances, ddof=1) / np.sqrt(len(variances))
-    return float((np.mean(variances) - 1 / 4) / error)
-
-
-def test_the_snooker_move_leaves_the_spread_of_small_ensembles() -> None:
-    """A t-score with 11 degrees of freedom: a false alarm in 40,000 runs at 7."""
-    assert abs(spread_score(SnookerMove())) < ALARM
 
 
 def test_twin_half_of_the_snooker_factor_is_found() -> None:

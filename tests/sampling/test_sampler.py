@@ -13,16 +13,13 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit
-from bwbayes.sampling import sampler
-from bwbayes.sampling.chain import Chain, draws
+from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import FIRST_CHECK, first_chain, sample
-from tests.sampling.chains import assert_same
 from tests.sampling.samplings import (
     PLAN,
     POSTERIOR,
-    InterruptedRunError,
     PluggedExecutor,
     Watched,
     assert_same_chain,
@@ -52,38 +49,6 @@ def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
     assert [] == outcome.check.shortcomings(PLAN.ess)
     assert chain.steps("sampling") == outcome.check.steps
     assert chain.proposals["sampling"] is not None
-
-
-@pytest.mark.parametrize("blocks", [3, 5, 16])
-def test_a_long_tuning_is_fitted_to_its_last_round_and_goes_on_in_any(
-    monkeypatch: pytest.MonkeyPatch, blocks: int
-) -> None:
-    """Each is twice as long; interrupted in one or after the last, it comes to the same end."""
-    monkeypatch.setattr(sampler, "TAKEN", 1.1)
-    expected, outcome = run()
-    assert 16 == expected.blocks("tuning")
-    draws, log_density = expected.coordinates("tuning"), expected.log_density("tuning")
-    proposals = expected.proposals["tuning"], expected.proposals["sampling"]
-    for last, proposal in zip((slice(80, 160), slice(160, None)), proposals, strict=True):
-        fitted = StudentMixture.fitted(draws[last].reshape(-1, 3), log_density[last].ravel())
-        assert proposal is not None
-        assert_same(fitted.arrays(), proposal.arrays())
-    chain, calls = new_chain(), PLAN.ensembles * (expected.blocks("pilot") + blocks)
-    with pytest.raises(InterruptedRunError):
-        sample(POSTERIOR, PLAN, chain, PluggedExecutor(calls))
-    with ThreadPoolExecutor(1) as executor:
-        again = sample(POSTERIOR, PLAN, chain, executor)
-    assert_same_chain(expected, chain)
-    assert_same_outcome(outcome, again)
-
-
-def test_its_draws_are_the_posteriors(finished: tuple[Chain, Outcome]) -> None:
-    """Mean and variance within four standard errors of the effective draws it claims."""
-    chain, outcome = finished
-    result = draws(POSTERIOR, chain)
-    error = 4 / np.sqrt(outcome.check.ess_bulk)
-    assert (np.abs(np.mean(result, axis=(0, 1, 2))) < error).all()
-    assert (np.abs(np.var(result, axis=(0, 1, 2)) - 1) < np.sqrt(2) * error).all()
 
 
 @pytest.mark.usefixtures("finished")
