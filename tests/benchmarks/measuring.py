@@ -1,23 +1,21 @@
-"""Calls timed in turns, and what was measured as rows: printed as tables, written as JSON."""
+"""Calls timed in turns, and what was measured as rows of a table."""
 
 from __future__ import annotations
 
-import datetime
-import json
 import os
-import platform
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table as Grid
 
-from bwbayes.app.running.fingerprint import versions
+ROOT = Path(__file__).resolve().parents[2]
 
-Cell = str | float | bool | None
+Call = Callable[[], object]
+Cell = str | float | None
 
 
 class Cost(NamedTuple):
@@ -27,21 +25,26 @@ class Cost(NamedTuple):
     cpu: float
 
 
-def timed(call: Callable[[], object]) -> Cost:
+def timed(call: Call) -> Cost:
     """Return what one call costs."""
-    wall, cpu = time.perf_counter(), _cpu()
+    wall, cpu = time.perf_counter(), cpu_time()
     call()
-    return Cost(time.perf_counter() - wall, _cpu() - cpu)
+    return Cost(time.perf_counter() - wall, cpu_time() - cpu)
 
 
-def interleaved[Name: Hashable](
-    contestants: Mapping[Name, Callable[[], object]], rounds: int
-) -> dict[Name, Cost]:
+def cpu_time() -> float:
+    """Return the CPU time (s) of this process and of the children that have ended."""
+    # The finer clock knows this process alone.
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
+
+
+def interleaved(contestants: Mapping[str, Call], rounds: int) -> dict[str, Cost]:
     """Return the least cost of each contestant's call, over rounds in which all take a turn.
 
     So noise hits all alike; a turn lasts 50 ms at least, in which cheap calls are repeated.
     """
-    result: dict[Name, list[Cost]] = {name: [] for name in contestants}
+    result: dict[str, list[Cost]] = {name: [] for name in contestants}
     for _ in range(rounds):
         for name, call in contestants.items():
             end = time.perf_counter() + 0.05
@@ -51,17 +54,10 @@ def interleaved[Name: Hashable](
     return {name: Cost(*map(min, zip(*costs, strict=True))) for name, costs in result.items()}
 
 
-def _cpu() -> float:
-    # The finer clock knows this process alone; children count once they have ended.
-    times = os.times()
-    return time.process_time() + times.children_user + times.children_system
-
-
 @dataclass(frozen=True)
 class Table:
     """Rows with the same columns, under a title; the ``note`` says how they were measured."""
 
-    name: str
     title: str
     note: str
     rows: Sequence[dict[str, Cell]]
@@ -83,28 +79,6 @@ class Table:
 
 
 def _shown(cell: Cell) -> str:
-    match cell:
-        case None:
-            return "-"
-        case bool():
-            return "yes" if cell else "no"
-        case int() | float():
-            return f"{cell:.0f}" if abs(cell) >= 100 else f"{cell:.3g}"
-    return cell
-
-
-def machine() -> dict[str, object]:
-    """Say where and when, and how busy the machine is with other things."""
-    return {
-        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "platform": platform.platform(),
-        "cores": os.cpu_count(),
-        "load": os.getloadavg() if hasattr(os, "getloadavg") else None,
-        "versions": versions("numba"),
-    }
-
-
-def write(tables: Sequence[Table], about: Mapping[str, object], path: Path) -> None:
-    """Write all tables as JSON."""
-    content = {**about, **{table.name: asdict(table) for table in tables}}
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    if isinstance(cell, int | float):
+        return f"{cell:.0f}" if abs(cell) >= 100 else f"{cell:.3g}"
+    return "-" if cell is None else cell

@@ -17,8 +17,7 @@ from tempfile import TemporaryDirectory
 import click
 from rich.console import Console
 
-from tests.benchmarks.cases import ROOT
-from tests.benchmarks.measuring import Cell, Table
+from tests.benchmarks.measuring import ROOT, Cell, Table
 
 PREAMBLE = """
 import os, resource, sys
@@ -148,4 +147,4 @@ def waits(*, against: Path | None, only: tuple[str, ...]) -> None:
                 )
                 console.print(f"{name}: {results}", highlight=False)
     note = "CPU seconds of all processes, once; `-`: it fails there"
-    Table("waits", "What a person waits for", note, rows).show(console)
+    Table("What a person waits for", note, rows).show(console)

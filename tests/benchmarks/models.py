@@ -1,0 +1,187 @@
+"""What a sample of a model costs: by engine and by part, in two threads, forward and backward."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from bwbayes.app.config.config import load
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.arrays import FloatArray
+from bwbayes.control.sampled import SampledModel
+from bwbayes.inference.posterior import Posterior
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.maxwell_slip import MaxwellSlip
+from bwbayes.model.operators.prandtl_ishlinskii import Plays
+from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.record.waveforms import signal
+from tests.benchmarks.measuring import ROOT, Call, Cell, Table, interleaved
+from tests.benchmarks.stock import stock
+from tests.control import cases
+from tests.inference.problems import posterior_of, truth
+
+# Models of a batch, effective draws that our runs go on to, and times of four creep lags, s.
+MODELS, ESS = 64, 4000.0
+LAGS = (0.1, 1.0, 10.0, 100.0)
+CREEPING = "bouc-wen, gain, four creep lags"
+STARTS = {"from rest": True, "in motion": False}
+
+# Samples and draws of what is read backwards.
+SAMPLES, DRAWS = 500, 1000
+
+
+def paper_record() -> Problem:
+    """Return the problem of the paper's record, with the target of effective draws."""
+    config = load(ROOT / "runs" / "ring_bender.toml")
+    sampling = config.sampling.model_copy(update={"ess": ESS, "engine": "numba"})
+    return resolve(config.model_copy(update={"sampling": sampling}), ROOT / "runs")
+
+
+def by_engine(posterior: Posterior) -> dict[str, Posterior]:
+    """Return the same posterior on both engines, and on the stock path."""
+    numpy = replace(posterior, engine="numpy")
+    return {"numba": posterior, "numpy": numpy, "stock": stock(posterior)}
+
+
+def trial(posterior: Posterior, count: int = MODELS) -> FloatArray:
+    """Return θ (count, parameters) near the truth, free parameters a few percent off."""
+    theta = np.repeat(truth(posterior), count, axis=0)
+    free = [posterior.prior.names.index(name) for name in posterior.names]
+    theta[:, free] *= 1 + 0.03 * np.random.default_rng(1).standard_normal((count, len(free)))
+    return theta
+
+
+def engines(posterior: Posterior, rounds: int) -> Table:
+    """Measure the paper's record on both engines, and by a loop over the samples."""
+    theta = trial(posterior)
+    posterior.log_likelihood(theta[:1])
+    calls = {name: partial(one.log_likelihood, theta) for name, one in by_engine(posterior).items()}
+    work = MODELS * posterior.only.voltage.size
+    cost = interleaved(calls, rounds)
+    row: dict[str, Cell] = {name: 1e9 * cost[name].wall / work for name in calls}
+    text = "ns per sample and model on one core, best of several; stock: a loop over the samples"
+    return Table(f"Likelihood of the paper's record, {MODELS} models", text, [row])
+
+
+def parts(posterior: Posterior, rounds: int) -> Table:
+    """Measure every operator, gain and creep on the compiled engine, and as times Bouc-Wen.
+
+    Models are draws of the default priors. In motion, the start is unknown.
+    """
+    calls: dict[str, Call] = {}
+    for start, from_rest in STARTS.items():
+        for name, variant in _with_parts(posterior, from_rest=from_rest):
+            theta = variant.prior.theta(variant.prior.draw(np.random.default_rng(1), MODELS))
+            variant.log_likelihood(theta[:1])
+            calls[f"{name}, {start}"] = partial(variant.log_likelihood, theta)
+    costs = interleaved(calls, rounds)
+    usual = costs["bouc-wen, from rest"].wall
+    work = MODELS * posterior.only.voltage.size
+    rows = [
+        dict[str, Cell](model=name, ns=1e9 * cost.wall / work, times=cost.wall / usual)
+        for name, cost in costs.items()
+    ]
+    text = "ns per sample and model on one core, compiled engine; times Bouc-Wen from rest"
+    return Table(f"Likelihood by part, {MODELS} models", text, rows)
+
+
+def _with_parts(posterior: Posterior, *, from_rest: bool) -> Iterator[tuple[str, Posterior]]:
+    """Yield posteriors of the same record with a lag: each operator, and a model that creeps."""
+    only = posterior.only
+    span = Span(float(np.min(only.voltage)), float(np.max(only.voltage)))
+    plain = Actuator("lag", only.actuator.hold, only.actuator.interval, span=span)
+    actuators = {
+        name: replace(plain, hysteresis=made("hysteresis", name, HYSTERESIS, {}))
+        for name in HYSTERESIS
+    }
+    gain, creep = PolynomialGain(reference=span), Creep(LAGS, reference=span)
+    actuators[CREEPING] = replace(plain, gain=gain, creep=creep)
+    fixed = {"exponent": 1.0} | ({"initial": 0.0} if from_rest else {})
+    record = only.voltage, only.displacement
+    for name, actuator in actuators.items():
+        one = posterior_of(*record, actuator, "discrepancy", fixed, from_rest=from_rest)
+        yield name, replace(one, engine="numba")
+
+
+def speed_up(call: Call, rounds: int, title: str) -> Table:
+    """Time a call made twice, in two threads and one after the other.
+
+    Eight times as many rounds as usual: both cores must be free in the same moment.
+    """
+    with ThreadPoolExecutor(2) as pool:
+
+        def together() -> None:
+            for future in [pool.submit(call), pool.submit(call)]:
+                future.result()
+
+        def in_turn() -> None:
+            for _ in range(2):
+                pool.submit(call).result()
+
+        cost = interleaved({"two": together, "one": in_turn}, 8 * rounds)
+    two, alone = cost["two"].wall, cost["one"].wall
+    row: dict[str, Cell] = {"one after the other": 1e3 * alone, "two threads": 1e3 * two}
+    return Table(title, "ms; two threads on two cores", [row | {"speed-up": alone / two}])
+
+
+def threads(posterior: Posterior, rounds: int, calls: int = 25) -> Table:
+    """Measure so many batches in each of two threads, on the compiled engine."""
+    theta = trial(posterior)
+
+    def call() -> None:
+        # A thread works for long: the moment it takes to wake it up is not to count.
+        for _ in range(calls):
+            posterior.log_likelihood(theta)
+
+    return speed_up(call, rounds, f"Twice {calls} batches of {MODELS} models, compiled engine")
+
+
+# Hysteresis, dynamics, gain and creep of models that are read backwards.
+INVERTED: dict[str, tuple[Operator, str, PolynomialGain | None, Creep | None]] = {
+    "bouc-wen": (BoucWen(), "none", None, None),
+    "bouc-wen, lag": (BoucWen(), "lag", None, None),
+    "bouc-wen, second-order": (BoucWen(), "second-order", None, None),
+    "bouc-wen, lag, creep": (BoucWen(), "lag", None, cases.CREEP),
+    "bouc-wen, lag, gain": (BoucWen(), "lag", cases.GAIN, None),
+    "plays, lag": (Plays(10), "lag", None, None),
+    "maxwell-slip, lag": (MaxwellSlip(10), "lag", None, None),
+    "asymmetric bouc-wen, lag": (BoucWenAsymmetric(), "lag", None, None),
+    "duhem, lag": (Duhem(), "lag", None, None),
+    "bouc-wen n = 1.7, lag": (BoucWen(), "lag", None, None),
+}
+
+
+def _read_backwards(model: SampledModel, displacement: FloatArray) -> None:
+    """Find the voltage of every model for each of the displacements (samples,), um."""
+    state = model.begin(np.zeros(model.models))
+    for asked in displacement:
+        _, state = model.inverse(state, np.full(model.models, asked), cases.SPAN)
+
+
+def inversion(rounds: int) -> Table:
+    """Measure the inverse of many draws against simulating them, on the paper's record.
+
+    What is asked for is the displacement of their middle; each draw gets a voltage of its own.
+    """
+    voltage = signal("identification").sample(1000.0)[1][:SAMPLES]
+    rows: list[dict[str, Cell]] = []
+    for name, (hysteresis, dynamics, gain, creep) in INVERTED.items():
+        actuator = Actuator(dynamics, "first", 1e-3, hysteresis, gain, creep, cases.SPAN)
+        theta = cases.theta(actuator, DRAWS, name)
+        simulate = partial(actuator.displacement, theta, voltage, from_rest=True)
+        invert = partial(_read_backwards, SampledModel.of(actuator, theta), simulate().mean(axis=0))
+        cost = interleaved({"simulate": simulate, "invert": invert}, min(rounds, 2))
+        forward, backward = cost["simulate"].wall, cost["invert"].wall
+        row: dict[str, Cell] = {"model": name, "simulate, ms": 1e3 * forward}
+        rows.append(row | {"invert, ms": 1e3 * backward, "ratio": backward / forward})
+    return Table("Inversion", f"{SAMPLES:,} samples, {DRAWS:,} draws", rows)
