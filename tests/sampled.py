@@ -1,19 +1,35 @@
-"""A problem's posterior, sampled as a run does it."""
+"""A posterior, sampled as a run does it."""
 
 from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
 
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 
 
 def sampled(problem: Problem, workers: int = 1) -> tuple[Outcome, Chain]:
-    """Return how the sampling ended, and the chain."""
+    """Return how the sampling of a problem ended, and the chain."""
     posterior, seed = problem.posterior, problem.config.seed
     with one_thread(), executor(workers, posterior.engine) as pool:
         point = pointfit.fit(posterior, generator(seed, "point fit"))
         chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
         return sample(posterior, problem.plan, chain, pool), chain
+
+
+def converged(posterior: Posterior, plan: SamplingPlan, seed: int = 1) -> Chain:
+    """Return the chain of a posterior that must converge."""
+    source = np.random.default_rng(seed)
+    with ThreadPoolExecutor(1) as pool, one_thread():
+        chain = first_chain(posterior, pointfit.fit(posterior, source), plan, source)
+        outcome = sample(posterior, plan, chain, pool)
+    assert outcome.converged, outcome.stop_reason
+    return chain

@@ -18,12 +18,12 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.record import Record, write_record
 from tests.inference.test_likelihood import dense
 from tests.measured import keep
-from tests.prediction.runs import Judged, Stand, judge, problem_of, run
+from tests.prediction.runs import Judged, judge, problem_of, run
+from tests.stand import Stand
 
 RATE = 100.0
 STAND = Stand(lag=0.02, discrepancy=0.5, sensor=0.2)
-TRUTH = {"d": 0.7, "alpha": 0.357, "beta": 0.0272, "gamma": 0.0172, "lag": 0.02, "offset": 2.0}
-TRUTH |= {"sensor_sd": 0.2, "discrepancy_sd": 0.5, "discrepancy_time": 0.3}
+TRUTH = {k: v for k, v in STAND.truth.items() if k not in ("exponent", "initial")} | {"offset": 2.0}
 
 RECORDS = 100
 

@@ -15,27 +15,15 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.model.actuator import Actuator
-from bwbayes.record import Record, write_record
+from bwbayes.record import write_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
-from tests.prediction.process import process
 from tests.sampled import sampled
+from tests.stand import Stand
 
 RATE = 250.0
-TRUTH = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 0.0,
-    "lag": 0.004,
-    "offset": 0.0,
-    "sensor_sd": 0.3,
-    "discrepancy_sd": 0.5,
-    "discrepancy_time": 0.3,
-}
+STAND = Stand(lag=0.004, discrepancy=0.5, memory=0.3, sensor=0.3, rate=RATE)
+TRUTH = STAND.truth | {"offset": 0.0}
 
 # In the study and its figures: the noise's discrepancy is hardly told by three seconds.
 PHYSICAL = ("d", "alpha", "beta", "gamma", "initial", "lag", "offset", "sensor_sd")
@@ -45,15 +33,10 @@ RECORDS = 40
 
 def steady_sine(seed: int, folder: Path, periods: int = 3) -> Problem:
     """Simulate a record and put the default config's problem together."""
-    source = np.random.default_rng([7, seed])
     voltage = 150 * np.sin(2 * np.pi * np.arange(periods * RATE) / RATE)
-    actuator = Actuator("lag", "first", 1 / RATE)
-    theta = np.array([[TRUTH[name] for name in actuator.parameters]])
-    slow = process(voltage.size, 1 / RATE / TRUTH["discrepancy_time"], source)
-    displacement = actuator.displacement(theta, voltage)[0] + TRUTH["discrepancy_sd"] * slow
-    displacement += TRUTH["sensor_sd"] * source.standard_normal(voltage.size)
+    record = STAND.measure(voltage, np.random.default_rng([7, seed]), offset=0.0)
     path = folder / f"sine_{seed}.csv"
-    write_record(Record(voltage, displacement, 1 / RATE), path)
+    write_record(record, path)
     config = parse(f'seed = {seed}\n[record]\nfile = "{path.name}"\n', "steady sine")
     return resolve(config, folder)
 

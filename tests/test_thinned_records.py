@@ -38,7 +38,8 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.prediction import predict_windows
 from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.prediction.runs import KEPT, Stand, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.stand import Stand
 
 SEEDS = 20
 RATE = 5000.0

@@ -112,15 +112,6 @@ def test_defect_of_one_statistic_is_told_by_its_name() -> None:
     assert result.statistics["e"].outside
 
 
-def test_ranks_among_199_draws_have_200_places() -> None:
-    """The lowest and the highest rank lie inside (0, 1) too, each over a 200th of it."""
-    made = entries(scores(RANKED + 1))
-    for rank, entry in enumerate(made):
-        entry["ranks"] = dict.fromkeys(NAMES, rank)
-    places = judged(made).positions * (RANKED + 1)
-    np.testing.assert_array_equal(np.arange(200)[:, np.newaxis] * np.ones(len(NAMES)), places // 1)
-
-
 def test_unconverged_replicates_are_counted_and_fail_beyond_one_per_cent() -> None:
     """They are ranked all the same, if they have draws."""
     for unconverged, passed in ((0, True), (2, True), (3, False)):

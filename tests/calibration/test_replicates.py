@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bwbayes.arrays import FloatArray
 from bwbayes.calibration import replicates as module
-from bwbayes.calibration.records import OtherRecord, Simulated, covered
+from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import (
     RANKED,
     Experiment,
@@ -19,17 +18,13 @@ from bwbayes.calibration.replicates import (
     replicate,
     replicates,
 )
-from bwbayes.errors import InputError
-from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.prediction.loops import crossings
 from bwbayes.prediction.prediction import Start
 from bwbayes.record.record import Record
 from bwbayes.sampling.plan import SamplingPlan
-from tests.app import example
-from tests.inference.problems import decaying_sine, posterior_of, short_posterior, truth
+from tests.inference.problems import posterior_of, short_posterior
 
 # Three free parameters, so that a replicate takes a fraction of a second.
 FIXED = {"initial": 0.0, "offset": 0.0, "beta": 0.0272, "gamma": 0.0172}
@@ -86,21 +81,6 @@ def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch
     assert 6 == len(entry["truth"])
 
 
-def test_each_band_is_held_against_what_it_is_for() -> None:
-    """Model, truth and readings lie 10 um apart, and each kind of band around its own."""
-    model = np.zeros(80)
-    record = Record(model, model + 20, 0.01, truth=model + 10)
-    middles = zip(KINDS, (0.0, 10.0, 20.0), strict=True)
-    around = {(kind, level): middle for kind, middle in middles for level in LEVELS}
-    bands = replace(
-        example.bands(samples=20),
-        lower={key: np.full(20, middle - 1) for key, middle in around.items()},
-        upper={key: np.full(20, middle + 1) for key, middle in around.items()},
-    )
-    parts = list(covered([(bands, Simulated(record, model), slice(60, 80))]))
-    assert [(kind, level, 1.0) for kind, level in around] == parts
-
-
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     """Among fewer than others it would have other ranks."""
     plan = replace(PLAN, walkers=6, block=5, most_steps=5)
@@ -129,27 +109,6 @@ def test_bands_of_other_records_are_held_against_them(third: Replicate) -> None:
     alone = third.entry
     assert alone["ranks"] == entry["ranks"]
     assert alone["covered"] == {name: entry["covered"][name] for name in alone["covered"]}
-
-
-def moving_posterior() -> tuple[Posterior, FloatArray]:
-    posterior = short_posterior("discrepancy", 80, "lag", fixed=FIXED | {"lag": 0.05})
-    return posterior, truth(posterior)
-
-
-def test_another_record_starts_anywhere() -> None:
-    """Its h is even between the extremes, its unrest and its offset have the sds of their priors.
-
-    Without dynamics and hysteresis: the offset's alone.
-    """
-    posterior, theta = moving_posterior()
-    other = another()
-    drive = theta[0, posterior.prior.names.index("d")] * other.record.voltage[0]
-    many = [other.simulated(posterior, theta, np.random.default_rng(i)).model for i in range(400)]
-    late, first = np.array(many)[:, -1], np.array(many)[:, 0] - drive
-    offset_sd = np.ptp(posterior.only.readings.values)
-    assert np.std(late) == pytest.approx(offset_sd, rel=0.12)
-    unrest_sd = theta[0, 0] * np.ptp(posterior.only.voltage) / 2
-    assert np.std(first - late) == pytest.approx(unrest_sd, rel=0.12)
 
 
 def test_one_discrepancy_goes_through_all_training_windows() -> None:
@@ -194,15 +153,3 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     np.testing.assert_allclose(2 * d * 100 * turn / (1 + turn**2), opening, rtol=1e-3)
     # The crest that it starts from is the range's upper end.
     np.testing.assert_allclose(d * 100 * (1 + 1 / np.sqrt(1 + turn**2)), extent, rtol=1e-3)
-
-
-@pytest.mark.parametrize(("shift", "level"), [(0.0, 0.0), (150.0, None)])
-def test_loop_is_measured_at_zero_or_beside_it(shift: float, level: float | None) -> None:
-    voltage = decaying_sine(80) + shift
-    posterior = small().posterior.altered(voltage=voltage)
-    expected = (voltage[:60].min() + voltage[:60].max()) / 2 if level is None else level
-    looped = Experiment(posterior, PLAN).looped
-    assert looped is not None
-    assert expected == crossings(looped[1])[0]
-    with pytest.raises(InputError, match="does not go back and forth"):
-        Experiment(posterior.altered(voltage=np.linspace(0.0, 100.0, 80)), PLAN)

@@ -19,8 +19,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.model.inverse.limits import Limits
 from bwbayes.sampling.diagnostics import smoothed_weights
+from tests.inference.linear import Linear
 from tests.inference.problems import decaying_sine, short_posterior
-from tests.inference.test_solvable import closed_form, covariance, linear_posterior, prior_moments
 from tests.prediction.runs import weighted_draws
 
 WIDE = Limits(-100.0, 100.0)
@@ -54,21 +54,18 @@ def promised(
 
 def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     """Of d beside the offset; the new record has an offset of its own, of the same prior."""
-    posterior = linear_posterior(("d", "offset"), "discrepancy")
-    exact = closed_form(posterior)
-    draws = np.random.default_rng(1).multivariate_normal(exact.mean, exact.covariance, 40_000)
+    model = Linear(("d", "offset"), "discrepancy")
+    exact, posterior = model.exact, model.posterior
     # Not about zero, so that the offset counts.
     voltage = 50 + 0.5 * decaying_sine(150)
-    (promise,) = promised((posterior, draws), {"sine": voltage}, "d")
+    (promise,) = promised((posterior, exact.draw(40_000, 1)), {"sine": voltage}, "d")
     # dx/dd is the lagged voltage, seen by two slopes.
     theta = posterior.prior.theta(exact.mean + np.array([[0.0, 0.0], [1e-3, 0.0]]))
     base, moved = posterior.likelihood.actuator.displacement(
         posterior.only.table.actuator(theta), voltage, from_rest=True
     )
     slope = (moved - base) / 1e-3
-    fixed = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
-    sd = prior_moments(posterior)[1]
-    dense = covariance(fixed, voltage.size) + sd[1] ** 2
+    dense = model.covariance(voltage.size) + model.sd[1] ** 2
     information = slope @ np.linalg.solve(dense, slope)
     left = 1 / np.sqrt(1 + exact.covariance[0, 0] * information)
     assert promise.left == pytest.approx(left, rel=0.02)

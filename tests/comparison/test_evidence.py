@@ -7,10 +7,8 @@ sampling of the plain posterior (``tests/reference``), and against integrals ove
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,64 +17,36 @@ from scipy.signal import lfilter
 
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import generator, resolve
-from bwbayes.app.running.workers import one_thread
-from bwbayes.arrays import FloatArray
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
-from tests.inference.test_solvable import (
-    WINDOWS,
-    covariance,
-    every_case,
-    linear_posterior,
-    prior_moments,
-)
+from tests.inference.linear import Linear, every_case
 from tests.measured import keep
 from tests.reference.make import digest
 from tests.reference.plain import FOLDER, MEASURED, load_case
+from tests.sampled import converged
 
 PLAN = SamplingPlan(ess=1000, walkers=24, block=25)
 
 
-def sampled(posterior: Posterior, plan: SamplingPlan = PLAN) -> tuple[FloatArray, FloatArray]:
-    """Draw by the normal path; draws and their log densities, nats."""
-    source = np.random.default_rng(1)
-    with ThreadPoolExecutor(1) as executor, one_thread():
-        chain = first_chain(posterior, pointfit.fit(posterior, source), plan, source)
-        outcome = sample(posterior, plan, chain, executor)
-    assert outcome.converged, outcome.stop_reason
-    return draws(posterior, chain), log_densities(chain)
-
-
-def estimated(posterior: Posterior, plan: SamplingPlan = PLAN, seed: int = 2) -> Evidence:
-    return evidence(posterior, *sampled(posterior, plan), np.random.default_rng(seed))
-
-
-def closed_form(posterior: Posterior) -> float:
-    """Log N(y; G m, C + G P Gᵀ), with the model's columns G and the prior N(m, P)."""
-    mean, sd = prior_moments(posterior)
-    base = posterior.prior.theta(mean[np.newaxis])
-    moved = posterior.prior.theta(mean + np.eye(mean.size))
-    rows = np.concatenate([np.arange(window.start, window.stop) for window in WINDOWS])
-    level = posterior.simulate(base, rows)[0]
-    design = (posterior.simulate(moved, rows) - level).T
-    known = {p.name: p.fixed for p in posterior.prior.parameters if p.fixed is not None}
-    noise = covariance(known, posterior.only.voltage.size)[np.ix_(rows, rows)]
-    whole = noise + (design * sd**2) @ design.T
-    return float(stats.multivariate_normal(level, whole).logpdf(posterior.only.displacement[rows]))
+def estimated(
+    posterior: Posterior, plan: SamplingPlan = PLAN, source: np.random.Generator | None = None
+) -> Evidence:
+    """Draw by the normal path, and estimate."""
+    chain = converged(posterior, plan)
+    source = source or np.random.default_rng(2)
+    return evidence(posterior, draws(posterior, chain), log_densities(chain), source)
 
 
 @every_case
 def test_a_linear_model_has_the_closed_form(free: tuple[str, ...], noise: str) -> None:
     """Within 0.1 nats, and within five of its errors: one in a million by chance."""
-    posterior = linear_posterior(free, noise)
-    made, known = estimated(posterior), closed_form(posterior)
+    model = Linear(free, noise)
+    made, known = estimated(model.posterior), model.log_density(model.rows)
     assert abs(made.log_evidence - known) < 0.1
     assert abs(made.log_evidence - known) < 5 * made.error
     assert made.error < 0.02
@@ -106,7 +76,7 @@ def test_the_error_is_that_of_repeated_estimates() -> None:
 
 def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
     """Two normal priors of which a constraint leaves x < y and x + y > 0."""
-    posterior = linear_posterior(("d", "alpha"), "white")
+    posterior = Linear(("d", "alpha"), "white").posterior
     d, alpha = (p for p in posterior.prior.free)
     wide = Distribution("normal", {"mean": 0.5, "sd": 0.3})
     other = Distribution("normal", {"mean": 0.4, "sd": 0.2})
@@ -123,12 +93,8 @@ def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
     assert abs(mass - np.log(known)) < 5 * error + 1e-9
     assert 0 < error < 0.01
     # Without constraints a prior has all its mass.
-    alone = linear_posterior(("offset",), "white").prior
+    alone = Linear(("offset",), "white").posterior.prior
     assert (0.0, 0.0) == log_prior_mass(alone, np.random.default_rng(1))
-
-
-def reference(name: str) -> Any:
-    return json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.slow
@@ -145,9 +111,7 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")
     source = RecordConfig(file="t.h5", train=config.record.train)
     problem = resolve(config.model_copy(update={"record": source}), tmp_path)
-    made = evidence(
-        problem.posterior, *sampled(problem.posterior, problem.plan), generator(1, "evidence")
-    )
+    made = estimated(problem.posterior, problem.plan, generator(1, "evidence"))
     away = made.log_evidence + made.log_prior_mass - np.mean(known["log_evidence"])
     keep("log evidence of the measured record", {"less dynesty's": round(float(away), 3)})
     assert abs(away) < 0.1
@@ -160,7 +124,8 @@ def test_nested_sampling_agrees() -> None:
     """
     problem = resolve(load(FOLDER / "virtual.toml"), FOLDER)
     plan = replace(problem.plan, ess=1000.0)
-    made = evidence(problem.posterior, *sampled(problem.posterior, plan), generator(1, "evidence"))
-    known = np.mean(reference("virtual")["log_evidence"])
+    made = estimated(problem.posterior, plan, generator(1, "evidence"))
+    reference = json.loads((FOLDER / "virtual.json").read_text(encoding="utf-8"))
+    known = np.mean(reference["log_evidence"])
     assert abs(made.log_evidence + made.log_prior_mass - known) < 0.1
     assert made.error < 0.05

@@ -90,18 +90,6 @@ def test_a_part_worth_fewer_than_five_independent_readings_has_no_vote() -> None
     assert (comparison.measure, comparison.recommended) == ("log score", "truth")
 
 
-def test_readings_scored_one_by_one_count_as_independent_ones() -> None:
-    """200 correlated readings worth 20 count a tenth of the same densities in a joint score."""
-    gain = 2 + 0.1 * noise(3)
-    for joint, total in ((True, np.sum(gain)), (False, np.sum(gain) / 10)):
-        rich, plain = (
-            replace(model(name, None), parts={"other": Part(scores, 200, 20.0, joint)})
-            for name, scores in (("rich", COMMON + gain), ("plain", COMMON))
-        )
-        comparison = recommend([plain, rich])
-        assert comparison.differences["plain"].value == pytest.approx(-total)
-
-
 def test_errors_cover_differences_of_correlated_blocks() -> None:
     """400 pairs whose difference has a mean of zero, in blocks of twice their correlation time.
 

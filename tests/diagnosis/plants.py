@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record
-from tests.prediction.process import process
+from tests.stand import process
 
 __all__ = ["CAUSES", "Plant", "plant"]
 

@@ -137,12 +137,6 @@ def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:
     assert remark.startswith("d: lies on its lower bound 0.8 um/V. Fix: widen its prior uniform(")
 
 
-def test_scale_parameter_that_may_be_zero_is_not_on_a_bound() -> None:
-    """A half-normal prior of a discrepancy that is not there ends at zero, as it should."""
-    prior = with_prior("discrepancy_sd", Distribution("halfnormal", {"scale": 1.0}))
-    assert [] == said(prior, discrepancy_sd=piled_up(0, 0.05))
-
-
 def judged(posterior: Posterior, ranges: Ranges) -> list[str]:
     """Return the remarks at the point fit."""
     generator = np.random.default_rng(1)

@@ -166,38 +166,6 @@ def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     assert verdict.cause is None
 
 
-def test_an_offset_that_may_have_had_bad_luck_is_named_with_a_longer_lead_in() -> None:
-    """Three of its sds off: one lead-in in 400. Of a record that is short it is not the reason."""
-    record = made(np.random.default_rng(4), 60, memory=0.1, discrepancy=0.3, parameters=0.02)
-    wide = {kind: np.sqrt(sd**2 + 1) for kind, sd in record.sds.items()}
-    lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=0.5)
-    bands = replace(bands_of(replace(record, sds=wide), 3.0), lead_in=lead, common_sd=1.0)
-    verdict = assess(replace(bands, scored_from=100), Background(0.1, 0.0, FITTED))
-    assert verdict is not None
-    assert verdict.holds is None
-    assert "the offset, estimated from a lead-in of 1 s, makes 8" in verdict.reasons[0]
-    assert "use lead_in = 5.6 for 15%" in verdict.reasons[0]
-    few = bands_of(made(np.random.default_rng(1), length=3, memory=1.0))
-    short = assess(replace(few, lead_in=lead, common_sd=1.0), Background(1.0, 0.0, FITTED))
-    assert short is not None
-    assert "too small" in short.line
-    assert "lead_in" not in short.line
-
-
-def test_missing_readings_are_not_judged() -> None:
-    record = made(np.random.default_rng(3), length=30)
-    bands = bands_of(record)
-    assert bands.measured is not None
-    missing = bands.measured.copy()
-    missing[500:900] = missing[::7] = np.nan
-    verdict = assess(replace(bands, measured=missing), Background(record.memory, 0.0, FITTED))
-    assert verdict is not None
-    assert verdict.holds is True
-    nothing = replace(bands, measured=np.full(missing.size, np.nan))
-    assert assess(nothing, Background()) is None
-    assert assess(replace(bands, measured=None), Background()) is None
-
-
 def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
     """It is the likely cause where the bands fail after it."""
     record = made(np.random.default_rng(3), length=30)

@@ -19,7 +19,8 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, write_record
 from tests.measured import keep, measured
-from tests.prediction.runs import Judged, Stand, covered, judge, problem_of
+from tests.prediction.runs import Judged, covered, judge, problem_of
+from tests.stand import Stand
 
 RATE = 100.0
 GOOD, SPOILT = 400, 50

@@ -118,16 +118,6 @@ def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: boo
     assert max(shares) < 0.99, shares
 
 
-def test_missing_readings_do_not_matter() -> None:
-    voltage = drive()
-    whole = displacement(voltage)
-    holes = whole.copy()
-    holes[1::2] = np.nan
-    one, other = (ranges_of(voltage, reading, 1e-3) for reading in (whole, holes))
-    assert one.time == other.time
-    assert other.displacement == pytest.approx(one.displacement, rel=1e-3)
-
-
 # Powers of k and m by which a parameter grows if displacements are k and voltages m times as large.
 # With another exponent n, beta and gamma grow by k^(1 - n) / m.
 POWERS = {

@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
@@ -195,22 +194,6 @@ def test_engines_agree_on_an_offset_any_stride_and_gaps(stride: int) -> None:
         replace(likelihood, engine=engine).log_density(theta) for engine in ("numpy", "numba")
     )
     np.testing.assert_allclose(fast, slow, atol=1e-9 * 700, rtol=1e-9)
-
-
-def test_density_of_the_noise_model_is_that_of_its_covariance() -> None:
-    """Against the sum over all lags, at frequencies that sampling does not fold."""
-    theta, interval = np.array([0.01, 1.4, 0.3, 0.7]), 0.005
-    lags = np.arange(1, 4000)
-    along = SmoothNoise(interval).transition(theta[np.newaxis], lags.astype(float))[0, :, 0, 0]
-    frequency = np.array([0.05, 0.3, 1.0])
-    sums = [1.4**2 * (1 + 2 * along @ np.cos(2 * np.pi * f * interval * lags)) for f in frequency]
-    empty = np.empty(0)
-    noise = SmoothNoise(interval)
-    series = Innovations(empty, empty, empty, empty, empty, interval, noise, theta)
-    density = series.noise_density(frequency)
-    assert density is not None
-    expected = np.sqrt(2 * interval * (np.array(sums) + 0.01**2))
-    np.testing.assert_allclose(density, expected, rtol=1e-3)
 
 
 def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:

@@ -15,7 +15,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import ceiling
-from tests.declared import declared, joint, parameter
+from tests.declared import declared, joint
 from tests.inference.problems import joint_prior, single
 
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
@@ -138,22 +138,6 @@ def test_outside_the_constraints_the_density_is_zero() -> None:
         assert -np.inf == prior.log_density(outside[np.newaxis])[0]
 
 
-# A published actuator, whose gamma is larger than its beta.
-PUBLISHED = {"d": 0.347, "alpha": 0.226, "beta": 0.0185, "gamma": 0.0252, "exponent": 1.0}
-
-
-def test_gamma_beyond_beta_is_outside_unless_the_model_need_not_be_passive() -> None:
-    prior = cut_prior(exponent=1.0)
-    published = np.array([[*(PUBLISHED[n] for n in ("d", "alpha", "beta", "gamma")), 1.0]])
-    assert -np.inf == prior.log_density(published)[0]
-    free = active(prior)
-    assert np.isfinite(free.log_density(published)[0])
-    np.testing.assert_allclose(published, free.constrain(free.unconstrain(published))[0], rtol=1e-9)
-    published[0, 3] = -0.0186
-    assert -np.inf == free.log_density(published)[0]
-    assert np.mean(free.draw(np.random.default_rng(13), 2000)[:, 3] > 0.02) > 0.1
-
-
 def test_draws_have_the_density_that_log_density_says() -> None:
     """Means of draws against importance sampling, z-scores below 4.
 
@@ -183,19 +167,6 @@ def test_bounds_truncate_the_prior() -> None:
     np.testing.assert_allclose(cut.ppf(stats.norm.cdf(z)), prior.constrain(z)[0], atol=1e-9)
     outside = prior.log_density(np.array([[0.4], [0.6], [2.1]]))
     assert [False, True, False] == np.isfinite(outside).tolist()
-
-
-@pytest.mark.parametrize("name", ["d", "sensor_sd", "lag"])
-def test_what_is_positive_stays_positive_under_any_prior(name: str) -> None:
-    prior = (
-        single(name, normal(-1.0, 1.0))
-        if name != "d"
-        else joint([parameter("d", normal(-1.0, 1.0)), parameter("alpha", 1e-9)])
-    )
-    assert (prior.draw(np.random.default_rng(7), 1000) > 0).all()
-    x, log_prior = prior.constrain(np.linspace(-20, 20, 81)[:, np.newaxis])
-    assert (x[np.isfinite(log_prior)] > 0).all()
-    assert np.isfinite(log_prior[np.abs(np.linspace(-20, 20, 81)) < 7]).all()
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from bwbayes.record.true_values import true_values
 from tests.inference.problems import posterior_of
-from tests.prediction.process import process
+from tests.stand import process
 
 __all__ = [
     "Case",

@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from tests.prediction.process import process
+from tests.stand import process
 
 __all__ = ["Made", "bands_of", "made"]
 

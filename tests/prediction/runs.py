@@ -27,20 +27,16 @@ from bwbayes.diagnosis.validation import Background, Verdict
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import predict_record, predict_windows
-from bwbayes.record import Record
 from bwbayes.report.result import Result
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
-from tests.prediction.process import process
 
 __all__ = [
     "CONVERGED",
     "Judged",
-    "Stand",
     "covered",
     "judge",
     "posterior_draws",
@@ -58,37 +54,6 @@ PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250
 
 # No draw of the pilot weighs more than so many times the mean.
 HEAVIEST = 10.0
-
-
-@dataclass(frozen=True)
-class Stand:
-    """The paper's ring bender with a lag (s), its discrepancy (um, s) and its sensor (um)."""
-
-    lag: float = 0.02
-    discrepancy: float = 0.3
-    memory: float = 0.3
-    sensor: float = 0.1
-    rate: float = 100.0
-    d: float = 0.7
-
-    def measure(
-        self,
-        voltage: FloatArray,
-        generator: np.random.Generator,
-        *,
-        offset: float = 2.0,
-        cut: int = 0,
-    ) -> Record:
-        """Drive it from rest along ``voltage`` (samples,) and record all but the first ``cut``."""
-        actuator = Actuator("lag", "first", 1 / self.rate)
-        known = {"d": self.d, "alpha": self.d * 0.51, "beta": 0.0272, "gamma": 0.0172}
-        known |= {"exponent": 1.0, "initial": 0.0, "lag": self.lag, "offset": offset}
-        theta = np.array([[known[name] for name in actuator.parameters]])
-        displacement = actuator.displacement(theta, voltage)[0]
-        step = 1 / self.rate / self.memory
-        displacement += self.discrepancy * process(voltage.size, step, generator)
-        displacement += self.sensor * generator.standard_normal(voltage.size)
-        return Record(voltage[cut:], displacement[cut:], 1 / self.rate, origin="stand")
 
 
 @dataclass(frozen=True)

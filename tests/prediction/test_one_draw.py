@@ -7,6 +7,8 @@ interval and at others.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -14,11 +16,11 @@ from scipy.stats import norm
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.prediction.prediction import Start, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
-from tests.prediction.running import left_by_running_drives
 
 # Far from each other, so that none can stand for another.
 SENSOR, DISCREPANCY, TIME = 0.9, 0.25, 0.3
@@ -125,6 +127,29 @@ def test_a_lead_in_tells_the_offset_as_the_dense_matrix_does(
     assert_scores_are_of(bands, mean, whole)
 
 
+def left_by_running_drives(
+    model: Mapping[str, float], voltage: float, every: FloatArray, count: int
+) -> FloatArray:
+    """Return as many states h at a voltage, each as probable as the next, um.
+
+    They are those of loops of 16 amplitudes about the middle of ``every`` voltage, left on either
+    branch, the outermost as far out as none; between them are straight lines.
+    """
+    alpha, beta, gamma = (np.array([model[name]]) for name in ("alpha", "beta", "gamma"))
+    middle, half = (np.max(every) + np.min(every)) / 2, np.ptp(every) / 2
+    states: list[float] = []
+    for reach in np.arange(1, 17) / 16:
+        low, high = middle - reach * half, middle + reach * half
+        for sweeps in ([0.0, high, low, high, low], [0.0, low, high, low, high]):
+            h = hysteresis(np.array([*sweeps, voltage]), alpha, beta, gamma)
+            states.append(float(h[0, -1]))
+    states = sorted(states)
+    states[0], states[-1] = min(states[0], 0.0), max(states[-1], 0.0)
+    places = np.linspace(0.0, 1.0, len(states))
+    parts = (np.arange(count) + 0.5) / count
+    return np.asarray(np.interp(parts, places, states), dtype=np.float64)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     posterior: Posterior, draw: FloatArray, sign: float
@@ -139,11 +164,9 @@ def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     left = float(np.mean(left_by_running_drives(named, sign * 100.0, every, 1000)))
     assert 0.9 * top < sign * left < top
     held = Record(np.full(60, sign * 100.0), None, INTERVAL)
-    bands = predict_record(posterior, np.repeat(draw, 400, axis=0), held, Start(), _seeded())
+    bands = predict_record(
+        posterior, np.repeat(draw, 400, axis=0), held, Start(), np.random.default_rng(5)
+    )
     # Late, when the dynamics have settled; h stays as the voltage does.
     h = named["d"] * held.voltage[-1] + named["offset"] - bands.mean[-1]
     assert left == pytest.approx(h, abs=0.02 * top)
-
-
-def _seeded() -> np.random.Generator:
-    return np.random.default_rng(5)

@@ -20,7 +20,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Verdict
 from bwbayes.record import write_record
 from tests.measured import keep
-from tests.prediction.runs import Stand, judge, problem_of
+from tests.prediction.runs import judge, problem_of
+from tests.stand import Stand
 
 RATE, SECONDS, SEEDS = 200.0, 10.0, 40
 

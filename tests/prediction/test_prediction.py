@@ -16,7 +16,7 @@ from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.prediction import Start, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of
-from tests.prediction.process import process
+from tests.stand import process
 
 TRUTH = {
     "d": 0.7,

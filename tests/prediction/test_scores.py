@@ -13,7 +13,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.scores import score
-from tests.prediction.process import process
+from tests.stand import process
 
 # The window of the measured record: 14 s at 200 Hz, correlation time 0.65 s.
 SAMPLES, CORRELATION = 2800, 130

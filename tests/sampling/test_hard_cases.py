@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
@@ -50,19 +49,6 @@ def test_twin_good_chain_passes_with_a_much_larger_target() -> None:
     for seed in range(10):
         draws = good(np.random.default_rng(seed))
         assert [] == check(draws, moved(draws), BLOCK).shortcomings(1000), seed
-
-
-@pytest.mark.parametrize("block", [1, 5, 25])
-def test_walker_that_rests_for_a_short_block_is_not_stuck(block: int) -> None:
-    """It is after 25 autocorrelation times, of three steps here, in whatever blocks they come."""
-    draws = good(np.random.default_rng(1))
-    kept = np.full((len(draws), *draws.shape[1:3]), 1)
-    kept[-40:, 1, 3] = 0
-    blocks = kept.reshape(-1, block, *kept.shape[1:]).sum(axis=1)
-    assert 0 == check(draws, blocks, block).stuck
-    kept[-120:, 1, 3] = 0
-    blocks = kept.reshape(-1, block, *kept.shape[1:]).sum(axis=1)
-    assert 1 == check(draws, blocks, block).stuck
 
 
 # Targets
@@ -157,12 +143,6 @@ def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.Monkey
     upper = chain.coordinates("sampling")[..., 0] > 0
     assert (upper == upper[0]).all()
     assert 0 < np.mean(upper[0]) < 1
-
-
-def test_density_that_is_nowhere_finite_is_said() -> None:
-    nowhere = target(lambda x: np.full(len(x), -np.inf), 2)
-    with pytest.raises(InputError, match="sampling: no place for walkers around the point fit"):
-        first_chain(nowhere, point_at([0.0, 0.0]), PLAN, np.random.default_rng(1))
 
 
 # Good runs
