@@ -1,15 +1,22 @@
 """What all tests share: no deadline on a busy machine, and in CI the same examples each time.
 
 Elsewhere hypothesis looks for new ones in every run, and keeps those that fail for the next.
+The tests of the whole come first: they take longest, and no worker shall end with one alone.
 """
 
 from __future__ import annotations
 
 import os
 
+import pytest
 from hypothesis import settings
 
 from tests.programs import REQUIRED, VARIABLE
 
 settings.register_profile("busy", deadline=None, derandomize=os.environ.get(VARIABLE) == REQUIRED)
 settings.load_profile("busy")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put those at the top of ``tests/`` before those of the rooms."""
+    items.sort(key=lambda item: len(item.path.parts))
