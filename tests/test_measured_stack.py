@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.ndimage import gaussian_filter1d
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.config.config import RecordConfig, load
-from bwbayes.app.config.models import models_of
 from bwbayes.app.fit.fitted import finished
-from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
@@ -26,7 +21,6 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import Start, predict_record, thinned
 from bwbayes.record import Record, read_record
 from bwbayes.sampling.chain import draws
-from tests.measured import keep
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
@@ -98,19 +92,6 @@ def test_white_noise_scores_worse_and_its_parameters_look_too_sure(honest: Any, 
         assert honest["validation"]["held_out"][name] < white["validation"]["held_out"][name]
     for name in ("d", "alpha", "beta", "gamma"):
         assert white["parameters"][name]["sd"] < 0.6 * honest["parameters"][name]["sd"]
-
-
-@pytest.mark.slow
-def test_plain_bouc_wen_is_improved_to_half_its_error(tmp_path: Path) -> None:
-    """From default priors alone: NRMSE at most 0.45 %, 95 % sensor band at most 0.75 um wide."""
-    config = tmp_path / "plain.toml"
-    text = (ROOT / "runs/measured_stack.toml").read_text(encoding="utf-8")
-    start = text.index("[parameters.discrepancy_time]")
-    config.write_text(text[:start] + text[text.index("[sampling]") :], encoding="utf-8")
-    held_out = run(tmp_path / "out", config, improve=True)["validation"]["held_out"]
-    keep("the measured stack, improved", {key: held_out[key] for key in ("nrmse", "width_95_um")})
-    assert held_out["nrmse"] <= 0.0045
-    assert held_out["width_95_um"] <= 0.75
 
 
 @pytest.fixture(scope="module")
@@ -259,47 +240,3 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     assert usual[1] < plain[1]
     assert usual[2] <= 0.65 * plain[2]
     np.testing.assert_allclose(usual, knocked, rtol=0.1)
-
-
-# Six models, from none of the hysteresis to elements that slip.
-MODELS = (
-    "linear; bouc-wen; bouc-wen + quadratic; bouc-wen + quadratic + cubic; "
-    "prandtl-ishlinskii + quadratic + cubic; maxwell-slip(thresholds=4) + quadratic + cubic"
-)
-
-
-@pytest.mark.slow
-def test_a_comparison_of_six_models_chooses_one_with_narrow_bands(tmp_path: Path) -> None:
-    """NRMSE at most 0.42 %, bands at least 35 % narrower than plain Bouc-Wen's."""
-    config = load(ROOT / "runs/measured_stack_parts.toml")
-    assert isinstance(config.record, RecordConfig)
-    source = config.record.model_copy(update={"file": str(RECORD)})
-    sampling = config.sampling.model_copy(update={"ess": 1000.0})
-    config = config.model_copy(update={"record": source, "sampling": sampling})
-    models = models_of(MODELS, config.model)
-    begun = time.monotonic()
-    quiet = Console(quiet=True)
-    made = compare_models(config, ROOT, models, tmp_path / "out", quiet)
-    minutes = (time.monotonic() - begun) / 60
-    assert made.recommended is not None
-    chosen = made[made.recommended].mean
-    # Screening may leave it out.
-    alone = {"bouc-wen": models["bouc-wen"]}
-    plain = compare_models(config, ROOT, alone, tmp_path / "plain", quiet)["bouc-wen"].mean
-    assert chosen is not None
-    assert plain is not None
-    narrower = 1 - chosen["width_um"] / plain["width_um"]
-    keep(
-        "models of the measured stack",
-        {
-            "recommended": made.recommended,
-            "tied": list(made.tied),
-            "nrmse_percent": round(100 * chosen["nrmse"], 3),
-            "narrower_percent": round(100 * narrower),
-            "minutes": round(minutes, 1),
-        },
-    )
-    assert chosen["nrmse"] <= 0.0042
-    assert narrower >= 0.35
-    # Plain Bouc-Wen, and a model without hysteresis, are told apart from it.
-    assert not {"bouc-wen", "linear"} & set(made.tied)

@@ -16,9 +16,8 @@ from scipy import stats
 
 from bwbayes.prediction.bands import Bands
 from bwbayes.record import Record, write_record
-from tests.inference.test_likelihood import dense
 from tests.measured import keep
-from tests.prediction.runs import Judged, judge, problem_of, run
+from tests.prediction.runs import Judged, judge, problem_of
 from tests.stand import Stand
 
 RATE = 100.0
@@ -36,34 +35,6 @@ def measured(seed: int, seconds: float = 16.0) -> Record:
     time = np.arange(round((seconds + 1.1) * RATE)) / RATE
     voltage = 100 * np.sin(2 * np.pi * time) * (1 - 0.5 * time / time[-1])
     return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)
-
-
-@pytest.mark.slow  # the quick twin is the dense density in inference/test_likelihood.py
-@pytest.mark.parametrize("what", ["a second", "a tenth"])
-def test_missing_readings_leave_the_posterior_of_the_dense_gaussian(
-    tmp_path: Path, what: str
-) -> None:
-    """Draws of a whole run, from a file with empty cells; the dense density differs by 1e-6."""
-    record = measured(1, 12.0)
-    lost = np.zeros(record.samples, dtype=bool)
-    if what == "a tenth":
-        lost[np.random.default_rng(2).choice(record.samples, record.samples // 10, False)] = True
-    else:
-        lost[500:600] = True
-    write_record(record.without(lost), tmp_path / "record.csv")
-    problem, result = run('[record]\nfile = "record.csv"\n', tmp_path)
-    posterior, log_density = problem.posterior, result.log_density.ravel()
-    assert posterior.only.readings.rows.size == record.samples - np.sum(lost)
-    chosen = np.random.default_rng(3).choice(log_density.size, 25, replace=False)
-    theta = posterior.prior.theta(result.flat_draws[chosen])
-    z = posterior.prior.unconstrain(result.flat_draws[chosen])
-    likelihoods = np.array([dense(posterior.likelihood, one)[0] for one in theta])
-    expected = posterior.prior.constrain(z)[1] + likelihoods
-    np.testing.assert_allclose(expected, log_density[chosen], 0, 1e-6)
-    assert result.verdicts["training"].holds is not False
-    columns = dict(zip(posterior.names, result.flat_draws.T, strict=True))
-    for name in ("d", "gamma", "lag", "offset"):
-        assert abs(np.mean(columns[name]) - TRUTH[name]) < 4 * np.std(columns[name])
 
 
 def spiky(record: Record, seed: int, last: float = 12.0) -> tuple[Record, list[int]]:

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures import drawn, interactive
 from bwbayes.report.figures.pictures import pictures
@@ -22,6 +21,7 @@ from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
 from bwbayes.sampling.diagnostics import Check, Outcome
 from tests.declared import declared
+from tests.prediction.records import normal_bands
 
 
 def _of(name: str, description: str, known: Distribution | float) -> Parameter:
@@ -53,22 +53,10 @@ def bands(
     mean = 0.7 * voltage - 10 * np.cos(2 * np.pi * time)
     truth = mean + 0.8 * np.sin(7 * time)
     reading = truth + 0.6 * generator.standard_normal(samples)
-    sds = dict(zip(KINDS, (0.3, 0.8, 1.0), strict=True))
-    reach = {(k, level): sds[k] * norm.ppf(0.5 + level / 200) for k in KINDS for level in LEVELS}
-    return Bands(
-        name=name,
-        time=time,
-        voltage=voltage,
-        measured=reading if measured else None,
-        truth=truth if measured else None,
-        mean=mean,
-        lower={key: mean - r for key, r in reach.items()},
-        upper={key: mean + r for key, r in reach.items()},
-        pit=norm.cdf(reading - mean) if measured else None,
-        crps=np.abs(reading - mean) if measured else None,
-        interval=1e-3,
-        scored_from=lead_in,
-        training=training,
+    sds = {kind: np.full(samples, sd) for kind, sd in zip(KINDS, (0.3, 0.8, 1.0), strict=True)}
+    made = normal_bands(time, voltage, mean, sds, reading if measured else None, training=training)
+    return dataclasses.replace(
+        made, name=name, truth=truth if measured else None, scored_from=lead_in
     )
 
 

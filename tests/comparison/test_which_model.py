@@ -164,15 +164,6 @@ def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(
     assert np.sum(near) >= 18
 
 
-@pytest.mark.slow
-def test_a_record_with_plays_a_quadratic_term_and_creep_gets_its_creep(tmp_path: Path) -> None:
-    """The quick twin: its own parts, with and without the creep, and another operator."""
-    model = "maxwell-slip(thresholds=6) + quadratic + creep"
-    record, _ = plant(model, 1)
-    names = [model, model.removesuffix(" + creep"), "bouc-wen + quadratic"]
-    assert right(model, compared(record, names, tmp_path / "runs"))
-
-
 def test_a_record_without_hysteresis_is_said_to_have_none(tmp_path: Path) -> None:
     record, _ = plant("linear", 1)
     names = ["bouc-wen + white", "linear + white"]

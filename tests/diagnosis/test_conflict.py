@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.conflict import around, conflicts, effective
+from bwbayes.diagnosis.conflict import around, conflicts
 from bwbayes.inference.defaults import default_priors, ranges_of
 from bwbayes.inference.map_estimate import fit
 from bwbayes.inference.parameters import JointPrior
@@ -161,20 +161,3 @@ def test_forty_good_records_raise_no_remark() -> None:
         ranges = ranges_of(posterior.only.voltage, posterior.only.displacement, INTERVAL)
         alarms += judged(posterior, ranges)
     assert [] == alarms
-
-
-def test_effective_quantiles_are_those_of_the_cut_prior() -> None:
-    """With h0 free alpha's median is above the stated one, and beta's too: |gamma| <= beta."""
-    prior = joint_prior(NAMES, RANGES, {})
-    quantiles = dict(
-        zip(prior.free_names, effective(prior, np.random.default_rng(1)).T, strict=True)
-    )
-    stated = {p.name: p.prior.frozen.ppf([0.025, 0.5, 0.975]) for p in prior.free if p.prior}
-    for name in ("lag", "offset", "sensor_sd", "discrepancy_time"):
-        (single,) = (p.prior for p in prior.free if p.name == name)
-        assert single is not None
-        np.testing.assert_allclose(
-            single.frozen.cdf(quantiles[name]), [0.025, 0.5, 0.975], atol=0.03, err_msg=name
-        )
-    assert quantiles["beta"][1] > 2 * stated["beta"][1]
-    assert quantiles["alpha"][2] < stated["alpha"][2]

@@ -103,12 +103,3 @@ def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float)
     expected = (1 + slope @ np.linalg.solve(covariance, slope)) ** -0.5
     assert 0.1 < expected < 0.95
     np.testing.assert_allclose(expected, left(posterior), rtol=0.03)
-
-
-def test_decaying_amplitudes_leave_less_open_than_a_sine_the_more_of_them_the_less() -> None:
-    """The verification signal has four amplitudes besides its largest, the other twenty."""
-    constant = left(measured(sine(100.0, 0.1, periods=4.0)))
-    four = left(measured(signal("verification")))
-    twenty = left(measured(signal("identification")))
-    assert (four < 0.9 * constant).all()
-    assert (twenty < 0.9 * four).all()

@@ -67,27 +67,6 @@ def test_any_number_of_models_fits_the_lanes(count: int) -> None:
     assert_engines_agree(posterior, prior_draws(posterior, count))
 
 
-@pytest.mark.parametrize("discrepancy_sd", [0.05, 0.2])
-def test_engines_agree_on_a_start_that_is_long_remembered(discrepancy_sd: float) -> None:
-    """A small discrepancy of long memory in a large noise: the filter settles in 200 samples or so.
-
-    What is off by a large constant, as for a bad model, keeps pulling at the start all that time.
-    """
-    posterior = short_posterior(samples=6000, dynamics="lag", fixed={})
-    theta = changed(
-        posterior, sensor_sd=1.0, discrepancy_sd=discrepancy_sd, discrepancy_time=20.0, offset=30.0
-    )
-    assert_engines_agree(posterior, theta)
-
-
-def test_engines_agree_after_a_gap_that_unsettles_the_filter() -> None:
-    """It was in its steady state before, and takes longer to get there again than one piece."""
-    windows = (slice(0, 3000), slice(3400, 4200))
-    posterior = short_posterior(samples=4200, dynamics="lag", fixed={}, training=windows)
-    theta = changed(posterior, sensor_sd=1.0, discrepancy_sd=1.0, discrepancy_time=20.0)
-    assert_engines_agree(posterior, theta)
-
-
 def test_a_general_exponent_is_left_to_numpy() -> None:
     posterior = short_posterior(dynamics="lag", fixed={"initial": 2.0})
     theta = np.repeat(truth(posterior), 5, axis=0)

@@ -97,24 +97,6 @@ def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> Non
     np.testing.assert_allclose(both.log_likelihood(theta), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_two_halves_of_a_record_that_share_all_are_the_whole(engine: Engine) -> None:
-    """White noise has no memory, so that the sum over windows is the whole, to rounding."""
-    whole = dataset("loops", "white")
-    halves = [
-        replace(whole, training=(window,), name=f"half-{i}")
-        for i, window in enumerate(whole.training)
-    ]
-    one = joint(whole, engine=engine)
-    two = joint(*halves, shared=("initial", "offset"), engine=engine)
-    assert one.table.names == two.table.names
-    z = np.random.default_rng(2).standard_normal((6, len(one.names)))
-    np.testing.assert_allclose(one.log_density(z), two.log_density(z), rtol=1e-10)
-    # The twin: with an offset of its own each half knows less.
-    loose = joint(*halves, shared=("initial",))
-    assert len(loose.names) == len(one.names) + 1
-
-
 def test_halves_with_a_discrepancy_are_the_whole() -> None:
     """Means to 0.1 sd and sds to 5 %, the halves ten correlation times apart.
 

@@ -101,17 +101,6 @@ def mirrored(worse: float = 0.0) -> Posterior:
     )
 
 
-def test_several_optima_are_reported_as_distinct() -> None:
-    """A model with two mirrored solutions gives both, once each."""
-    posterior = mirrored()
-    point = fit(posterior, np.random.default_rng(7))
-    assert ("d", "offset", "sensor_sd") == posterior.names
-    free, _ = posterior.prior.constrain(point.optima)
-    np.testing.assert_allclose([-6.0, 6.0], np.sort(free[:, 1]), atol=0.15)
-    density = posterior.log_density(point.optima)
-    np.testing.assert_allclose(density[0], density[1], atol=1e-3)
-
-
 def test_the_mode_is_the_best_of_the_optima_and_one_not_much_worse_is_kept() -> None:
     """The other is some nats worse: the sum of squares is 200 x 0.1^2 larger, at an sd of 0.3."""
     posterior = mirrored(worse=0.1)

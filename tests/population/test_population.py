@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,34 +118,6 @@ def test_few_specimens_or_none_in_common_are_refused() -> None:
     assert () == shared([*three, other])
     with pytest.raises(InputError, match="no parameter of the actuator in common"):
         population([*three, other], generator)
-
-
-def test_a_specimen_of_a_posterior_has_its_actuators_parameters_and_their_prior(
-    tmp_path: Path,
-) -> None:
-    """Draws of the prior itself lie as the density that is divided out says."""
-    posterior = short_posterior(samples=40)
-    generator = np.random.default_rng(11)
-    draws = posterior.prior.draw(generator, 3000)
-    one = specimen_of("a", posterior, draws, generator)
-    assert not {"offset", "initial", "sensor_sd"} & set(one.names)
-    assert {"d", "alpha", "beta", "gamma"} <= set(one.names)
-    d, gamma = one.names.index("d"), one.names.index("gamma")
-    assert (bool(one.logarithmic[d]), bool(one.logarithmic[gamma])) == (True, False)
-    # The histogram of the draws is the density that is divided out, to counting error.
-    for i in range(len(one.names)):
-        y, edges = one.draws[:, i], np.quantile(one.draws[:, i], np.linspace(0.1, 0.9, 9))
-        counts, _ = np.histogram(y, edges)
-        middle = (edges[1:] + edges[:-1]) / 2
-        order = np.argsort(y)
-        logs = np.interp(middle, y[order], one.log_prior[order, i])
-        expected = np.exp(logs - np.max(logs)) * np.diff(edges)
-        expected *= counts.sum() / expected.sum()
-        assert stats.chisquare(counts, expected).pvalue > 1e-6, one.names[i]
-    one.save(tmp_path / "specimen.npz")
-    back = Specimen.load("a", tmp_path / "specimen.npz")
-    assert (one.names, one.units) == (back.names, back.units)
-    np.testing.assert_array_equal(one.log_prior, back.log_prior)
 
 
 def test_the_next_specimen_has_the_populations_parameters_and_meets_the_constraints() -> None:

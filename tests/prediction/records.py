@@ -7,6 +7,7 @@ that the bands say.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +16,6 @@ from scipy.special import ndtr, ndtri
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from tests.stand import process
-
-__all__ = ["Made", "bands_of", "made"]
 
 
 @dataclass(frozen=True)
@@ -63,23 +62,40 @@ def made(
 
 def bands_of(record: Made, spoilt: FloatArray | float = 0.0, *, training: bool = False) -> Bands:
     """Return the bands of a record whose readings have ``spoilt`` (samples,) um added."""
+    return normal_bands(
+        record.time,
+        record.voltage,
+        record.mean,
+        record.sds,
+        record.mean + record.error + spoilt,
+        training=training,
+    )
+
+
+def normal_bands(
+    time: FloatArray,
+    voltage: FloatArray,
+    mean: FloatArray,
+    sds: Mapping[Kind, FloatArray],
+    measured: FloatArray | None,
+    *,
+    training: bool = False,
+) -> Bands:
+    """Return bands (samples,) that are normal, of these means and sds."""
     half = {
-        (kind, level): ndtri(0.5 + level / 200) * record.sds[kind]
-        for kind in KINDS
-        for level in LEVELS
+        (kind, level): ndtri(0.5 + level / 200) * sds[kind] for kind in KINDS for level in LEVELS
     }
-    measured = record.mean + record.error + spoilt
     return Bands(
         name="training" if training else "held-out",
-        time=record.time,
-        voltage=record.voltage,
+        time=time,
+        voltage=voltage,
         measured=measured,
         truth=None,
-        mean=record.mean,
-        lower={key: record.mean - width for key, width in half.items()},
-        upper={key: record.mean + width for key, width in half.items()},
-        pit=ndtr((measured - record.mean) / record.sds["sensor"]),
-        crps=np.abs(measured - record.mean),
-        interval=float(record.time[1] - record.time[0]),
+        mean=mean,
+        lower={key: mean - width for key, width in half.items()},
+        upper={key: mean + width for key, width in half.items()},
+        pit=None if measured is None else ndtr((measured - mean) / sds["sensor"]),
+        crps=None if measured is None else np.abs(measured - mean),
+        interval=float(time[1] - time[0]),
         training=training,
     )

@@ -7,7 +7,6 @@ and chosen again by their weights: a run in two seconds. All else is the run's o
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +15,9 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.running.assembling import assemble
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.explaining import explained
-from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.predictions import judged
-from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Background, Verdict
 from bwbayes.inference import map_estimate as pointfit
@@ -29,24 +25,17 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import predict_record, predict_windows
-from bwbayes.report.result import Result
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import first_chain, sample
-from bwbayes.sampling.storage import ChainFile
 
 __all__ = [
-    "CONVERGED",
     "Judged",
     "covered",
     "judge",
     "posterior_draws",
     "problem_of",
-    "run",
     "weighted_draws",
 ]
 
-# What is enough for a test.
-CONVERGED = "\n[sampling]\ness = 400\n"
 
 # Draws of each round, to which the mixture of the next one is fitted; draws of the last; those that
 # stay. Three rounds find a tail that is several times as long as the point fit's sd says.
@@ -153,22 +142,6 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
         found = explained(problem, "record", places, thorough=failed)
         verdicts = judged(problem, bands, background, {"record": found})
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
-
-
-def run(text: str, folder: Path) -> tuple[Problem, Result]:
-    """Do what a run does, but for its files."""
-    problem = problem_of(text + CONVERGED, folder)
-    posterior, seed = problem.posterior, problem.config.seed
-    with one_thread(), executor(1, posterior.engine) as pool:
-        point = pointfit.fit(posterior, generator(seed, "point fit"))
-        first = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
-        noted = {"versions": json.dumps(versions(posterior.engine))}
-        path = folder / "chain"
-        chain = ChainFile.create(path, first, point, problem.plan.block, noted)
-        outcome = sample(posterior, problem.plan, chain, pool)
-        result = assemble(problem, chain, outcome)
-    assert outcome.converged, outcome.stop_reason
-    return problem, result
 
 
 def covered(bands: Bands, level: int = 95) -> float:

@@ -190,25 +190,3 @@ def test_initial_curve_starts_at_zero_volts_and_ends_where_the_voltage_does() ->
     _, both = initial_curve(actuator, column, -80.0, 80.0, 161)
     np.testing.assert_allclose(both[0], -both[0, ::-1], atol=1e-12)
     np.testing.assert_allclose(both[0, 80:], curve[0], atol=1e-12)
-
-
-def test_summary_holds_mean_sd_and_interval_of_the_draws() -> None:
-    of, draws = problem("plays")
-    loops = measure_loops(of, draws)
-    column = of.table.columns(of.prior.theta(draws))
-    low, high = np.min(of.only.voltage), np.max(of.only.voltage)
-    areas = measures(steady_loop(of.only.actuator, column, low, high))["area_um_V"]
-    assert areas is not None
-    kept: Any = loops.numbers
-    expected = {"mean": np.mean(areas), "sd": np.std(areas, ddof=1)}
-    expected |= dict(zip(("lower_95", "upper_95"), np.quantile(areas, [0.025, 0.975]), strict=True))
-    assert expected == pytest.approx(kept["major"]["area_um_V"])
-    assert kept["minor"]["amplitude_V"] == pytest.approx(kept["major"]["amplitude_V"] / 2)
-    curve = kept["initial_curve"]
-    assert {len(curve["voltage_V"])} == {len(values) for values in curve.values()} == {41}
-    assert all(
-        a <= b <= c
-        for a, b, c in zip(
-            curve["lower_95_um"], curve["mean_um"], curve["upper_95_um"], strict=True
-        )
-    )

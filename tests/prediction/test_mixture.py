@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray, Floating
 from bwbayes.prediction.mixture import (
-    VALUES,
     crps,
     log_density,
     quantile,
@@ -84,16 +83,6 @@ def test_scores_that_go_with_the_draws_would_be_noticed() -> None:
     assert worst_error(means, sds, ranked_values(means, sds, scores)) < ALARM
     ordered = ranked_values(means, sds, np.sort(scores, axis=1))
     assert worst_error(means, sds, ordered) > 2 * ALARM
-
-
-@pytest.mark.parametrize("number", [1, 2, 3, 250, 1000, VALUES, VALUES + 1])
-def test_scores_are_stratified_in_every_draw_and_in_all(number: int) -> None:
-    scores = ndtr(stratified_scores(number, random()))
-    each = len(scores)
-    assert VALUES <= scores.size < VALUES + number
-    assert (np.floor(scores * each) == np.arange(each)[:, np.newaxis]).all()
-    expected = (np.arange(scores.size) + 0.5) / scores.size
-    np.testing.assert_allclose(np.sort(scores.ravel()), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 from scipy.stats import norm
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.prediction.scores import score
+from tests.prediction.records import normal_bands
 from tests.stand import process
 
 # The window of the measured record: 14 s at 200 Hz, correlation time 0.65 s.
@@ -24,29 +24,12 @@ def correlated(generator: np.random.Generator, series: int, samples: int = SAMPL
     return np.stack([process(samples, 1 / CORRELATION, generator) for _ in range(series)])
 
 
-def bands_around(
-    mean: FloatArray, measured: FloatArray | None, sd: float = 1.0, interval: float = 0.005
-) -> Bands:
-    """Bands of mean +- z sd for all kinds, displacement's half as wide."""
-    half = {
-        (kind, level): np.full(mean.size, norm.ppf(0.5 + level / 200) * sd)
-        * (1.0 if kind == "sensor" else 0.5)
-        for kind in KINDS
-        for level in LEVELS
-    }
-    return Bands(
-        name="held out",
-        time=np.linspace(0, interval * mean.size, mean.size, endpoint=False),
-        voltage=np.zeros(mean.size),
-        measured=measured,
-        truth=None,
-        mean=mean,
-        lower={key: mean - width for key, width in half.items()},
-        upper={key: mean + width for key, width in half.items()},
-        pit=None if measured is None else ndtr((measured - mean) / sd),
-        crps=None if measured is None else np.abs(measured - mean),
-        interval=interval,
-    )
+def bands_around(mean: FloatArray, measured: FloatArray | None) -> Bands:
+    """Bands at 200 Hz with an sd of 1, displacement's half as wide."""
+    time = 0.005 * np.arange(mean.size)
+    wide = np.ones(mean.size)
+    sds: dict[Kind, FloatArray] = {"parameter": wide / 2, "displacement": wide / 2, "sensor": wide}
+    return normal_bands(time, np.zeros(mean.size), mean, sds, measured)
 
 
 def inside(values: FloatArray, level: int) -> BoolArray:
@@ -97,7 +80,7 @@ def test_the_worst_second_is_the_lowest_coverage_of_any_200_samples_at_200_hz() 
 
 
 def test_bands_without_a_measurement_are_refused() -> None:
-    with pytest.raises(InputError, match=r"held out: nothing was measured.*; give a record"):
+    with pytest.raises(InputError, match=r"held-out: nothing was measured.*; give a record"):
         score(bands_around(np.zeros(5), None), np.random.default_rng(0))
 
 

@@ -55,14 +55,6 @@ def test_effective_draws_of_a_known_process(kept: float) -> None:
         assert expected == pytest.approx(effective_draws(values)[0], rel=0.33)
 
 
-def test_walkers_that_move_together_are_not_counted_as_many() -> None:
-    """The cap by ensemble means: sixteen walkers on one path are worth one."""
-    path = autoregressive(0.5, 2000, (4, 1), np.random.default_rng(6))
-    together = path + 0.01 * np.random.default_rng(7).standard_normal((2000, 4, 16))
-    alone = effective_draws(path)[0]
-    np.testing.assert_allclose(alone, effective_draws(together)[0], rtol=0.1)
-
-
 def test_rhat_and_effective_draws_are_arvizs() -> None:
     """Draws that repeat, as those of walkers that stay where they are, have equal ranks."""
     draws = np.round(autoregressive(0.5, 200, (4, 6, 3), np.random.default_rng(15)), 1)
@@ -127,9 +119,3 @@ def test_pareto_k_trusts_a_fitted_student_and_not_one_that_misses_a_mode() -> No
         np.log(0.005) - 0.5 * np.sum((draws - 12) ** 2, axis=1),
     )
     assert pareto_k(density - fitted.log_density(draws)) > 0.7
-
-
-def test_pareto_k_of_what_is_not_a_number_is_not_trusted() -> None:
-    log_weights = np.random.default_rng(14).standard_normal(1000)
-    log_weights[3] = np.nan
-    assert not pareto_k(log_weights) < 0.7

@@ -27,7 +27,7 @@ from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome, check
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
-from tests.sampling.hard_chains import BLOCK, HARD, good, moved
+from tests.sampling.hard_chains import BLOCK, HARD, good, hard, moved
 from tests.sampling.targets import TARGETS, gaussian, target
 
 PLAN = SamplingPlan(
@@ -41,7 +41,7 @@ PLAN = SamplingPlan(
 @pytest.mark.parametrize("name", HARD)
 def test_hard_chain_never_passes(name: str) -> None:
     for seed in range(3):
-        draws = HARD[name](np.random.default_rng(seed), 2)
+        draws = hard(name, np.random.default_rng(seed))
         assert [] != check(draws, moved(draws), BLOCK).shortcomings(1), seed
 
 

@@ -13,7 +13,6 @@ from scipy.special import logsumexp
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.proposals import StudentMixture
-from tests.sampling.targets import TARGETS, Known, student
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
 MIXTURE = StudentMixture(
@@ -49,36 +48,6 @@ def test_draws_have_the_distribution() -> None:
             )
 
         assert stats.kstest(draws @ direction, cdf).pvalue > 1e-4
-
-
-def efficiency(known: Known, proposal: StudentMixture) -> float:
-    """Effective draws of importance sampling from a proposal, (Σw)² / Σw², a draw."""
-    draws = proposal.draw(np.random.RandomState(8), 20_000)
-    logs = known.log_density(draws) - proposal.log_density(draws)
-    return float(np.exp(2 * logsumexp(logs) - logsumexp(2 * logs)) / len(draws))
-
-
-def efficiencies(known: Known) -> tuple[float, float]:
-    """Efficiency of one Student-t of the draws' covariance, and of a fitted mixture."""
-    draws = known.draw(np.random.default_rng(9), 4000)
-    factor = np.linalg.cholesky(np.atleast_2d(np.cov(draws, rowvar=False)))
-    one = efficiency(known, student(np.mean(draws, axis=0), factor))
-    return one, efficiency(known, StudentMixture.fitted(draws))
-
-
-EXPONENTIAL = Known(
-    1,
-    lambda x: np.where(x[:, 0] > 0, -x[:, 0], -np.inf),
-    lambda generator, count: generator.exponential(size=(count, 1)),
-    student(np.ones(1), np.eye(1)),
-    np.array([[1.0], [2.0]]),
-)
-
-
-@pytest.mark.parametrize("name", ["banana", "bounded", "bimodal", "one parameter"])
-def test_a_mixture_covers_a_skewed_target_better_than_one_student(name: str) -> None:
-    one, mixture = efficiencies(TARGETS.get(name, EXPONENTIAL))
-    assert mixture > 1.1 * one
 
 
 GENERATOR = np.random.default_rng(12)
@@ -121,24 +90,3 @@ def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
     assert np.isfinite(mixture.log_density(TINY[name])).all()
     proposed = mixture.draw(np.random.RandomState(14), 500)
     assert np.isfinite(mixture.log_density(proposed)).all()
-
-
-def test_a_component_of_its_own_covers_what_the_others_cover_worst() -> None:
-    """Four small modes beside a large one are too many for three components.
-
-    The largest weight p/q, in units of the mean one, is how long a walker stays there.
-    """
-    rng = np.random.default_rng(16)
-    centers = np.array([[0, 0], [9, 9], [9, -9], [-9, 9], [-9, -9]])
-    shares, widths = np.array([0.96, 0.01, 0.01, 0.01, 0.01]), np.array([1, 0.5, 0.5, 0.5, 0.5])
-    modes = rng.choice(5, p=shares, size=10_000)
-    draws = centers[modes] + widths[modes, np.newaxis] * rng.standard_normal((modes.size, 2))
-    squares = np.sum((draws[:, np.newaxis] - centers) ** 2, axis=-1) / widths**2
-    log_density = np.logaddexp.reduce(np.log(shares / widths**2) - 0.5 * squares, axis=1)
-
-    def longest_stay(mixture: StudentMixture) -> float:
-        log_weights = log_density - mixture.log_density(draws)
-        return float(np.max(log_weights) + np.log(np.mean(np.exp(-log_weights))))
-
-    without = longest_stay(StudentMixture.fitted(draws))
-    assert longest_stay(StudentMixture.fitted(draws, log_density)) < without - np.log(3)

@@ -12,11 +12,10 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import Chain
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import FIRST_CHECK, first_chain, sample
+from bwbayes.sampling.sampler import FIRST_CHECK, sample
 from tests.sampling.samplings import (
     PLAN,
     POSTERIOR,
@@ -27,7 +26,6 @@ from tests.sampling.samplings import (
     new_chain,
     run,
 )
-from tests.sampling.targets import target
 
 
 @pytest.fixture(scope="module")
@@ -76,25 +74,6 @@ def test_a_budget_that_ends_with_the_first_good_check_is_told() -> None:
     assert [] == outcome.check.shortcomings(plan.ess)
     assert not outcome.converged
     assert outcome.stop_reason.endswith("only the last check passed")
-
-
-def test_the_pilot_has_a_budget_of_its_own() -> None:
-    """Ensembles that never find each other go on after it, and do not converge."""
-
-    def islands(x: FloatArray) -> FloatArray:
-        return np.where(np.max(np.abs(x % 100 - 50), axis=1) < 20, 0.0, -np.inf)
-
-    plan = replace(PLAN, most_pilot_steps=140, most_steps=100, walkers=4)
-    posterior = target(islands, 2)
-    optima = np.array([[100 * i + 50.0, 50.0] for i in range(4)])
-    covariance = np.eye(2)
-    point = PointFit(optima[0], covariance, 0.0, optima, covariance)
-    chain = first_chain(posterior, point, plan, np.random.default_rng(3))
-    with ThreadPoolExecutor(1) as executor:
-        outcome = sample(posterior, plan, chain, executor)
-    assert 140 == chain.steps("pilot")
-    assert not outcome.converged
-    assert "R-hat" in outcome.stop_reason
 
 
 def test_a_chain_whose_target_is_made_smaller_is_judged_at_its_end(
