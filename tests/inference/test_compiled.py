@@ -20,6 +20,8 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.engine import choose
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
 from tests.inference.problems import (
@@ -116,19 +118,41 @@ VOLTAGES = st.lists(
 ).filter(lambda path: max(path) - min(path) > 1)
 
 
+def of_operator(
+    name: str, gain: PolynomialGain | None = None, creep: Creep | None = None
+) -> Posterior:
+    """Return the posterior of a decaying sine with an operator and a lag, its start unknown."""
+    operator = made("hysteresis", name, HYSTERESIS, {})
+    span = Span(-100.0, 100.0)
+    actuator = Actuator("lag", "first", INTERVAL, operator, gain, creep, span)
+    voltage = decaying_sine(200)
+    return posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=False)
+
+
 @pytest.mark.parametrize("name", HYSTERESIS)
 @given(VOLTAGES, st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=15)
 def test_engines_agree_on_any_path(name: str, path: list[float], seed: int) -> None:
     """Plateaus, steps, turns at every sample; whole tens meet extrema and ends of the span."""
-    operator = made("hysteresis", name, HYSTERESIS, {})
-    actuator = Actuator("lag", "first", INTERVAL, operator, span=Span(-100.0, 100.0))
-    reading = np.random.default_rng(seed).normal(size=len(path))
-    usual = posterior_of(decaying_sine(200), decaying_sine(200), actuator, "discrepancy", {})
+    usual, reading = of_operator(name), np.random.default_rng(seed).normal(size=len(path))
     posterior = usual.altered(
         voltage=np.array(path), displacement=reading, training=(slice(0, len(path)),)
     )
     assert_engines_agree(posterior, prior_draws(usual, 5, seed))
+
+
+@pytest.mark.parametrize("name", HYSTERESIS)
+@pytest.mark.parametrize("parts", [False, True])
+def test_both_engines_simulate_alike(name: str, parts: bool) -> None:
+    """To 1e-11 of the range; operators that are integrated, in steps of their own, to 1e-6."""
+    gain, creep = (PolynomialGain(), Creep((0.1, 1.0), growing=True)) if parts else (None, None)
+    posterior = of_operator(name, gain, creep)
+    theta = prior_draws(posterior, LANES + 3)
+    expected = replace(posterior, engine="numpy").simulate(theta)
+    got = replace(posterior, engine="numba").simulate(theta)
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    tolerance = 1e-6 if name in ("jiles-atherton", "domain-wall") else 1e-11
+    assert (np.abs(got - expected) <= tolerance * size).all()
 
 
 def test_twin_a_defect_of_a_millionth_is_found() -> None:

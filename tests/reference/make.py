@@ -2,8 +2,8 @@
 
 From the repository's root, ``python -m tests.reference.make virtual measured measured_evidence``.
 It needs dynesty and numba, which the package and its tests do not; numba compiles the plain loops.
-Independent runs of dynamic nested sampling, aimed at the posterior, are pooled; the errors that
-their spread shows are stored with the result. It takes five and ten minutes on one core.
+Independent runs of dynamic nested sampling, aimed at the posterior, are pooled. It takes five and
+ten minutes on one core.
 """
 
 from __future__ import annotations
@@ -11,10 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import platform
 import sys
 from collections.abc import Callable
-from datetime import UTC, datetime
 from importlib import import_module
 from importlib.metadata import version
 from itertools import starmap
@@ -127,64 +125,35 @@ def digest(case: Case) -> str:
 
 
 def reference(name: str) -> dict[str, object]:
-    """Make one reference."""
-    case = load_case(FOLDER / f"{name}.toml")
-    count = RUNS[name]
-    runs = [nested(case, seed) for seed in range(1, count + 1)]
+    """Make one reference, or with ``_evidence`` one of the evidence by four runs aimed at it."""
+    evidence = name.endswith("_evidence")
+    case = load_case(FOLDER / f"{name.removesuffix('_evidence')}.toml")
+    aim, count = ("evidence", 4) if evidence else ("posterior", RUNS[name])
+    runs = [nested(case, seed, aim=aim) for seed in range(1, count + 1)]
+    made = {
+        "digest": digest(case),
+        "versions": {p: version(p) for p in ("numpy", "scipy", "numba", "dynesty")},
+        "log_evidence": [float(run.logz[-1]) for run in runs],
+        "log_evidence_error": [float(run.logzerr[-1]) for run in runs],
+    }
+    if evidence:
+        return made
     weights = [run.importance_weights() for run in runs]
     # Each run counts the same.
     pooled = np.concatenate([w / (count * w.sum()) for w in weights])
     result = statistics(np.concatenate([run.samples for run in runs]), pooled)
-    single = [statistics(run.samples, w) for run, w in zip(runs, weights, strict=True)]
-    # Kish's number of effective draws knows nothing of the noise in nested sampling's volumes.
-    error = {
-        key: np.std([s[key] for s in single], axis=0, ddof=1) / count**0.5 / result["sd"]
-        for key in result
+    parameters = {
+        parameter: {key: float(values[i]) for key, values in result.items()}
+        for i, parameter in enumerate(case.free)
     }
-    packages = ("numpy", "scipy", "numba", "dynesty")
-    return {
-        "case": name,
-        "digest": digest(case),
-        "script": "tests/reference/make.py",
-        "made": datetime.now(UTC).date().isoformat(),
-        "versions": {"python": platform.python_version(), **{p: version(p) for p in packages}},
-        "runs": count,
-        "live_points": LIVE,
-        "walks": WALKS,
-        "likelihoods": [int(np.sum(run.ncall)) for run in runs],
-        "ess": float(1 / np.sum(pooled**2)),
-        "log_evidence": [float(run.logz[-1]) for run in runs],
-        "log_evidence_error": [float(run.logzerr[-1]) for run in runs],
-        "parameters": {
-            parameter: {key: float(values[i]) for key, values in result.items()}
-            for i, parameter in enumerate(case.free)
-        },
-        "error_in_sd": {
-            parameter: {key: round(float(values[i]), 4) for key, values in error.items()}
-            for i, parameter in enumerate(case.free)
-        },
-    }
-
-
-def reference_evidence(name: str) -> dict[str, object]:
-    """Make one reference evidence; the spread of independent runs is its error."""
-    case = load_case(FOLDER / f"{name}.toml")
-    runs = [nested(case, seed, aim="evidence") for seed in range(1, 5)]
-    return {
-        "digest": digest(case),
-        "versions": {p: version(p) for p in ("numpy", "scipy", "numba", "dynesty")},
-        "live_points": 2 * LIVE,
-        "log_evidence": [float(run.logz[-1]) for run in runs],
-        "log_evidence_error": [float(run.logzerr[-1]) for run in runs],
-    }
+    return made | {"ess": float(1 / np.sum(pooled**2)), "parameters": parameters}
 
 
 def main(names: list[str]) -> None:
     """Make the named references and write them beside this file."""
     for name in names:
-        case, wanted_evidence = name.removesuffix("_evidence"), name.endswith("_evidence")
-        made = reference_evidence(case) if wanted_evidence else reference(case)
-        lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in made.items())
+        made = reference(name).items()
+        lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in made)
         (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
 
