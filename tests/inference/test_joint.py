@@ -148,9 +148,10 @@ def test_bounds_hold_in_every_record() -> None:
 
 
 def test_outliers_are_found_in_the_record_that_has_them() -> None:
-    spoilt = SLOW.displacement.copy()
+    loops, slow = (dataset(name, "white", "none") for name in RECORDS)
+    spoilt = slow.displacement.copy()
     spoilt[40] += 60.0
-    both = joint(LOOPS, replace(SLOW, displacement=spoilt))
+    both = joint(loops, replace(slow, displacement=spoilt))
     aside = outliers(both.without, np.random.default_rng(6))
     assert {"loops": [], "slow": [40]} == {name: rows.tolist() for name, rows in aside.items()}
 
