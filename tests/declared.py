@@ -20,10 +20,9 @@ NAMES = (
 )  # fmt: skip
 
 
-def declared(name: str, *, passive: bool = True) -> Declaration:
+def declared(name: str) -> Declaration:
     """Return a declaration; Bouc-Wen's where several operators have a parameter of that name."""
-    own = {d.name: d for d in BoucWen(passive).parameters}
-    return own.get(name, DECLARED[name])
+    return DECLARED[name]
 
 
 def parameter(
@@ -46,32 +45,8 @@ def joint(parameters: list[Parameter], *, passive: bool = True) -> JointPrior:
 
 
 def context(
-    ranges: Ranges,
-    exponent: float | Distribution = 1.0,
-    stiffness: float | None = None,
-    *,
-    gamma_free: bool = True,
+    ranges: Ranges, exponent: float | Distribution = 1.0, stiffness: float | None = None
 ) -> Context:
     """Return what default priors may know."""
     stated: dict[str, float | Distribution] = {"exponent": exponent}
-    if stiffness is not None:
-        stated["stiffness"] = stiffness
-    if not gamma_free:
-        stated["gamma"] = 0.0
-    return Context(ranges, stated)
-
-
-def default_prior(
-    name: str,
-    ranges: Ranges,
-    exponent: float | Distribution = 1.0,
-    stiffness: float | None = None,
-    *,
-    gamma_free: bool = True,
-) -> Distribution | float:
-    """Return a parameter's default prior, or the value at which it is fixed."""
-    known = context(ranges, exponent, stiffness, gamma_free=gamma_free)
-    default = declared(name).default(known)
-    if default is None:
-        raise KeyError(name)
-    return default
+    return Context(ranges, stated if stiffness is None else stated | {"stiffness": stiffness})

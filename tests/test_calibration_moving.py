@@ -12,9 +12,10 @@ The default suite makes 40 replicates with the lag, and with priors of someone w
 of actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are
 tested together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a
 wrong width and a bias on the draws (sds a fifth too small are seen with a probability of 0.96, a
-bias of 0.3 sd with 0.99). Coverages of the 18 bands are held to the spread between replicates: by chance one in 100
-sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow`` makes 150 of each
-variant and of each part of a model, and 50 with a free exponent beside known hysteresis: four
+bias of 0.3 sd with 0.99). Coverages of the 18 bands are held to the spread between replicates: by
+chance one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow``
+makes 150 of each variant and of each part of a model, and 50 with a free exponent beside known
+hysteresis: four
 seconds of a record do not tell an exponent, a loop and its shape of which nothing is known.
 """
 

@@ -41,7 +41,7 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
-    stand = VirtualTestStand(discrepancy="none", sample_rate=200.0)
+    stand = VirtualTestStand(discrepancy="none", sample_rate=250.0)
     generator = np.random.default_rng(1)
     record = stand.run(Waveform(Sine(100.0, 1.0), 14.0, decay=Decay(0.0, 0.05)), generator)
     names: dict[str, Any] = {
@@ -51,7 +51,7 @@ def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
     }
     (lines,) = blocks("python")
     # That is what a reader does, with fewer samples, draws and walkers.
-    lines = lines.replace("interval=1e-3", "interval=5e-3")
+    lines = lines.replace("interval=1e-3", "interval=4e-3")
     exec(lines.replace("12))", "12), ess=400, walkers=24)"), names)
     assert names["fit"].converged
     assert names["bands"].scores.nrmse < 0.05

@@ -37,11 +37,11 @@ def measured(seed: int, seconds: float = 16.0) -> Record:
     return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)
 
 
-def spiky(record: Record, seed: int, last: float = 12.0) -> tuple[Record, list[int]]:
-    """Add ten spikes of 20 um before the time ``last``; return their samples too."""
+def spiky(record: Record, seed: int) -> tuple[Record, list[int]]:
+    """Add ten spikes of 20 um to the part that is fitted; return their samples too."""
     assert record.displacement is not None
     source = np.random.default_rng([22, seed])
-    rows = np.sort(source.choice(round(last * RATE), 10, replace=False))
+    rows = np.sort(source.choice(round(12 * RATE), 10, replace=False))
     displacement = record.displacement.copy()
     displacement[rows] += 20 * source.choice([-1, 1], 10)
     return replace(record, displacement=displacement), rows.tolist()

@@ -31,9 +31,9 @@ PHYSICAL = ("d", "alpha", "beta", "gamma", "initial", "lag", "offset", "sensor_s
 RECORDS = 40
 
 
-def steady_sine(seed: int, folder: Path, periods: int = 3) -> Problem:
+def steady_sine(seed: int, folder: Path) -> Problem:
     """Simulate a record and put the default config's problem together."""
-    voltage = 150 * np.sin(2 * np.pi * np.arange(periods * RATE) / RATE)
+    voltage = 150 * np.sin(2 * np.pi * np.arange(3 * RATE) / RATE)
     record = STAND.measure(voltage, np.random.default_rng([7, seed]), offset=0.0)
     path = folder / f"sine_{seed}.csv"
     write_record(record, path)

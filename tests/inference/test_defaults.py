@@ -14,7 +14,7 @@ from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES as EVERY
-from tests.declared import default_prior, joint, parameter
+from tests.declared import context, declared, joint, parameter
 
 NAMES = tuple(name for name in EVERY if name not in ("mass", "stiffness", "exponent"))
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")
@@ -27,24 +27,24 @@ def drive(amplitude: float = 100.0, interval: float = 1e-3, bias: float = 0.0) -
     return voltage
 
 
-def displacement(voltage: FloatArray, interval: float = 1e-3, offset: float = 0.0) -> FloatArray:
+def displacement(voltage: FloatArray, interval: float = 1e-3) -> FloatArray:
     """Return that of the ring bender with a lag of 20 ms, um."""
     actuator = Actuator("lag", "first", interval)
     table = RingBender()
     theta = [0.02 if n == "lag" else getattr(table, n) for n in actuator.parameters]
     clean: FloatArray = actuator.displacement(np.array([theta]), voltage)[0]
-    return clean + offset
+    return clean
 
 
 def prior(name: str, ranges: Ranges, exponent: float | Distribution = 1.0) -> Distribution:
-    result = default_prior(name, ranges, exponent, 4.1e5)
+    result = declared(name).default(context(ranges, exponent, 4.1e5))
     assert isinstance(result, Distribution)
     return result
 
 
-def score(name: str, value: float, ranges: Ranges, exponent: float | Distribution = 1.0) -> float:
+def score(name: str, value: float, ranges: Ranges) -> float:
     """Return how many prior sds a value lies from the median."""
-    result = prior(name, ranges, exponent)
+    result = prior(name, ranges)
     ends = np.array([-np.inf, np.inf])
     return float(result.to_normal(np.array([value]), ends[0], ends[1])[0])
 

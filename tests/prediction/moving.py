@@ -25,6 +25,7 @@ from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from bwbayes.record.true_values import true_values
 from tests.inference.problems import posterior_of
+from tests.prediction.runs import covered as inside
 from tests.stand import process
 
 __all__ = [
@@ -132,16 +133,9 @@ def studied(case: Case, records: int, seed: int = 0) -> list[Bands]:
     ]
 
 
-def covered(every: list[Bands], level: int, width: float = 1.0) -> FloatArray:
+def covered(every: list[Bands], level: int) -> FloatArray:
     """Part of the judged readings inside the sensor band, (records,)."""
-    parts = []
-    for bands in every:
-        lower, upper = bands.lower["sensor", level], bands.upper["sensor", level]
-        assert bands.measured is not None
-        middle, half = (upper + lower) / 2, (upper - lower) / 2
-        inside = np.abs(bands.measured - middle) <= width * half
-        parts.append(np.mean(inside[bands.scored_from :]))
-    return np.array(parts)
+    return np.array([inside(bands, level) for bands in every])
 
 
 def errors_off(parts: FloatArray, level: int) -> float:

@@ -12,7 +12,6 @@ from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
@@ -27,8 +26,8 @@ from bwbayes.prediction.loops import (
 from tests.inference.problems import decaying_sine, posterior_of
 
 
-def still(operator: Operator | None = None, gain: PolynomialGain | None = None) -> Actuator:
-    return Actuator("none", "first", 1.0, operator or BoucWen(), gain)
+def still(operator: Operator | None = None) -> Actuator:
+    return Actuator("none", "first", 1.0, operator or BoucWen())
 
 
 def columns(actuator: Actuator, **known: float) -> dict[str, FloatArray]:

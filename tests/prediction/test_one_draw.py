@@ -51,10 +51,10 @@ def simulated(posterior: Posterior, voltage: FloatArray, interval: float) -> Flo
     return moved
 
 
-def another(posterior: Posterior, interval: float, offset: float = 12.0) -> Record:
+def another(posterior: Posterior, interval: float) -> Record:
     """Make a record of four seconds at another interval, from rest, some readings far off."""
     voltage = decaying_sine(round(4.0 / interval), amplitude=80.0)
-    reading = simulated(posterior, voltage, interval) + offset
+    reading = simulated(posterior, voltage, interval) + 12.0
     reading += SENSOR * np.random.default_rng(1).standard_t(3, voltage.size)
     return Record(voltage, reading, interval)
 
@@ -81,15 +81,13 @@ def assert_scores_are_of(bands: Bands, mean: FloatArray, sd: float) -> None:
     np.testing.assert_allclose(crps, bands.crps, atol=1e-3 * sd)
 
 
-def offset_of_lead_in(
-    posterior: Posterior, record: Record, sensor: float = SENSOR, discrepancy: float = DISCREPANCY
-) -> tuple[float, float]:
+def offset_of_lead_in(posterior: Posterior, record: Record) -> tuple[float, float]:
     """Mean and sd of the offset, um, by the dense normal equations of a lead-in."""
     assert record.displacement is not None
     samples = round(LEAD_IN / record.interval)
     moved = simulated(posterior, record.voltage, record.interval)[:samples]
     lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples))) * record.interval
-    covariance = discrepancy**2 * np.exp(-lags / TIME) + sensor**2 * np.eye(samples)
+    covariance = DISCREPANCY**2 * np.exp(-lags / TIME) + SENSOR**2 * np.eye(samples)
     weight = np.linalg.solve(covariance, np.ones(samples))
     mean = float(weight @ (record.displacement[:samples] - moved) / weight.sum())
     return mean, float(weight.sum() ** -0.5)

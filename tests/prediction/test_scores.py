@@ -19,9 +19,9 @@ from tests.stand import process
 SAMPLES, CORRELATION = 2800, 130
 
 
-def correlated(generator: np.random.Generator, series: int, samples: int = SAMPLES) -> FloatArray:
+def correlated(generator: np.random.Generator, series: int) -> FloatArray:
     """Stationary AR(1) series (series, samples) of unit variance."""
-    return np.stack([process(samples, 1 / CORRELATION, generator) for _ in range(series)])
+    return np.stack([process(SAMPLES, 1 / CORRELATION, generator) for _ in range(series)])
 
 
 def bands_around(mean: FloatArray, measured: FloatArray | None) -> Bands:
