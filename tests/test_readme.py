@@ -41,18 +41,18 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
-    stand = VirtualTestStand(discrepancy="none", sample_rate=250.0)
+    stand = VirtualTestStand(discrepancy="none", sample_rate=500.0)
     generator = np.random.default_rng(1)
-    record = stand.run(Waveform(Sine(100.0, 1.0), 14.0, decay=Decay(0.0, 0.05)), generator)
+    record = stand.run(Waveform(Sine(100.0, 1.0), 7.0, decay=Decay(0.0, 0.1)), generator)
     names: dict[str, Any] = {
         "voltage": record.voltage,
         "displacement": record.displacement,
         "new_record": stand.run(Waveform(Sine(80.0, 0.7), 4.0), generator),
     }
     (lines,) = blocks("python")
-    # That is what a reader does, with fewer samples, draws and walkers.
-    lines = lines.replace("interval=1e-3", "interval=4e-3")
-    exec(lines.replace("12))", "12), ess=400, walkers=24)"), names)
+    # That is what a reader does, with a quarter of the samples, fewer draws and walkers.
+    lines = lines.replace("interval=1e-3", "interval=2e-3")
+    exec(lines.replace("12))", "6), ess=400, walkers=24)"), names)
     assert names["fit"].converged
     assert names["bands"].scores.nrmse < 0.05
 
