@@ -138,7 +138,8 @@ class Linear:
 
     def marginal(self) -> FloatArray:
         """Covariance of all readings, parameters integrated out."""
-        return self.noise + (self.design * self.sd**2) @ self.design.T
+        whole: FloatArray = self.noise + (self.design * self.sd**2) @ self.design.T
+        return whole
 
     def log_density(self, rows: IntArray) -> float:
         """Log density of some readings, parameters integrated out."""

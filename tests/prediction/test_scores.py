@@ -26,7 +26,7 @@ def correlated(generator: np.random.Generator, series: int) -> FloatArray:
 
 def bands_around(mean: FloatArray, measured: FloatArray | None) -> Bands:
     """Bands at 200 Hz with an sd of 1, displacement's half as wide."""
-    time = 0.005 * np.arange(mean.size)
+    time = 0.005 * np.arange(mean.size, dtype=np.float64)
     wide = np.ones(mean.size)
     sds: dict[Kind, FloatArray] = {"parameter": wide / 2, "displacement": wide / 2, "sensor": wide}
     return normal_bands(time, np.zeros(mean.size), mean, sds, measured)

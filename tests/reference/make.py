@@ -130,7 +130,7 @@ def reference(name: str) -> dict[str, object]:
     case = load_case(FOLDER / f"{name.removesuffix('_evidence')}.toml")
     aim, count = ("evidence", 4) if evidence else ("posterior", RUNS[name])
     runs = [nested(case, seed, aim=aim) for seed in range(1, count + 1)]
-    made = {
+    made: dict[str, object] = {
         "digest": digest(case),
         "versions": {p: version(p) for p in ("numpy", "scipy", "numba", "dynesty")},
         "log_evidence": [float(run.logz[-1]) for run in runs],
