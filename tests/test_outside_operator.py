@@ -66,16 +66,10 @@ class TanhLoop(RemembersExtrema):
         return 2 * (numbers[0] * half - numbers[1] * numbers[2] * np.tanh(half / numbers[2]))
 
 
-@dataclass(frozen=True)
 class BentStep(OneStateStep):
     """w = d u − h − k tanh(u / u_s), dh = α du − β |du| h: as an operator's own step."""
 
-    numbers: FloatArray
-
-    @property
-    def parameters(self) -> FloatArray:
-        """d, α, β, k and u_s, (models, 5)."""
-        return self.numbers
+    ROW = "d, α, β, k and u_s"
 
     @staticmethod
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:

@@ -145,7 +145,7 @@ class Exported:
             warnings=[line for text in self.standing.said for line in wrap(text, 92)],
             held=actuator.hold == "zero",
             hysteresis_is=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
-            parameters_are=to_ascii(type(step).parameters.__doc__ or ""),
+            parameters_are=to_ascii(step.ROW),
             parameter_row=[*map(to_c_number, step.parameters[0].tolist())],
             remembered=remembered,
             functions=c_functions(type(step).move, lengths, "actuator_"),

@@ -12,9 +12,7 @@ curve. No time stepping, and an error below 1e-9 of the largest |h|.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -34,59 +32,44 @@ TABLE, ROWS = 7, 10
 REACH = 36.0
 
 
-@dataclass(frozen=True)
 class PowerStep(OneStateStep):
     """w = d u − h with Bouc-Wen hysteresis h of any exponent n ≥ 1.
 
     What it remembers besides voltage and h is the direction, and the time on the curve, V, below
     zero where g is; it is looked up where the voltage turns.
-
-    Parameters
-    ----------
-    d, alpha, beta, gamma, exponent
-        (models,), um/V, um/V, um^(1−n)/V, um^(1−n)/V, and without unit.
     """
 
-    d: FloatArray
-    alpha: FloatArray
-    beta: FloatArray
-    gamma: FloatArray
-    exponent: FloatArray
+    ROW: ClassVar = "d, α, c/α, scales and rates below zero and above, n, and the curves' tables"
+    remembers: ClassVar = 4
 
-    @property
-    def remembers(self) -> int:
-        """Voltage, h, direction and time."""
-        return 4
-
-    @cached_property
-    def rates(self) -> tuple[FloatArray, FloatArray]:
-        """C over α for g below zero and above."""
-        return (self.gamma - self.beta) / self.alpha, (self.beta + self.gamma) / self.alpha
-
-    @cached_property
-    def scales(self) -> tuple[FloatArray, FloatArray]:
-        """What z is in units of below zero and above, |c/α|^(−1/n), um; not out of all reach."""
+    @classmethod
+    def of(
+        cls,
+        d: FloatArray,
+        alpha: FloatArray,
+        beta: FloatArray,
+        gamma: FloatArray,
+        exponent: FloatArray,
+    ) -> Self:
+        """Return the step of d, α, β, γ and n, (models,), as of Bouc-Wen hysteresis."""
+        rates = (gamma - beta) / alpha, (beta + gamma) / alpha
+        # What z is in units of below zero and above, |c/α|^(−1/n), um; not out of all reach.
         with np.errstate(divide="ignore"):
-            logs = [-np.log(np.abs(rate)) / self.exponent for rate in self.rates]
+            logs = [-np.log(np.abs(rate)) / exponent for rate in rates]
         below, above = (np.exp(np.minimum(values, np.log(1e100))) for values in logs)
-        return below, above
-
-    @cached_property
-    def parameters(self) -> FloatArray:
-        """d, α, c/α, scales and rates below zero and above, n, and the curves' tables."""
-        numbers = self.d, self.alpha, *self.rates, *self.scales, self.exponent
-        exponents, row = np.unique(self.exponent, return_inverse=True)
-        soft = self.gamma < self.beta
+        exponents, row = np.unique(exponent, return_inverse=True)
+        soft = gamma < beta
         # How far above one z may be on the soft curve.
-        farthest = np.log(self.scales[1] / self.scales[0])[soft] * self.exponent[soft]
+        farthest = np.log(above / below)[soft] * exponent[soft]
         rising = tabulate(exponents, saturating=True)
         falling = tabulate(exponents, saturating=False, top=max(farthest, default=0.0))
         cells = 1 << (max(rising.shape[2], falling.shape[2]) - 1).bit_length()
-        tables = np.full((2, self.d.size, ROWS, cells), np.inf)
+        tables = np.full((2, d.size, ROWS, cells), np.inf)
         tables[:, :, :, : rising.shape[2]] = rising[row]
         tables[1, soft] = np.inf
         tables[1, soft, :, : falling.shape[2]] = falling[row[soft]]
-        return np.column_stack([*numbers, tables.swapaxes(0, 1).reshape(self.d.size, -1)])
+        numbers = d, alpha, *rates, below, above, exponent
+        return cls(np.column_stack([*numbers, tables.swapaxes(0, 1).reshape(d.size, -1)]))
 
     @staticmethod
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
@@ -114,23 +97,18 @@ class PowerStep(OneStateStep):
         memory = np.stack(np.broadcast_arrays(start, state, s, time))
         return self.gone_along(memory, voltage)
 
-    def _x(self, g: FloatArray) -> FloatArray:
-        """Return x with the sign that 1 − x = h′/α asks for, (models,)."""
-        below, above = self.rates
-        return np.where(g < 0, below, above) * np.abs(g) ** self.exponent
-
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return d − max(α, 2 α β / (β + γ)) and d: h is steepest just after a turn."""
-        top = np.minimum(self.scales[1], self.alpha * (limits.high - limits.low))
-        turned = self.alpha * np.maximum(1 - self._x(-top), 1.0)
-        return self.d - turned, self.d
+        d, alpha, below, _, _, scale, n = self.parameters.T[:TABLE]
+        top = np.minimum(scale, alpha * (limits.high - limits.low))
+        return d - alpha * np.maximum(1 - below * top**n, 1.0), d
 
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return d, α, c/α below zero and above, and n."""
-        below, above = (float(rate[0]) for rate in self.rates)
-        slopes = {"d": (float(self.d[0]), "um/V"), "alpha": (float(self.alpha[0]), "um/V")}
+        d, alpha, below, above, _, _, n = self.parameters[0, :TABLE].tolist()
+        slopes = {"d": (d, "um/V"), "alpha": (alpha, "um/V")}
         rates = {"below": (below, "um^-n"), "above": (above, "um^-n")}
-        return {**slopes, **rates, "exponent": (float(self.exponent[0]), "-")}
+        return {**slopes, **rates, "exponent": (n, "-")}
 
 
 def clock(parameters: Any, g: Any) -> Any:

@@ -15,9 +15,9 @@ So Bouc-Wen with n = 1, asymmetric or not, backlash-like and Duhem loops are one
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.operator import Span
 from bwbayes.model.step import OneStateStep
-from bwbayes.shown import brief
 
 __all__ = [
     "BENT", "SHORT", "RelaxingStep", "bent", "phi_functions", "relax", "relaxed",
@@ -54,49 +53,37 @@ NEAR, TERMS = 1.0, 16
 INVERSE_FACTORIALS = tuple(1 / math.factorial(order) for order in range(TERMS + 2, 2, -1))
 
 
-@dataclass(frozen=True)
 class RelaxingStep(OneStateStep):
-    """w = f(u) − h, with h that relaxes along the voltage's path: dg/dv = a(u) − c g, g = s h.
+    """w = f(u) − h, with h that relaxes along the voltage's path: dg/dv = a(u) − c g, g = s h."""
 
-    Parameters
-    ----------
-    curve
-        d, d₂ and d₃, (3, models), um/V, um/V² and um/V³.
-    strength
-        α, α₁ and α₂, (3, models), um/V, um/V² and um/V³.
-    against, ahead
-        c for g < 0 and from there on, 1/V, (2, 2, models): for s and the voltage's sign of −1 and
-        1. Where one is not the other, α₁ and α₂ are zero.
-    """
-
-    __repr__ = brief
-
-    curve: FloatArray
-    strength: FloatArray
-    against: FloatArray
-    ahead: FloatArray
+    ROW: ClassVar = "d, d2, d3, α, α1, α2, and the rates c against and ahead, by direction and sign"
 
     @classmethod
-    def alike(
-        cls, d: FloatArray, alpha: FloatArray, against: FloatArray, ahead: FloatArray
-    ) -> RelaxingStep:
-        """Return one with constants d, α, um/V, and rates that know no signs, 1/V, (models,)."""
-        curve, strength = np.zeros((2, 3, d.size))
-        curve[0], strength[0] = d, alpha
-        rates = np.empty((2, 2, 2, d.size))
-        rates[0], rates[1] = against, ahead
-        return cls(curve, strength, *rates)
+    def of(
+        cls,
+        curve: Sequence[FloatArray] | FloatArray,
+        strength: Sequence[FloatArray] | FloatArray,
+        against: FloatArray,
+        ahead: FloatArray,
+    ) -> Self:
+        """Return the step of a curve, a strength, and rates.
 
-    @cached_property
-    def parameters(self) -> FloatArray:
-        """d, d2, d3, α, α1, α2, and the rates c against and ahead, by direction and sign."""
-        numbers = np.empty((self.curve.shape[1], 14))
+        Parameters
+        ----------
+        curve, strength
+            d, d₂ and d₃, and α, α₁ and α₂, or the first of each, (models,), um/V, um/V² and um/V³.
+        against, ahead
+            c for g < 0 and from there on, 1/V: (models,), or (4, models) for directions and signs
+            of the voltage of (−1, −1), (−1, 1), (1, −1) and (1, 1). Where one is not the other, α₁
+            and α₂ are zero.
+        """
+        numbers = np.zeros((curve[0].size, 14))
         rows = numbers.T
-        rows[:3], rows[3:6] = self.curve, self.strength
-        rows[6:10], rows[10:] = self.against.reshape(4, -1), self.ahead.reshape(4, -1)
+        rows[: len(curve)], rows[3 : 3 + len(strength)] = curve, strength
+        rows[6:10], rows[10:] = against, ahead
         rates = numbers[:, 6:]
         rates[np.abs(rates) < TINY] = TINY
-        return numbers
+        return cls(numbers)
 
     @cached_property
     def signed(self) -> bool:
@@ -169,23 +156,23 @@ class RelaxingStep(OneStateStep):
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d − α + c g at the ceilings: h is steepest just after a turn. f and a are even."""
-        d, alpha = self.curve[0], self.strength[0]
-        tops = alpha / np.maximum(self.ahead.min(axis=1), TINY)
-        lowest = alpha + np.max(np.maximum(self.against, 0.0) * tops[::-1, np.newaxis], axis=(0, 1))
-        highest = np.max(self.ahead * tops[:, np.newaxis], axis=(0, 1)) - alpha
+        d, alpha = self.parameters.T[[0, 3]]
+        against, ahead = self.parameters.T[6:].reshape(2, 2, 2, -1)
+        tops = alpha / np.maximum(ahead.min(axis=1), TINY)
+        lowest = alpha + np.max(np.maximum(against, 0.0) * tops[::-1, np.newaxis], axis=(0, 1))
+        highest = np.max(ahead * tops[:, np.newaxis], axis=(0, 1)) - alpha
         return d - lowest, d + np.maximum(highest, 0.0)
 
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return d to d₃ and α to α₂, but zeros, and the rates, by signs if they differ."""
         names = ("d", "d2", "d3", "alpha", "alpha1", "alpha2")
         units = ("um/V", "um/V^2", "um/V^3") * 2
-        values = self.parameters[0, :6].tolist()
-        rows = zip(names, values, units, strict=True)
+        values, rates = np.split(self.parameters[0], [6])
+        rows = zip(names, values.tolist(), units, strict=True)
         slopes = {name: (value, unit) for name, value, unit in rows if value or name == "d"}
-        rates = {"against": self.parameters[0, 6:10], "ahead": self.parameters[0, 10:]}
         return slopes | {
-            name: (rate.reshape(2, 2).tolist() if self.signed else float(rate[0]), "1/V")
-            for name, rate in rates.items()
+            name: (rate.tolist() if self.signed else float(rate[0, 0]), "1/V")
+            for name, rate in zip(("against", "ahead"), rates.reshape(2, 2, 2), strict=True)
         }
 
 

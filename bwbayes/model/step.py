@@ -15,12 +15,13 @@ of what :mod:`bwbayes.model.elementwise` says.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.reversals import PIECE, monotone_stretches
+from bwbayes.shown import brief
 
 if TYPE_CHECKING:
     from bwbayes.model.operator import Span
@@ -41,12 +42,21 @@ class HysteresisStep(ABC):
 
     Voltages are in V, displacements in um, slopes in um/V, all (models,). What it remembers is an
     array (models, any).
+
+    Parameters
+    ----------
+    parameters
+        What ``move`` needs to know of the models, (models, any); ``ROW`` says what that is.
     """
 
-    @property
-    @abstractmethod
-    def parameters(self) -> FloatArray:
-        """What ``move`` needs to know of the models, (models, any)."""
+    __repr__ = brief
+
+    ROW: ClassVar = ""
+
+    parameters: FloatArray
+
+    def __init__(self, parameters: FloatArray) -> None:
+        self.parameters = parameters
 
     @staticmethod
     @abstractmethod
@@ -87,10 +97,7 @@ class OneStateStep(HysteresisStep):
     Its memory is (models, ``remembers``), zeros where it follows.
     """
 
-    @property
-    def remembers(self) -> int:
-        """How many numbers: voltage and h."""
-        return 2
+    remembers: ClassVar[int] = 2
 
     def demagnetized(self) -> FloatArray:
         """Return zero volts and h = 0."""

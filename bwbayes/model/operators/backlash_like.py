@@ -51,7 +51,7 @@ class BacklashLike(OneState):
 
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
-        return RelaxingStep.alike(column["d"], column["alpha"], column["beta"], column["beta"])
+        return RelaxingStep.of([column["d"]], [column["alpha"]], column["beta"], column["beta"])
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""

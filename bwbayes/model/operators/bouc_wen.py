@@ -126,8 +126,8 @@ class BoucWen(OneState):
         d, alpha, beta, gamma = (column[name] for name in ("d", *SHAPE[:3]))
         exponent = column.get("exponent", np.ones_like(d))
         if np.all(exponent == 1.0):
-            return RelaxingStep.alike(d, alpha, beta - gamma, beta + gamma)
-        return PowerStep(d, alpha, beta, gamma, exponent)
+            return RelaxingStep.of([d], [alpha], beta - gamma, beta + gamma)
+        return PowerStep.of(d, alpha, beta, gamma, exponent)
 
     def opening(self, column: Values, half_range: float) -> FloatArray | None:
         """Return β U for n = 1."""

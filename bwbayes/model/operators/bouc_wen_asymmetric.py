@@ -9,7 +9,7 @@ closed form, so it is as exact.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
@@ -138,12 +138,8 @@ class BoucWenAsymmetric(OneState):
     def step(self, column: Values) -> HysteresisStep:
         """Return plain Bouc-Wen hysteresis with the rates of each pair of signs."""
         pairs = [rates(column, s, x) for s, x in product(reversed(SIGNS), repeat=2)]
-        plain = RelaxingStep.alike(column["d"], column["alpha"], *pairs[0])
-        against, ahead = (
-            np.reshape([slow + sign * fast for slow, fast in pairs], plain.ahead.shape)
-            for sign in (-1.0, 1.0)
-        )
-        return replace(plain, against=against, ahead=ahead)
+        slow, fast = np.stack(pairs, axis=1)
+        return RelaxingStep.of([column["d"]], [column["alpha"]], slow - fast, slow + fast)
 
     def opening(self, column: Values, half_range: float) -> FloatArray:
         """Return β U."""

@@ -7,7 +7,7 @@ voltage. With constants for both, it is the backlash-like model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -123,10 +123,9 @@ class Duhem(OneState):
     def step(self, column: Values) -> HysteresisStep:
         """Return that of f and α."""
         nothing = np.zeros_like(column["d"])
-        names = ("d", "d2", "d3", "alpha", "alpha1", "alpha2")
-        values = np.stack([column.get(name, nothing) for name in names])
-        rate = np.broadcast_to(column["beta"], (2, 2, nothing.size))
-        return DuhemStep(values[:3], values[3:], rate, rate)
+        names = ("d", "d2", "d3"), ("alpha", "alpha1", "alpha2")
+        curve, strength = ([column.get(name, nothing) for name in group] for group in names)
+        return DuhemStep.of(curve, strength, column["beta"], column["beta"])
 
     def gain(self, column: Values, span: Span) -> FloatArray:
         """Return the mean of f′ over the span."""
@@ -145,10 +144,10 @@ class DuhemStep(RelaxingStep):
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return f′ − α(u) ∓ β h, with h on the loop over all of the limits: none is larger."""
-        rate = self.ahead[0, 0]
+        numbers = self.parameters.T[:, :, np.newaxis]
+        rate, nothing = self.parameters[:, 10], np.zeros(len(self.parameters))
         beta = np.maximum(rate, 1e-6 / (limits.high - limits.low))  # a rate may be zero
-        rates = np.broadcast_to(beta, self.ahead.shape)
-        loop, nothing = replace(self, against=rates, ahead=rates), np.zeros_like(beta)
+        loop = self.of(self.parameters.T[:3], self.parameters.T[3:6], beta, beta)
         rising = np.linspace(*limits, 1001)
         _, rise = loop.along(limits.low, nothing, rising[-1:])
         _, fall = loop.along(limits.high, nothing, rising[:1])
@@ -157,7 +156,7 @@ class DuhemStep(RelaxingStep):
         _, up = loop.along(limits.low, decay * at_high + fall[:, 0], rising)
         _, down = loop.along(limits.high, at_high, rising[::-1])
         farthest = rate[:, np.newaxis] * np.maximum(up, -down[:, ::-1])
-        d, d2, d3, alpha, alpha1, alpha2 = self.parameters.T[:6, :, np.newaxis]
+        d, d2, d3, alpha, alpha1, alpha2 = numbers[:6]
         slope = d - alpha + rising * (2 * d2 - alpha1 + rising * (3 * d3 - alpha2))
         return (slope - farthest).min(axis=1), (slope + farthest).max(axis=1)
 

@@ -46,7 +46,7 @@ class NoHysteresis(OneState):
     def step(self, column: Values) -> HysteresisStep:
         """Return d u."""
         nothing = np.zeros_like(column["d"])
-        return RelaxingStep.alike(column["d"], nothing, nothing, nothing)
+        return RelaxingStep.of([column["d"]], [nothing], nothing, nothing)
 
     def reachable(
         self, column: Values, voltage: float, span: Span

@@ -209,19 +209,13 @@ class Plays(RemembersExtrema):
         return moved
 
 
-@dataclass(frozen=True)
 class PlaysStep(HysteresisStep):
     """w = d u + Σ w_j z_j with plays z_j = max(u − r_j, min(u + r_j, z_j)); the memory are these.
 
     ``parameters`` are d, all weights w_j, um/V, and all thresholds r_j, V, (models, 1 + 2 plays).
     """
 
-    numbers: FloatArray
-
-    @property
-    def parameters(self) -> FloatArray:
-        """d, all weights, and all thresholds."""
-        return self.numbers
+    ROW: ClassVar = "d, all weights, and all thresholds"
 
     @staticmethod
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
@@ -239,7 +233,7 @@ class PlaysStep(HysteresisStep):
     @property
     def weights(self) -> FloatArray:
         """w_j, (models, plays), um/V."""
-        return self.numbers[:, 1 : 1 + self.numbers.shape[1] // 2]
+        return self.parameters[:, 1 : 1 + self.parameters.shape[1] // 2]
 
     def demagnetized(self) -> FloatArray:
         """Return all plays at zero, (models, plays)."""
@@ -247,12 +241,12 @@ class PlaysStep(HysteresisStep):
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002  # anywhere
         """Return d, and d + Σ w_j."""
-        return self.numbers[:, 0], self.numbers[:, 0] + self.weights.sum(axis=1)
+        return self.parameters[:, 0], self.parameters[:, 0] + self.weights.sum(axis=1)
 
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return d, the weights and the thresholds."""
-        d, *others = self.numbers[0].tolist()
-        weights, thresholds = others[: len(others) // 2], others[len(others) // 2 :]
+        rows = np.split(self.parameters[0], [1, 1 + self.weights.shape[1]])
+        (d,), weights, thresholds = (row.tolist() for row in rows)
         return {
             "d": (d, "um/V"), "weights": (weights, "um/V"), "thresholds": (thresholds, "V"),
         }  # fmt: skip

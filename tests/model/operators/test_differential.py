@@ -107,7 +107,7 @@ def test_any_exponent_inverts_the_hypergeometric_travel(exponent: float) -> None
     height = np.concatenate((np.geomspace(1e-8, 0.5, 40), np.linspace(0.51, 0.98, 48)))
     travel = height * hyp2f1(1.0, 1 / exponent, 1 + 1 / exponent, height**exponent) / 0.36
     d, alpha, *rest = np.array([[0.0, 0.36, 0.6 * 0.36, 0.4 * 0.36, exponent]]).T
-    _, got = PowerStep(d, alpha, *rest).along(0.0, np.zeros(1), travel)
+    _, got = PowerStep.of(d, alpha, *rest).along(0.0, np.zeros(1), travel)
     np.testing.assert_allclose(got[0], height, rtol=1e-11)
 
 
