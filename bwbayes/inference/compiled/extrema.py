@@ -1,116 +1,94 @@
 """The stage of operators that remember extrema: each brings its Everett function alone.
 
-Which branch a sample lies on is the voltage's affair alone: :func:`plan_of` says it for all models
-and the whole record at once. What is left is to remember the displacement of each model at each
-turn, in slots, and to add what :meth:`everett
-<bwbayes.model.operators.extremum_memory.RemembersExtrema.everett>` says from there on.
-
-The unknown start gives each model an extremum of its own. While the voltage stays below all of
-these, or has passed all, nothing is different; in between, models are told apart one by one.
+One model after the other, each with a stack of its own: the voltages of the extrema that still
+count, and the displacements there. What lies between two changes of that stack is one branch, whose
+samples are worked out together.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import everett
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
-__all__ = ["ExtremaPlan", "along_branches", "rows"]
+__all__ = ["along_branches", "rows"]
 
-# Columns of a plan: the slot of the extremum that a sample's branch comes from (−1: the voltage has
-# not moved yet); the direction; the extremum's voltage; the slot in which the last sample becomes
-# an extremum (0: none); whether the branch is another than the last sample's; whose extremum it is;
-# and the voltage of that two before it.
-SLOT, SIGN, TURNED, PUSH, FRESH, WHOSE, BEFORE = range(7)
-COLUMNS = 7
-
-# Whose: all models'; each has its own; of those that have passed their own it is the one before.
-SHARED, EACH_OWN, EITHER = 0.0, 1.0, 2.0
-
-# Rows: w₀, w of the last sample, the extremum of its own, how many numbers its Everett function
-# needs; then these, and w of each slot.
-FIXED = 4
-REST, LAST, OWN, COUNT, NUMBERS = (LANES * row for row in range(FIXED + 1))
+# Rows: a model's number in the plan, w₀, w of the last sample, the direction, how many extrema
+# there are; then the voltages of these, and the displacements there.
+FIXED = 5
+NUMBER, REST, LAST, SIGN, DEPTH, STACK = (LANES * row for row in range(FIXED + 1))
 
 
-class ExtremaPlan(NamedTuple):
-    """What is known beforehand: ``rows`` (samples, columns), and how many slots it takes."""
-
-    rows: FloatArray
-    slots: int
-
-    @classmethod
-    def of(cls, voltage: FloatArray, memory: Memory) -> ExtremaPlan:
-        """Look where a voltage (samples,) turns and closes loops."""
-        levels = np.array([extremum.voltage for extremum in memory.extrema])
-        owners = [i for i, extremum in enumerate(memory.extrema) if extremum.own is not None]
-        own_slot = owners[0] if owners else -1
-        lowest = float(np.min(_own(memory))) if owners else 0.0
-        return cls(*plan_of(voltage, levels, memory.direction, own_slot, lowest))
-
-
-def _own(memory: Memory) -> FloatArray:
-    """Return the extremum (models,) that each model has of its own, V, or zeros."""
-    for extremum in memory.extrema:
-        if extremum.own is not None:
-            return extremum.own
-    return np.zeros_like(memory.displacement)
+def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
+    """Return what the stage starts from, (models, rows), w₀ second; its plan are the numbers."""
+    models, extrema = memory.displacement.size, memory.extrema
+    slots = deepest(voltage, np.array([extremum.voltage for extremum in extrema]), memory.direction)
+    group = np.zeros((models, FIXED + 2 * slots))
+    group[:, 0] = np.arange(models)
+    group[:, 1] = group[:, 2] = memory.displacement
+    group[:, 3], group[:, 4] = memory.direction, len(extrema)
+    for slot, (level, displacement, own) in enumerate(extrema, FIXED):
+        group[:, slot] = level if own is None else own
+        group[:, slots + slot] = displacement
+    return group
 
 
 @njit(nogil=True, cache=True)
-def plan_of(
-    voltage: FloatArray, levels: FloatArray, direction: float, own_slot: int, lowest: float
-) -> tuple[FloatArray, int]:
-    """Return the plan (samples, columns), and the number of slots.
+def deepest(voltage: FloatArray, levels: FloatArray, direction: float) -> int:
+    """Return how many extrema are remembered at most: the largest ones that models have, at first.
 
-    ``levels`` are the extrema at the first sample, V, that in ``own_slot`` (−1: none) being the
-    largest of those that models have of their own, and ``lowest`` the lowest.
+    A lower one is forgotten earlier.
     """
-    plan = np.zeros((voltage.size, COLUMNS))
     stack = np.empty(levels.size + voltage.size)
     stack[: levels.size] = levels
-    depth, slots = levels.size, levels.size
-    plan[0, SLOT] = -1.0
+    depth = slots = levels.size
     for t in range(1, voltage.size):
-        u = voltage[t]
-        step = u - voltage[t - 1]
-        if step == 0.0:
-            plan[t] = plan[t - 1]
-            plan[t, PUSH] = plan[t, FRESH] = 0.0
+        s = np.sign(voltage[t] - voltage[t - 1])
+        if s == 0.0:
             continue
-        s = 1.0 if step > 0.0 else -1.0
         if s == -direction:
             stack[depth] = voltage[t - 1]
-            plan[t, PUSH] = depth
             depth += 1
             slots = max(slots, depth)
         direction = s
-        while depth > 1:
-            closing = stack[depth - 2] if depth > 2 else -stack[1]
-            if s * u < s * closing:
-                break
-            depth -= 2 if depth > 2 else 1
-        if own_slot >= depth:
-            own_slot = -1
-        slot = depth - 1
-        plan[t, SLOT] = slot
-        plan[t, SIGN] = s
-        plan[t, TURNED] = stack[slot]
-        if own_slot > 0 and slot == own_slot:
-            plan[t, WHOSE] = EACH_OWN
-        elif own_slot > 0 and slot == own_slot + 1 and u >= lowest:
-            plan[t, WHOSE] = EITHER
-        same = plan[t - 1, SLOT] == slot and plan[t - 1, WHOSE] == plan[t, WHOSE]
-        plan[t, FRESH] = 0.0 if same and plan[t, PUSH] == 0.0 else 1.0
-        # For those that have passed their own: where their branch comes from.
-        plan[t, BEFORE] = stack[slot - 2] if plan[t, WHOSE] == EITHER else 0.0
-    return plan, slots
+        depth = _remaining(stack, depth, s, voltage[t])
+    return slots
+
+
+@njit(nogil=True, cache=True)
+def _closing(stack: FloatArray, depth: int, s: float) -> float:
+    """Return the voltage at which the branch from the last extremum is forgotten, V, times s.
+
+    As :meth:`RemembersExtrema.advance` has it.
+    """
+    if depth == 1:
+        return np.inf
+    return s * (stack[depth - 2] if depth > 2 else -stack[1])
+
+
+@njit(nogil=True, cache=True)
+def _remaining(stack: FloatArray, depth: int, s: float, u: float) -> int:
+    """Return how many extrema remain once a voltage has come to u in direction s."""
+    while s * u >= _closing(stack, depth, s):
+        depth -= 2 if depth > 2 else 1
+    return depth
+
+
+@njit(nogil=True, cache=True)
+def _ends(voltage: FloatArray, first: int, last: int) -> IntArray:
+    """Return, for samples ``first`` to ``last`` that the voltage moves to, where it turns next."""
+    ends = np.full(last - first, last)
+    direction, following = 0.0, last
+    for t in range(last - 1, max(first, 1) - 1, -1):
+        s = np.sign(voltage[t] - voltage[t - 1])
+        if s != 0.0:
+            ends[t - first] = ends[following - first] if s == direction else following
+            direction, following = s, t
+    return ends
 
 
 @njit(nogil=True, cache=True)
@@ -124,83 +102,53 @@ def along_branches(
     out: FloatArray,
 ) -> None:
     """Write w − w₀ of samples ``first`` to ``last`` to ``out`` and move the memory on."""
-    count, w = int(group[COUNT]), np.empty(last - first)
-    numbers, slots = np.empty(count), NUMBERS + count * LANES
-    begin = first
-    while begin < last:
-        # As far as the branch is the same.
-        end = begin + 1
-        while end < last and plan[end, FRESH] == 0.0:
-            end += 1
-        base = slots + int(plan[begin, SLOT]) * LANES
-        pushed = slots + int(plan[begin, PUSH]) * LANES
-        for i in range(LANES):
-            for k in range(count):
-                numbers[k] = group[NUMBERS + k * LANES + i]
-            if pushed > slots:
-                group[pushed + i] = group[LAST + i]
-            if base < slots:
-                w[: end - begin] = group[LAST + i]
-            else:
-                own = group[OWN + i] if plan[begin, WHOSE] == EACH_OWN else plan[begin, TURNED]
-                _branch(operator, numbers, group[base + i], own, plan[begin], voltage[begin:end], w)
-            if plan[begin, WHOSE] == EITHER:
-                _either(operator, numbers, group, base + i, i, plan[begin], voltage[begin:end], w)
-            group[LAST + i] = w[end - begin - 1]
-            for t in range(begin, end):
-                out[(t - first) * LANES + i] = w[t - begin] - group[REST + i]
-        begin = end
+    slots = (group.size // LANES - FIXED) // 2
+    w, ends = np.empty(last - first), _ends(voltage, first, last)
+    for i in range(LANES):
+        numbers, stack = plan[int(group[NUMBER + i])], group[STACK + i :: LANES]
+        here, direction, depth = group[LAST + i], group[SIGN + i], int(group[DEPTH + i])
+        begin = first
+        while begin < last:
+            before, u = voltage[max(begin - 1, 0)], voltage[begin]
+            s = np.sign(u - before)
+            if s == 0.0:
+                w[begin - first] = here
+                begin += 1
+                continue
+            if s == -direction:
+                stack[depth], stack[slots + depth] = before, here
+                depth += 1
+            direction = s
+            depth = _remaining(stack, depth, s, u)
+            closing, end = _closing(stack, depth, s), ends[begin - first]
+            if s * voltage[end - 1] >= closing:
+                end = begin + 1
+                while s * voltage[end] < closing:
+                    end += 1
+            turned, level = stack[depth - 1], stack[slots + depth - 1]
+            branch = w[begin - first : end - first]
+            _branch(operator, numbers, turned, level, s, depth, voltage[begin:end], branch)
+            here, begin = branch[-1], end
+        group[LAST + i], group[SIGN + i], group[DEPTH + i] = here, direction, depth
+        for t in range(last - first):
+            out[t * LANES + i] = w[t] - group[REST + i]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _branch(
     operator: RemembersExtrema,
     numbers: FloatArray,
-    level: float,
     turned: float,
-    plan: FloatArray,
+    level: float,
+    s: float,
+    depth: int,
     voltage: FloatArray,
     w: FloatArray,
 ) -> None:
-    """Write w along a branch from an extremum with a displacement ``level`` on."""
-    s = plan[SIGN]
-    if plan[SLOT] == 0.0:
-        # The first curve is half a branch from the mirrored voltage on.
+    """Write w along a branch from an extremum on; along the first one it moves half as far."""
+    if depth == 1:
         for t in range(voltage.size):
-            u = voltage[t]
-            w[t] = level + 0.5 * s * everett(operator, numbers, -u, u)
+            w[t] = level + 0.5 * s * everett(operator, numbers, -voltage[t], voltage[t])
     else:
         for t in range(voltage.size):
             w[t] = level + s * everett(operator, numbers, turned, voltage[t])
-
-
-@njit(nogil=True, cache=True)
-def _either(
-    operator: RemembersExtrema,
-    numbers: FloatArray,
-    group: FloatArray,
-    place: int,
-    lane: int,
-    plan: FloatArray,
-    voltage: FloatArray,
-    w: FloatArray,
-) -> None:
-    """Go on from the extremum before its own once a model has come back to that."""
-    for t in range(voltage.size):
-        u = voltage[t]
-        if u >= group[OWN + lane]:
-            moved = everett(operator, numbers, plan[BEFORE], u)
-            w[t] = group[place - 2 * LANES] + moved
-            group[OWN + lane], group[place - LANES] = u, w[t]
-
-
-def rows(numbers: FloatArray, plan: ExtremaPlan, memory: Memory) -> FloatArray:
-    """Return what the stage starts from, (models, rows), w₀ first."""
-    extrema = len(memory.extrema)
-    group = np.zeros((len(numbers), FIXED + numbers.shape[1] + max(plan.slots, extrema)))
-    group[:, 0] = group[:, 1] = memory.displacement
-    group[:, 2], group[:, 3] = _own(memory), numbers.shape[1]
-    group[:, FIXED : FIXED + numbers.shape[1]] = numbers
-    for slot, extremum in enumerate(memory.extrema, FIXED + numbers.shape[1]):
-        group[:, slot] = extremum.displacement
-    return group

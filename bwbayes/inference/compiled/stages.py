@@ -48,9 +48,8 @@ class Stage(NamedTuple):
 def prepared(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage | None:
     """Return the stage of an operator's models; None if that is left to NumPy."""
     if isinstance(operator, RemembersExtrema):
-        plan = extrema.ExtremaPlan.of(voltage, memory)
-        group = extrema.rows(operator.numbers(column), plan, memory)
-        return Stage(operator, memory.displacement, group, plan.rows)
+        group = extrema.rows(voltage, memory)
+        return Stage(operator, memory.displacement, group, operator.numbers(column))
     if type(operator).step is Operator.step:
         return None
     step = operator.step(column)
