@@ -67,7 +67,8 @@ def _closing(stack: FloatArray, depth: int, s: float) -> float:
     """
     if depth == 1:
         return np.inf
-    return s * (stack[depth - 2] if depth > 2 else -stack[1])
+    closing: float = stack[depth - 2] if depth > 2 else -stack[1]
+    return s * closing
 
 
 @njit(nogil=True, cache=True)
