@@ -75,7 +75,7 @@ class _Plan:
     def displacements(self, voltage: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
         """Yield some draws at a time, and their displacement (draws, samples), um."""
         states = self.initial_states(voltage)
-        size = max(2_000_000 // voltage.size, 1)
+        size = max(500_000 // voltage.size, 1)
         for start in range(0, len(states.model), size):
             rows = slice(start, start + size)
             names = ("which", "model", "unrest", "offset_sd")
@@ -98,18 +98,16 @@ class _Plan:
         theta = self.posterior.prior.theta(self.draws)
         theta = self.posterior.noise_of_new(theta, np.random.default_rng(len(theta)))
         noise, rng = self.posterior.only.noise.at(self.reference.interval), self.rng()
-        rms, largest = np.empty((2, 2, len(theta)))
-        squares = np.zeros(2)
+        rms, largest, squares = np.empty((3, len(theta), 2))
         for rows, displacement in self.displacements(voltage):
-            for row, values in enumerate(displacement, rows.start):
-                squares += np.mean((values - self.references) ** 2, axis=1)
-                discrepancy = noise.draw(theta[row : row + 1], values.size, rng)[0]
-                errors = values + discrepancy - self.references
-                rms[:, row] = np.sqrt(np.mean(errors**2, axis=1))
-                largest[:, row] = np.max(np.abs(errors), axis=1)
-        expected = np.sqrt(squares / len(theta)).tolist()
-        smoothed = Errors(rms[1], largest[1], expected[1])
-        return Played(rms[0], largest[0], expected[0], voltage, bands, smoothed)
+            errors = displacement[:, np.newaxis] - self.references
+            squares[rows] = np.mean(errors**2, axis=2)
+            errors += noise.draw_all(theta[rows], voltage.size, rng)[0][:, np.newaxis]
+            rms[rows] = np.sqrt(np.mean(errors**2, axis=2))
+            largest[rows] = np.max(np.abs(errors), axis=2)
+        expected = np.sqrt(np.mean(squares, axis=0)).tolist()
+        smoothed = Errors(rms[:, 1], largest[:, 1], expected[1])
+        return Played(rms[:, 0], largest[:, 0], expected[0], voltage, bands, smoothed)
 
 
 def compensate(
@@ -133,8 +131,7 @@ def compensate(
     posterior, draws
         The posterior of one record, and draws (draws, free) from it, parameters in their own units.
     reference
-        What the displacement is to be. 0 um is where the actuator stands at zero volts as the
-        command begins; a reference that begins elsewhere gets a way from there before it.
+        What the displacement is to be.
     generator
         Draws the starts and the discrepancy.
     command
@@ -143,16 +140,11 @@ def compensate(
         is slow enough not to show its dynamics, that is where the expected squared error, to the
         reference as smoothed, is least; it is taken only if it is less.
     hold
-        What the command does between samples, whatever the record's voltage did: ``"zero"``, it is
-        held, as a DAC does, and the voltage of a sample is the one that brings the displacement to
-        the reference at the next sample, just before it changes; ``"first"``, it goes in straight
-        lines.
-    from_rest
-        The actuator starts demagnetized; otherwise it has waited at zero volts until it stood
-        still, in a state of its hysteresis that nothing tells.
-    limits, nearest
-        The amplifier's, and whether to come as near as they allow; see
-        :func:`~bwbayes.model.inverse.chain.inverse`.
+        ``"zero"``: the voltage of a sample brings the displacement to the reference at the next
+        sample, just before it changes; ``"first"``: it goes in straight lines.
+    from_rest, limits, nearest
+        As of :func:`~bwbayes.model.inverse.chain.inverse`. Otherwise the actuator has waited at
+        zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
         Of the tracking error, um.
     remarks
@@ -180,7 +172,9 @@ def compensate(
     seed = int(generator.integers(2**62))
     plan = _Plan(posterior, draws, reference, Start(from_rest, False, settled=True), hold, seed)
     requested, target = plan.references
-    linear = _linear(posterior, requested, limits)
+    record = posterior.only
+    slope, _ = np.polyfit(record.voltage[record.readings.rows], record.readings.values, 1)
+    linear = np.clip(requested / slope, limits.low, limits.high)
     states = plan.initial_states(linear)
     actuator, model = states.actuators[-1], states.model.mean(axis=0)
     # The mean model's own place at zero volts, where all begin, is not the mean of the places.
@@ -215,25 +209,11 @@ def compensate(
             f"between samples the displacement leaves a straight line by up to {between:.3g} um, "
             "more than the rms error at them; choose a shorter sampling interval"
         )
+    remarks = (*remarks, *notes)
+    straight = plan.played(linear)
     return Compensation(
-        reference,
-        command,
-        played,
-        plan.played(linear),
-        hold,
-        between,
-        from_rest,
-        limit,
-        (*remarks, *notes),
+        reference, command, played, straight, hold, between, from_rest, limit, remarks
     )
-
-
-def _linear(posterior: Posterior, reference: FloatArray, limits: Limits) -> FloatArray:
-    """Return the voltage for a reference by the slope of a line through the fitted readings."""
-    record = posterior.only
-    rows = record.readings.rows
-    slope, _ = np.polyfit(record.voltage[rows], record.readings.values, 1)
-    return np.asarray(np.clip(reference / slope, limits.low, limits.high))
 
 
 def _between(actuator: Actuator, model: FloatArray, voltage: FloatArray, from_rest: bool) -> float:
@@ -258,6 +238,7 @@ def _notes(
     limits: Limits,
     nearest: bool,
 ) -> list[str]:
+    """Return what is to be said of a reference that was changed, and of limits that were met."""
     notes = []
     if reference.approach > 0:
         begins = reference.given[round(reference.approach / reference.interval)]

@@ -199,16 +199,28 @@ class Noise(ABC):
         self, theta: FloatArray, samples: int, generator: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Draw the discrepancy and the sensor's noise, (samples,), um, at one θ (1, parameters)."""
-        (kept,), (fresh,) = self.transition(theta), self.fresh(theta)
-        values, vectors = np.linalg.eigh(fresh[: self.states, : self.states])
-        scores = generator.standard_normal((self.states, samples))
-        shocks = np.zeros((2, samples))
-        shocks[: self.states] = (vectors * np.sqrt(np.maximum(values, 0))) @ scores
-        shocks[: self.states, 0] = self.marginal_sd(theta)[0] * scores[:, 0]
-        bottom = (1.0, -np.trace(kept), np.linalg.det(kept))
-        discrepancy = scipy.signal.lfilter((1.0, -kept[1, 1]), bottom, shocks[0])
-        discrepancy += scipy.signal.lfilter((0.0, kept[0, 1]), bottom, shocks[1])
-        return discrepancy, theta[0, 0] * generator.standard_normal(samples)
+        (discrepancy,), (sensor,) = self.draw_all(theta, samples, generator)
+        return discrepancy, sensor
+
+    def draw_all(
+        self, theta: FloatArray, samples: int, generator: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw the same at each θ (models, parameters), (models, samples), as one by one."""
+        kept, fresh = self.transition(theta), self.fresh(theta)
+        states, sds = slice(0, self.states), self.marginal_sd(theta)[0]
+        scores = generator.standard_normal((len(theta), self.states + 1, samples))
+        values, vectors = np.linalg.eigh(fresh[:, states, states])
+        shocks = np.zeros((len(theta), 2, samples))
+        scales = np.sqrt(np.maximum(values, 0))[:, np.newaxis]
+        shocks[:, states] = (vectors * scales) @ scores[:, states]
+        shocks[:, states, 0] = sds[:, np.newaxis] * scores[:, states, 0]
+        discrepancy = np.empty((len(theta), samples))
+        for model, f in enumerate(kept):
+            bottom = (1.0, -np.trace(f), np.linalg.det(f))
+            first = scipy.signal.lfilter((1.0, -f[1, 1]), bottom, shocks[model, 0])
+            second = scipy.signal.lfilter((0.0, f[0, 1]), bottom, shocks[model, 1])
+            discrepancy[model] = first + second
+        return discrepancy, theta[:, :1] * scores[:, -1]
 
 
 def _predicted(
