@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from textwrap import wrap
 from typing import Any
@@ -113,7 +114,17 @@ class Exported:
             },
             "sections": {
                 "unit": "um of displacement for a um of drive, both from rest",
-                "recursions": self._sections,
+                "recursions": [
+                    {
+                        "what": "creep" if number else "dynamics",
+                        "numerator": numerator,
+                        "denominator": denominator,
+                        "gain": gain,
+                    }
+                    for number, (numerator, denominator, gain) in enumerate(
+                        zip(*(taps[0].tolist() for taps in self.model.sections), strict=True)
+                    )
+                ],
             },
             "state_space": {
                 "unit": "um of displacement for a um of drive, both from rest",
@@ -133,7 +144,8 @@ class Exported:
             keep_trailing_newline=True,
             finalize=lambda value: to_c_number(value) if isinstance(value, float) else value,
         )
-        environment.filters["plain"] = _plain
+        # What ends no comment of C.
+        environment.filters["plain"] = partial(re.sub, r"[^\w .,:;=+()%-]", "_", flags=re.ASCII)
         actuator, step = self.model.actuator, self.model.step
         remembered = step.demagnetized()[0].tolist()
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
@@ -162,19 +174,6 @@ class Exported:
         return next((name for name, operator in HYSTERESIS.items() if operator is kind), path)
 
     @property
-    def _sections(self) -> list[dict[str, Any]]:
-        sections = zip(*(values[0].tolist() for values in self.model.sections), strict=True)
-        return [
-            {
-                "what": "creep" if number else "dynamics",
-                "numerator": numerator,
-                "denominator": denominator,
-                "gain": gain,
-            }
-            for number, (numerator, denominator, gain) in enumerate(sections)
-        ]
-
-    @property
     def _gain(self) -> dict[str, float] | None:
         gain = self.model.actuator.gain
         if gain is None or not gain.reference.half > 0:
@@ -193,20 +192,10 @@ def exported(
     limits: Span,
     sds: Mapping[str, float] | None = None,
 ) -> Exported:
-    """Return a model that is ready for a controller.
+    """Return a model with parameters θ (parameters,) that is ready for a controller.
 
-    Parameters
-    ----------
-    name
-        What it is called.
-    actuator
-        Parts, hold and the controller's sampling interval.
-    theta
-        (parameters,), the columns and their units as in ``actuator.declarations``.
-    limits
-        The voltages that its inverse may give, V.
-    sds
-        Standard deviations of its parameters, by name.
+    The actuator has parts, hold and the controller's sampling interval; the others are those of
+    :class:`Exported`.
 
     Raises
     ------
@@ -225,8 +214,3 @@ def exported(
     except InputError as error:
         without_inverse = str(error)
     return Exported(name, model, limits, sds or {}, without_inverse)
-
-
-def _plain(text: str) -> str:
-    """Return a text that ends no comment of C."""
-    return re.sub(r"[^\w .,:;=+()%-]", "_", text, flags=re.ASCII)

@@ -18,6 +18,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.linear import Taps
 from bwbayes.model.operator import Span
 from bwbayes.model.step import Gone, HysteresisStep
 from bwbayes.shown import brief
@@ -26,7 +27,6 @@ __all__ = [
     "BISECTION_ROUNDS",
     "NEWTON_ROUNDS",
     "SampledModel",
-    "SampledSections",
     "SteppedState",
     "require_inverse",
     "resolution",
@@ -35,17 +35,6 @@ __all__ = [
 # Rounds of the inverse at most: Newton's rule needs a few; if it fails, bisection goes on to the
 # last bit of a voltage.
 NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
-
-
-class SampledSections(NamedTuple):
-    """Linear recursions side by side: taps (models, sections, 3) and gains (models, sections).
-
-    The first is that of the dynamics, the others are the lags of the creep.
-    """
-
-    numerator: FloatArray
-    denominator: FloatArray
-    gains: FloatArray
 
 
 class SteppedState(NamedTuple):
@@ -87,7 +76,7 @@ class SampledModel:
     actuator: Actuator
     column: dict[str, FloatArray]
     step: HysteresisStep
-    sections: SampledSections
+    sections: Taps
 
     @classmethod
     def of(cls, actuator: Actuator, theta: FloatArray) -> Self:
@@ -99,7 +88,7 @@ class SampledModel:
             The hysteresis has no step of bounded time.
         """
         column = {name: values.copy() for name, values in actuator.columns(theta).items()}
-        sections = SampledSections(*actuator.sections(column).taps)
+        sections = actuator.sections(column).taps
         return cls(actuator, column, actuator.hysteresis.step(column), sections)
 
     @property

@@ -285,12 +285,8 @@ def track(
         Parts and the controller's interval; the voltage is held.
     theta, noise
         (draws, parameters): the actuators that are simulated, and what each has beside them.
-    stand
-        The test stand.
-    generator
-        Source of discrepancy and sensor noise.
-    robustness
-        The margins that all draws must keep.
+    stand, generator, robustness
+        The test stand, the source of discrepancy and sensor noise, and the margins to keep.
     frequencies
         Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
         leave 71 % of a sine, or to a tenth of the samples.
@@ -338,19 +334,9 @@ def track(
     ]
     rms, largest, limited = (np.stack(values, axis=1) for values in zip(*errors, strict=True))
     return Tracking(
-        gains,
-        margins,
-        robustness,
-        stand,
-        frequencies,
-        signals,
-        center,
-        amplitude,
-        rise * actuator.interval,
-        rms,
-        largest,
-        limited,
-    )
+        gains, margins, robustness, stand, frequencies, signals, center, amplitude,
+        rise * actuator.interval, rms, largest, limited,
+    )  # fmt: skip
 
 
 def _reach(mean: SampledModel, limits: Span) -> Span:

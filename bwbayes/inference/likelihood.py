@@ -189,7 +189,8 @@ class Likelihood:
 
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
-        gain = self.actuator.typical_slope(self.table.actuator(theta), self.voltage)
+        column = self.actuator.columns(self.table.actuator(theta))
+        gain = self.actuator.hysteresis.gain(column, self.actuator.range_of(self.voltage))
         sd = np.repeat((gain * self.half_range)[:, np.newaxis], self.unknowns, axis=1)
         if self.offset_sd:
             sd[:, 0] = self.offset_sd

@@ -203,12 +203,6 @@ class Actuator:
         result += (level + column["offset"])[:, np.newaxis]
         return result, State(hysteresis, equilibrium, filtered)
 
-    def hysteretic(self, theta: FloatArray, voltage: FloatArray, *, from_rest: bool) -> FloatArray:
-        """Return what the operator makes of a record's voltage, (models, samples), um."""
-        column = self.columns(theta)
-        memory = self.begin(column, voltage, from_rest=from_rest)
-        return self.hysteresis.advance(column, voltage, memory)[0]
-
     def _drives(
         self, column: Values, path: FloatArray, memory: Any
     ) -> tuple[list[FloatArray], Any]:
@@ -221,24 +215,21 @@ class Actuator:
         crept = self.creep.drive(column, drive, path)
         return [drive, *(crept.copy() for _ in self.creep.times)], after
 
-    def typical_slope(self, theta: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return a typical slope (models,) of the drive within a voltage's range, um/V."""
-        return self.hysteresis.gain(self.columns(theta), self._span(voltage))
-
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return the columns (models,) of θ (models, parameters) by name."""
         return dict(zip(self.parameters, theta.T, strict=True))
 
     def begin(self, column: Mapping[str, FloatArray], path: FloatArray, *, from_rest: bool) -> Any:
         """Return the operator's memory at the first sample of a record."""
-        span = self._span(path)
+        span = self.range_of(path)
         return self.hysteresis.begin(column, float(path[0]), span, from_rest=from_rest)
 
     def within(self, voltage: FloatArray) -> Actuator:
         """Return the actuator with a span; by default the range of a whole record's voltage."""
-        return replace(self, span=self._span(voltage))
+        return replace(self, span=self.range_of(voltage))
 
-    def _span(self, voltage: FloatArray) -> Span:
+    def range_of(self, voltage: FloatArray) -> Span:
+        """Return the voltages that earlier drives may have had, V."""
         return self.span or Span(float(np.min(voltage)), float(np.max(voltage)))
 
     def check(self, column: Mapping[str, FloatArray]) -> None:

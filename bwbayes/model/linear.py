@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import reduce
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -27,6 +28,7 @@ __all__ = [
     "Hold",
     "Recursion",
     "Sections",
+    "Taps",
     "first_order_lag",
     "no_dynamics",
     "parse_hold",
@@ -42,9 +44,6 @@ ComplexArray = NDArray[np.complex128]
 
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
-
-# Stands for a first tap of zero.
-TINY = 1e-100
 
 
 def parse_hold(name: str) -> Hold:
@@ -107,6 +106,17 @@ class Recursion:
         return responses
 
 
+class Taps(NamedTuple):
+    """Taps (models, sections, 3) and gains (models, sections) of recursions side by side.
+
+    The first is that of the dynamics, the others are the lags of the creep.
+    """
+
+    numerator: FloatArray
+    denominator: FloatArray
+    gains: FloatArray
+
+
 @dataclass(frozen=True)
 class Sections:
     """Recursions side by side: x = Σ gainᵢ Fᵢ[wᵢ], for a batch of models.
@@ -124,30 +134,25 @@ class Sections:
         return sum(recursion.unknowns for recursion in self.recursions)
 
     @property
-    def taps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Numerators and denominators (models, sections, 3), and gains (models, sections)."""
+    def taps(self) -> Taps:
+        """The taps of all recursions."""
         taps = np.zeros((2, self.gains[0].size, len(self.gains), 3))
         for number, recursion in enumerate(self.recursions):
             taps[0, :, number, : recursion.numerator.shape[1]] = recursion.numerator
             taps[1, :, number, : recursion.denominator.shape[1]] = recursion.denominator
-        return taps[0], taps[1], np.stack(self.gains, axis=1)
+        return Taps(taps[0], taps[1], np.stack(self.gains, axis=1))
 
     @property
     def zeros(self) -> ComplexArray:
-        """Zeros (models, any) from one drive to x: the inverse has them for poles."""
-        total = np.zeros((1, 1))
-        for number, gain in enumerate(self.gains):
-            product = gain[:, np.newaxis] * self.recursions[number].numerator
-            for other in self.recursions[:number] + self.recursions[number + 1 :]:
-                product = _multiplied(product, other.denominator)
-            total = total + product
-        # A drive that is held has no first tap.
-        total = total[:, int(np.argmax(total.any(axis=0))) :]
-        first = np.where(total[:, :1] == 0, TINY, total[:, :1])
-        companions = np.zeros((len(total), total.shape[1] - 1, total.shape[1] - 1))
-        companions[:, :1] = (-total[:, 1:] / first)[:, np.newaxis]
-        companions[:, 1:, :-1] = np.eye(companions.shape[1])[1:, 1:]
-        return np.asarray(np.linalg.eigvals(companions), dtype=np.complex128)
+        """Zeros (any,) from one drive to x, of all models: the inverse has them for poles."""
+        zeros = []
+        for tops, bottoms, gains in zip(*self.taps, strict=True):
+            total = np.zeros(1)
+            for number, top in enumerate(tops):
+                others = np.delete(bottoms, number, axis=0)
+                total = np.polyadd(total, reduce(np.polymul, others, gains[number] * top))
+            zeros.append(np.roots(total))
+        return np.concatenate(zeros).astype(np.complex128)
 
     def begin(self, unrest: FloatArray | None) -> tuple[FloatArray, ...]:
         """Return the states of sections that are ``unrest`` (models, unknowns) away from rest."""
@@ -179,14 +184,6 @@ class Sections:
             gain[:, None, None] * recursion.free_responses(samples) for recursion, gain in parts
         ]
         return np.concatenate(responses, axis=1)
-
-
-def _multiplied(first: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the products of polynomials (models, taps)."""
-    result = np.zeros((len(first), first.shape[1] + other.shape[1] - 1))
-    for shift in range(other.shape[1]):
-        result[:, shift : shift + first.shape[1]] += first * other[:, shift : shift + 1]
-    return result
 
 
 def no_dynamics(models: int, hold: Hold) -> Recursion:

@@ -87,7 +87,8 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     actuator = cases.actuator(name, hold)
     theta, voltage = cases.theta(actuator, 1, name), cases.drive(800)
     column = actuator.columns(theta)
-    w = actuator.hysteretic(theta, voltage, from_rest=True)
+    memory = actuator.begin(column, voltage, from_rest=True)
+    w = actuator.hysteresis.advance(column, voltage, memory)[0]
     if actuator.gain is not None:
         w = w + actuator.gain.displacement(column, voltage)
     inputs = [w[0]]

@@ -24,9 +24,11 @@ def test_slopes_lie_within_their_bounds(name: str) -> None:
     path = np.concatenate(
         [voltage, np.linspace(voltage[-1], 100, 300), np.linspace(100, -100, 300)]
     )
-    w = actuator.hysteretic(theta, path, from_rest=True)
+    column = actuator.columns(theta)
+    memory = actuator.begin(column, path, from_rest=True)
+    w = actuator.hysteresis.advance(column, path, memory)[0]
     if actuator.gain is not None:
-        w = w + actuator.gain.displacement(actuator.columns(theta), path)
+        w = w + actuator.gain.displacement(column, path)
     moves = np.diff(path) != 0
     slopes = np.diff(w)[:, moves] / np.diff(path)[moves]
     assert (slopes >= least[:, np.newaxis] - 1e-9).all()

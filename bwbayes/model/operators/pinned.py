@@ -50,8 +50,14 @@ WEAKEST, STRONGEST = 1e-3, 0.98
 class Pinned(OneState):
     """Hysteresis by pinned walls, with an error below 1e-6 of the range.
 
-    P_an = P_s L((u + a P)/E₀), as :class:`JilesAtherton` and :class:`DomainWall` say in full.
-    Parameters are
+    The displacement P in um follows the voltage u in V, to which the field is proportional, by
+
+        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
+        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
+
+    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
+    s. L is what the walls would follow without pinning, E₀ in V the scale of the field, and a P in
+    V the field that the displacement itself makes (a in V/um). Parameters are
 
     - d = P_s L′(0) / (E₀ (1 − η)), the slope of the anhysteretic displacement at zero, um/V,
     - P_s, the displacement at saturation, um,
@@ -244,18 +250,7 @@ def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
 
 @dataclass(frozen=True)
 class JilesAtherton(Pinned):
-    """Jiles-Atherton hysteresis, with L(y) = coth y − 1/y and an error below 1e-6 of the range.
-
-    The displacement P in um follows the voltage u in V, by
-
-        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
-        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
-
-    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
-    s. P_s in um is the displacement at saturation, E₀ in V the scale of the field, a P in V the
-    field that the displacement itself makes (a in V/um), k in V the pinning, and c the reversible
-    part. In place of E₀ and a, the parameters are the slope d = P_s L′(0) / (E₀ (1 − η)) in um/V
-    and the coupling η = a P_s L′(0) / E₀, with L′(0) = 1/3.
+    """Jiles-Atherton hysteresis: :class:`Pinned` with L(y) = coth y − 1/y, L′(0) = 1/3.
 
     Notes
     -----
@@ -268,18 +263,7 @@ class JilesAtherton(Pinned):
 
 @dataclass(frozen=True)
 class DomainWall(Pinned):
-    """Domain wall hysteresis, with L(y) = tanh y and an error below 1e-6 of the range.
-
-    The displacement P in um follows the voltage u in V, to which the field is proportional, by
-
-        P_an = P_s tanh((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
-        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
-
-    with s the voltage's direction, and P_irr constant where P_an − P_irr does not have the sign of
-    s. P_s in um is the displacement at saturation, E₀ in V the scale of the field, a P in V the
-    field that the displacement itself makes (a in V/um), k in V the pinning, and c the reversible
-    part. In place of E₀ and a, the parameters are the slope d = P_s L′(0) / (E₀ (1 − η)) in um/V
-    and the coupling η = a P_s L′(0) / E₀, with L′(0) = 1.
+    """Domain wall hysteresis: :class:`Pinned` with L(y) = tanh y, L′(0) = 1.
 
     Notes
     -----

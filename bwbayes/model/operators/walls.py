@@ -1,14 +1,10 @@
 """The equation of pinned walls along a rising voltage, and what integrates it.
 
-The displacement P in um follows the voltage u in V by
-
-    P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
-    dP_irr/du = (P_an − P_irr) / (k − a (P_an − P_irr))   where P_an > P_irr,
-
-and P_irr stays elsewhere. There, P follows from an implicit equation, which is solved to rounding;
-from where P_an reaches P_irr, which is known in closed form, an implicit method of order five
-(:mod:`~bwbayes.model.operators.rosenbrock`) takes over, with steps of its own for each model: walls
-that are hardly pinned follow P_an within a voltage k that is small against all others.
+It is that of :class:`~bwbayes.model.operators.pinned.Pinned`. Where P_an is below P_irr, P follows
+from an implicit equation, which is solved to rounding; from where they meet, which is known in
+closed form, an implicit method of order five (:mod:`~bwbayes.model.operators.rosenbrock`) takes
+over, with steps of its own for each model: walls that are hardly pinned follow P_an within a
+voltage k that is small against all others.
 
 All is written once, of what :mod:`bwbayes.model.elementwise` says: for arrays of models, and
 compiled for one. ``spins`` says which curve L is: tanh, or that of Langevin.
