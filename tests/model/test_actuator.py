@@ -16,8 +16,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.linear import Hold
+from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.registry import DYNAMICS
-from tests.model.operators.slow import Model, assert_close, by_samples, random_walk
+from tests.model.operators.slow import Model, assert_close, random_walk
 
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 # The paper's Table 1 in the package's units, with a mass that lets the second order ring.
@@ -64,7 +65,7 @@ def simulate(actuator: Actuator, theta: FloatArray, voltage: FloatArray) -> Floa
     """Follow one model sample by sample, with a Runge-Kutta integrator inside each interval."""
     value = dict(zip(actuator.parameters, theta.tolist(), strict=True))
     model = Model(value["alpha"], value["beta"], value["gamma"], value["exponent"])
-    drive = value["d"] * voltage - by_samples(voltage, model, value["initial"])
+    drive = value["d"] * voltage - hysteresis(voltage, *model, initial=value["initial"])[0]
     if actuator.dynamics == "none":
         # A held drive changes just after the sample.
         drive = drive if actuator.hold == "first" else np.concatenate([drive[:1], drive[:-1]])

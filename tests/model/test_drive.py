@@ -44,11 +44,6 @@ def test_sine_turns_twice_a_period_noise_or_not(frequency: float, noise: float) 
     assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.5 / frequency, rel=0.15)
 
 
-def test_noise_would_turn_the_voltage_hundreds_of_times() -> None:
-    """The twin: without the least return, the noise of a measured voltage makes the times."""
-    assert turning_points(sine(noise=0.3), 1e-9).size > 1000
-
-
 @given(
     every=st.integers(1, 20),
     frequency=st.floats(0.2, 2.0),

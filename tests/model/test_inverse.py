@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -192,24 +191,6 @@ def test_a_displacement_that_begins_in_motion_is_missed_at_its_beginning_alone()
     voltage = assert_returned(actuator, theta, reference, first=2)
     missed = actuator.displacement(theta, voltage[0])[0] - reference
     assert abs(missed[1]) > 1e-3
-
-
-def test_without_dynamics_the_inverse_is_a_search_for_each_sample() -> None:
-    """A slow twin: Brent's method for one sample after the other, with the state carried on."""
-    actuator = Actuator("none", "first", 1e-3, gain=PolynomialGain(reference=SPAN), span=SPAN)
-    theta = theta_of(actuator)
-    reference = smooth(120)
-    state, expected = None, []
-    for asked in reference:
-
-        def off(u: float, asked: float = asked, before: object = state) -> float:
-            moved = actuator.advance(theta, [u], before, from_rest=True)  # type: ignore[arg-type]
-            return float(moved[0][0, 0]) - asked
-
-        expected.append(brentq(off, -200, 200, xtol=1e-13, rtol=1e-15))
-        _, state = actuator.advance(theta, [expected[-1]], state, from_rest=True)
-    computed = inverse(actuator, theta, reference, from_rest=True)[0]
-    np.testing.assert_allclose(computed, expected, atol=1e-8)
 
 
 def limited() -> tuple[Actuator, FloatArray]:

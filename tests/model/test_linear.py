@@ -18,33 +18,6 @@ HOLDS: tuple[Hold, ...] = ("first", "zero")
 TABLE_1 = (0.00134, 1580.0, 4.10e5)
 
 
-def from_poles(first: complex, second: complex) -> tuple[float, float, float]:
-    """Mass, damping and stiffness, the last one 1, of two poles in 1/s."""
-    product = (first * second).real
-    return 1 / product, -(first + second).real / product, 1.0
-
-
-# In units of the sampling rate: slow, ordinary, fast and mixed; nearly equal; complex; undamped.
-POLES: dict[str, tuple[complex, complex]] = {
-    "slow": (-1e-3, -3e-3),
-    "one slow": (-1e-4, -2.0),
-    "ordinary": (-0.1, -0.6),
-    "fast": (-3.0, -40.0),
-    "very fast": (-50.0, -3000.0),
-    "equal": (-0.3, -0.3),
-    "equal and fast": (-4.0, -4.0),
-    "equal and slow": (-2e-3, -2e-3),
-    **{f"apart by {gap:g}": (-0.4, -0.4 * (1 + gap)) for gap in (1e-3, 1e-6, 1e-9, 1e-12)},
-    **{f"fast, apart by {gap:g}": (-2.0, -2.0 * (1 + gap)) for gap in (1e-3, 1e-6, 1e-9, 1e-12)},
-    "nearly equal, complex": (-0.4 + 1e-8j, -0.4 - 1e-8j),
-    "at one": (-1.0, -1.0),
-    "complex": (-0.1 + 0.5j, -0.1 - 0.5j),
-    "complex and fast": (-0.5 + 9j, -0.5 - 9j),
-    "undamped": (0.7j, -0.7j),
-    "undamped and fast": (2.9j, -2.9j),
-}
-
-
 def batch(*parameters: float) -> list[FloatArray]:
     return [np.array([value]) for value in parameters]
 
@@ -132,17 +105,6 @@ def test_without_a_lag_the_output_is_the_drive_as_it_is_held() -> None:
         np.testing.assert_allclose(got, walk(), rtol=0, atol=1e-12)
         got = from_rest(first_order_lag(np.array([lag]), INTERVAL, "zero"), walk())
         np.testing.assert_array_equal(walk()[:-1], got[1:])
-
-
-@pytest.mark.parametrize("hold", HOLDS)
-def test_a_model_does_not_depend_on_its_batch(hold: Hold) -> None:
-    models = [from_poles(*(pole / INTERVAL for pole in pair)) for pair in POLES.values()]
-    mass, damping, stiffness = np.array(models).T
-    together = second_order(mass, damping, stiffness, INTERVAL, hold)
-    outputs = together.run(np.tile(walk(), (len(models), 1)), together.at_rest())
-    for row, parameters in enumerate(models):
-        alone = from_rest(oscillator(parameters, hold), walk())
-        np.testing.assert_allclose(outputs[row], alone, rtol=0, atol=1e-12 * np.abs(alone).max())
 
 
 def test_finite_for_parameters_over_many_decades() -> None:

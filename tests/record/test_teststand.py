@@ -6,7 +6,6 @@ otherwise; their seeds are fixed.
 
 from __future__ import annotations
 
-import itertools
 import math
 from hashlib import sha256
 from pathlib import Path
@@ -21,6 +20,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
 from bwbayes.record.teststand import Amplifier, LaserSensor, VirtualTestStand, creep
 from bwbayes.record.waveforms import Decay, Sine, Triangle, Waveform, signal
@@ -49,30 +49,10 @@ def scalar_output(command: FloatArray) -> list[float]:
     return output
 
 
-def scalar_hysteresis(output: list[float]) -> list[float]:
-    """Equation (6) with Table 1, one sample at a time, by the solution of its two linear pieces."""
-    ceiling = 0.3575 / (0.0272 + 0.0172)
-    h = [0.0]
-    for before, after in itertools.pairwise(output):
-        sign, travel = math.copysign(1.0, after - before), abs(after - before)
-        along = sign * h[-1]
-        if along < 0:
-            # Down to zero with the rate beta - gamma, and what is left of the way from there.
-            reach = 0.3575 / (0.0272 - 0.0172)
-            to_zero = math.log(1 - along / reach) / (0.0272 - 0.0172)
-            part = min(travel, to_zero)
-            along = reach + (along - reach) * math.exp(-(0.0272 - 0.0172) * part)
-            travel -= part
-        if travel > 0:
-            along = ceiling + (along - ceiling) * math.exp(-(0.0272 + 0.0172) * travel)
-        h.append(sign * along)
-    return h
-
-
 def scalar_displacement(command: FloatArray) -> list[float]:
     """Equation (7) for a drive held over each interval, by the matrix exponential."""
     output = scalar_output(command)
-    hysteretic = scalar_hysteresis(output)
+    hysteretic = hysteresis(output, 0.3575, 0.0272, 0.0172)[0]
     rates = np.array([[0.0, 1.0], [-4.10e5 / 0.00134, -1580 / 0.00134]])
     transition = expm(rates * MILLISECOND)
     drive = [0.7 * u - h for u, h in zip(output, hysteretic, strict=True)]

@@ -24,7 +24,6 @@ from tests.model.operators.slow import (
     Model,
     assert_close,
     by_integration,
-    by_samples,
     drawn,
     paths,
     random_walk,
@@ -86,21 +85,6 @@ def test_bouc_wen_agrees_with_an_integrator(number: int, exponent: float) -> Non
         assert_close(integrated(voltage, model, part * top), got, 1e-9)
 
 
-@given(
-    beta=st.floats(0.0, 0.2),
-    fraction=st.floats(-1.0, 1.0),
-    start=st.integers(-3000, 3000).map(lambda h: h / 100),
-    voltages=st.lists(st.integers(-10_000, 10_000).map(lambda u: u / 100), min_size=1, max_size=20),
-)
-@settings(deadline=None, max_examples=150)
-def test_any_passive_linear_model_agrees_with_the_scalar_closed_form(
-    beta: float, fraction: float, start: float, voltages: list[float]
-) -> None:
-    model, voltage = Model(ALPHA, beta, fraction * beta), np.array(voltages)
-    got = hysteresis(voltage, *model, initial=start)[0]
-    assert_close(by_samples(voltage, model, start), got, 1e-12)
-
-
 @pytest.mark.parametrize("exponent", [1.0, 1 + 1e-9, 1.05, 1.7, 3.3, 10.0, 50.0])
 def test_any_exponent_inverts_the_hypergeometric_travel(exponent: float) -> None:
     """v(g) = (g/alpha) 2F1(1, 1/n; 1 + 1/n; (lambda/alpha) g^n), here with G = 1."""
@@ -109,28 +93,6 @@ def test_any_exponent_inverts_the_hypergeometric_travel(exponent: float) -> None
     d, alpha, *rest = np.array([[0.0, 0.36, 0.6 * 0.36, 0.4 * 0.36, exponent]]).T
     _, got = PowerStep.of(d, alpha, *rest).along(0.0, np.zeros(1), travel)
     np.testing.assert_allclose(got[0], height, rtol=1e-11)
-
-
-@pytest.mark.parametrize("exponent", EXPONENTS)
-@pytest.mark.parametrize("limit", [(0.02, 0.02), (0.02, -0.02)])
-def test_equal_and_opposite_rates_are_limits_and_not_exceptions(
-    limit: tuple[float, float], exponent: float
-) -> None:
-    voltage = 0.3 * random_walk(4)
-    expected = hysteresis(voltage, *shaped(limit, exponent), initial=-3.0)[0]
-    for off in (1e-9, 1e-12, 1e-15):
-        near = shaped((limit[0] * (1 + off), limit[1]), exponent)
-        assert_close(expected, hysteresis(voltage, *near, initial=-3.0)[0], 100 * off + 1e-9)
-
-
-@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0])
-def test_saturation_without_beta_stays_finite_and_below_the_ceiling(fraction: float) -> None:
-    """There the ceiling is a state of unstable rest: rounding must not push h through it."""
-    voltage = 1000 * np.sin(np.linspace(0, 30, 400))
-    for beta in (0.0, 1e-18, 1e-9):
-        h = hysteresis(voltage, ALPHA, beta, ALPHA, initial=fraction * ALPHA / (beta + ALPHA))
-        assert np.isfinite(h).all()
-        assert np.abs(h).max() <= 1 + 1e-12
 
 
 @pytest.mark.parametrize("exponents", [(1.0,), (1.0, 1.5, 2.0, 5.0, 10.0)])

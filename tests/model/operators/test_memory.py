@@ -192,32 +192,6 @@ def test_loops_between_the_same_voltages_are_congruent(
     np.testing.assert_allclose(shapes[0], shapes[1], rtol=0, atol=1e-11)
 
 
-@every_case
-def test_loops_elsewhere_are_alike_only_for_plays(
-    case: Case, request: pytest.FixtureRequest
-) -> None:
-    shapes = []
-    for mean in (0.0, 90.0):
-        loop = mean + np.array([-40.0, 40.0, 0.0, -40.0, 0.0, 40.0])
-        got = run(case.operator, case.column, loop, SPANS[0])[:, -4:]
-        shapes.append(got - got[:, :1])
-    apart = np.max(np.abs(shapes[0] - shapes[1]))
-    if request.node.callspec.id in INVARIANT:
-        assert apart < 1e-12
-    else:
-        assert apart > 1.0
-
-
-@every_case
-@settings(max_examples=15, deadline=None)
-@given(voltage=paths)
-def test_from_rest_it_is_odd(case: Case, voltage: FloatArray) -> None:
-    up = run(case.operator, case.column, voltage, None)
-    np.testing.assert_allclose(
-        -up, run(case.operator, case.column, -voltage, None), rtol=0, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("name", INVARIANT)
 @settings(max_examples=15, deadline=None)
 @given(voltage=paths, travel=st.floats(0.1, 100))
@@ -257,16 +231,6 @@ def test_the_start_goes_from_the_ascending_to_the_descending_branch(
         assert (highest == 1).all()
 
 
-@every_case
-def test_the_typical_slope_is_that_of_the_whole_span(case: Case) -> None:
-    span = Span(-50.0, 70.0)
-    sweep = run(case.operator, case.column, np.array([-50.0, 70.0]), span)
-    expected = (sweep[:, 1] - sweep[:, 0])[0] / 120
-    np.testing.assert_allclose(case.operator.gain(case.column, span), expected, rtol=1e-12)
-    still = case.operator.gain(case.column, Span(3.0, 3.0))
-    np.testing.assert_allclose(still, 0.7, rtol=1e-3)
-
-
 def test_springs_that_hold_back_more_than_all_are_refused() -> None:
     column = rows(d=[1.3, 0.5], **SLIPPING, initial=0.0)
     with pytest.raises(InputError, match=r"^d: 0.5 in model 1; must not be less"):
@@ -284,13 +248,6 @@ def test_ramps_wider_than_ten_bells_are_refused() -> None:
 def test_thresholds_that_cannot_be_are_refused(kind: type[Plays], thresholds: object) -> None:
     with pytest.raises(InputError, match=r"^thresholds: "):
         kind(thresholds)  # type: ignore[arg-type]
-
-
-def test_ramps_of_no_width_are_relays() -> None:
-    voltage = walk(10)
-    column = rows(**BELLS, width=0.0, initial=INITIALS)
-    relays = run(Preisach(), column, voltage, SPANS[0])
-    assert_close(relays, run(KrasnoselskiiPokrovskii(), column, voltage, SPANS[0]), 1e-13)
 
 
 @pytest.mark.parametrize("saturation", [1e-1, 1.0, 1e2, 1e4])

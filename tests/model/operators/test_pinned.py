@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -135,23 +134,6 @@ def test_without_pinning_there_is_next_to_no_loop(operator: Pinned) -> None:
     curve = [float(operator.begin(column, u, SPAN, from_rest=False).state[0]) for u in voltage]
     np.testing.assert_allclose(got, curve, rtol=0, atol=1e-3 * field * 0.62)
     assert np.abs(got - curve).max() > 1e-4 * field * 0.62
-
-
-@pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
-def test_saturation_is_crossed_in_few_steps(
-    operator: Pinned, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Prior draws may saturate at next to nothing; steps of that field took a minute each."""
-    steps, slopes = [], walls.slopes
-
-    def counted(*arguments: Any) -> Any:
-        steps.append(arguments)
-        return slopes(*arguments)
-
-    monkeypatch.setattr(walls, "slopes", counted)
-    voltage = 60 * np.sin(np.linspace(0, 4, 30))
-    run(operator, rows(**{**MODEL, "saturation": 5e-3, "initial": 0.0}), voltage)
-    assert 20 < len(steps) / 9 < 400  # which each step asks for nine times
 
 
 @pytest.mark.parametrize(
