@@ -6,9 +6,10 @@ the reference as requested and as it was smoothed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -259,13 +260,21 @@ class Compensation(Product):
         """Return a row for each number, with a column for each command."""
         played = [command.numbers(self.limit) for command in (self.compensated, self.linear)]
         rows = [("Voltage", *(_span(numbers["voltage_V"]) for numbers in played), "V")]
-        rows += _error_rows("", played)
         if self.limit is not None:
             texts = [f"{numbers['probability_below_limit']:.3f}" for numbers in played]
             rows.append((f"Probability that the error stays below {self.limit:g} µm", *texts, ""))
+        references = {"": played}
         if self.reference.moved > 0:
             smoothed = [numbers["to_smoothed_reference"] for numbers in played]
-            rows += _error_rows(" to the smoothed reference", smoothed)
+            references[" to the smoothed reference"] = smoothed
+        titles = {"rms_um": "Rms of the error", "largest_um": "Largest error"}
+        for (reference, commands), (key, title) in product(references.items(), titles.items()):
+            errors = [numbers[key] for numbers in commands]
+            means = (f"{error['mean']:.3g}" for error in errors)
+            rows.append((f"{title}{reference}, mean", *means, "µm"))
+            for level in LEVELS:
+                spans = (_span(error[str(level)]) for error in errors)
+                rows.append((f"{title}{reference}, {level} % interval", *spans, "µm"))
         return Table(
             "error",
             "Error",
@@ -284,40 +293,21 @@ class Compensation(Product):
             "first": "straight lines (first-order hold)",
         }
         start = "demagnetized" if self.from_rest else "waited"
-        return Facts(
-            [
-                (
-                    "Reference",
-                    f"{np.min(target):.4g} to {np.max(target):.4g} µm, "
-                    f"{target.size} samples every {interval:g} s",
-                ),
-                ("Command", commands[self.command]),
-                ("Voltage between samples", holds[self.hold]),
-                (
-                    "Displacement between samples",
-                    f"up to {self.between:.3g} µm from a straight line; errors are those at the "
-                    "samples, just before the voltage changes",
-                ),
-                ("Start", f"{start} at zero volts{'' if self.from_rest else ', after any drive'}"),
-                ("0 µm", "where the actuator stands at zero volts as the command begins"),
-            ]
-        )
+        extent = f"{np.min(target):.4g} to {np.max(target):.4g} µm"
+        between = f"up to {self.between:.3g} µm from a straight line; errors are those at the"
+        pairs = {
+            "Reference": f"{extent}, {target.size} samples every {interval:g} s",
+            "Command": commands[self.command],
+            "Voltage between samples": holds[self.hold],
+            "Displacement between samples": f"{between} samples, just before the voltage changes",
+            "Start": f"{start} at zero volts{'' if self.from_rest else ', after any drive'}",
+            "0 µm": "where the actuator stands at zero volts as the command begins",
+        }
+        return Facts([*pairs.items()])
 
     def __repr__(self) -> str:
         promise = f"compensation for {self.reference.name}: {self._promise()}"
         return "\n".join([*self.standing.said, promise.replace("µ", "u")])
-
-
-def _error_rows(reference: str, errors: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return means and intervals of errors, each with a column of its own."""
-    rows: list[tuple[str, ...]] = []
-    for key, title in (("rms_um", "Rms of the error"), ("largest_um", "Largest error")):
-        means = (f"{error[key]['mean']:.3g}" for error in errors)
-        rows.append((f"{title}{reference}, mean", *means, "µm"))
-        for level in LEVELS:
-            spans = (_span(error[key][str(level)]) for error in errors)
-            rows.append((f"{title}{reference}, {level} % interval", *spans, "µm"))
-    return rows
 
 
 def _span(edges: Sequence[float]) -> str:

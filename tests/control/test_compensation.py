@@ -207,20 +207,6 @@ def test_shapes_begin_at_rest_and_reach_their_amplitude(shape: str) -> None:
     assert np.max(np.abs(np.diff(values, 2))) < 0.7
 
 
-@pytest.mark.parametrize(
-    ("given", "line"),
-    [
-        ([], "give one row of 10 samples or more"),
-        ([1.0] * 5, "give one row of 10 samples or more"),
-        ([1.0] * 20, "is 1 um all along"),
-        ([0.0, np.nan] * 10, "sample 1 is not a finite number"),
-    ],
-)
-def test_references_that_cannot_be_used_are_refused(given: list[float], line: str) -> None:
-    with pytest.raises(InputError, match=line):
-        Reference(given, 1e-3)
-
-
 def test_shapes_that_make_no_sense_are_refused() -> None:
     for options, line in (
         ({"amplitude": -1.0}, "amplitude -1; must be positive"),

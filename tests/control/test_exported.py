@@ -13,7 +13,6 @@ from scipy.signal import StateSpace, dlsim
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.sampled import SampledModel
-from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
@@ -121,9 +120,3 @@ def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     system = made.linear
     for matrix in "ABCD":
         np.testing.assert_array_equal(numbers["state_space"][matrix], getattr(system, matrix))
-
-
-@pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)])
-def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
-    with pytest.raises(InputError, match="give two voltages, the lower one first"):
-        of("bouc-wen", "first", Span(*limits))

@@ -117,23 +117,17 @@ def test_a_waveform_is_its_bias_before_the_start_and_carrier_times_decay_after(
     ("build", "named"),
     [
         (lambda: Sine(1.0, 0.0), "sine: frequency"),
-        (lambda: Sine(1.0, -2.0), "sine: frequency"),
         (lambda: Sine(math.nan, 1.0), "sine: amplitude"),
-        (lambda: Sine(1.0, 1.0, math.inf), "sine: phase"),
         (lambda: Triangle(1.0, math.inf), "triangle: frequency"),
         (lambda: Staircase((), 1.0), "staircase: levels"),
-        (lambda: Staircase((1.0, math.nan), 1.0), "staircase: levels"),
         (lambda: Staircase((1.0,), 0.0), "staircase: dwell"),
         (lambda: Decay(0.0, -0.1), "decay: rate"),
-        (lambda: Decay(math.nan, 0.1), "decay: start"),
         (lambda: Waveform(Sine(1.0, 1.0), 0.0), "waveform: duration"),
         (lambda: Waveform(Sine(1.0, 1.0), 1.0, start=-0.1), "waveform: start"),
         (lambda: Waveform(Sine(1.0, 1.0), 1.0, start=1.0), "waveform: start"),
-        (lambda: Waveform(Sine(1.0, 1.0), 1.0, bias=math.nan), "waveform: bias"),
         (lambda: Waveform(Sine(1.0, 1.0), 1.0).sample(0.0), "sampling: rate"),
         (lambda: Waveform(Sine(1.0, 1.0), 0.001).sample(100.0), "sampling: 0.001 s"),
         (lambda: Waveform(Sine(1.0, 1.0), 1e5).sample(101.0), "sampling: 100000 s at 101 Hz"),
-        (lambda: Waveform(Sine(1.0, 1.0), 1e300).sample(1e300), "sampling: 1e+300 s"),
     ],
 )
 def test_impossible_values_are_named_in_one_line(build: Callable[[], object], named: str) -> None:

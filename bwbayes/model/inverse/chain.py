@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -96,14 +96,6 @@ def inverse(
     return result
 
 
-class _Range(NamedTuple):
-    """Where the voltage may go: between low and high, V, at most ``step`` a sample."""
-
-    low: float
-    high: float
-    step: float = math.inf
-
-
 @dataclass(frozen=True)
 class _Single:
     """One model that is read backwards."""
@@ -127,8 +119,8 @@ class _Single:
         extent = 30.0 * max(size, abs(span.low), abs(span.high))
         if nearest:
             low, high = max(limits.low, -extent), min(limits.high, extent)
-            return self._undo(drive, _Range(low, high, limits.rate * interval))
-        voltage = self._undo(drive, _Range(-extent, extent))
+            return self._undo(drive, Limits(low, high, limits.rate))
+        voltage = self._undo(drive, Limits(-extent, extent))
         edges = np.abs(voltage) >= extent
         if edges.any():
             sample = int(np.argmax(edges))
@@ -143,7 +135,7 @@ class _Single:
             )
         return voltage
 
-    def _undo(self, displacement: FloatArray, within: _Range) -> FloatArray:
+    def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:
         """Undo dynamics and creep, then hysteresis and nonlinearity.
 
         The creep is that of the drive that was found without it, then of the one with that creep,
@@ -174,7 +166,7 @@ class _Single:
             "model's creep and gain"
         )
 
-    def _static(self, drive: FloatArray, within: _Range) -> FloatArray:
+    def _static(self, drive: FloatArray, within: Limits) -> FloatArray:
         """Return the voltage (samples,) with which hysteresis and nonlinearity make a drive."""
         # Steps of the drive below this part of its range are rounding: they turn nothing.
         quantum = 1e-13 * float(np.ptp(drive))
@@ -183,6 +175,7 @@ class _Single:
         start = 0.0 if self.from_rest else self._first_voltage(float(drive[0]), within)
         here, memory = self._along(np.array([start]), self._begin(start))
         # A record from rest may go anywhere at its first sample.
+        reach = within.rate * self.actuator.interval
         result, free, behind = [] if self.from_rest else [np.array([start])], self.from_rest, False
         joined = np.concatenate([here, drive if self.from_rest else drive[1:]])
         for begin, last, _ in monotone_stretches(joined, LONGEST):
@@ -192,11 +185,11 @@ class _Single:
                 end = first + 1 if behind else last
                 target = joined[first + 1 : end + 1]
                 segment = self._branch(target, float(here[-1]), start, memory, within)
-                fast = np.abs(np.diff(segment, prepend=start)) > within.step
+                fast = np.abs(np.diff(segment, prepend=start)) > reach
                 fast[0] &= not free
                 behind = bool(fast.any())
                 if fast[0]:
-                    segment = np.array([start + math.copysign(within.step, segment[0] - start)])
+                    segment = np.array([start + math.copysign(reach, segment[0] - start)])
                 elif behind:
                     segment = segment[: int(np.argmax(fast))]
                 result.append(segment)
@@ -207,7 +200,7 @@ class _Single:
         return np.pad(voltage, (0, drive.size - voltage.size), constant_values=start)
 
     def _branch(
-        self, target: FloatArray, here: float, start: float, memory: Any, within: _Range
+        self, target: FloatArray, here: float, start: float, memory: Any, within: Limits
     ) -> FloatArray:
         """Return the voltages along a branch from ``start``, where the drive is ``here``."""
         s = math.copysign(1.0, float(target[-1]) - here)
@@ -237,7 +230,7 @@ class _Single:
         operator, span = self.actuator.hysteresis, self.actuator.span or UNIT
         return operator.begin(self.column, voltage, span, from_rest=self.from_rest)
 
-    def _first_voltage(self, drive: float, within: _Range) -> float:
+    def _first_voltage(self, drive: float, within: Limits) -> float:
         """Return the voltage at which the state that θ's initial one says makes a drive."""
 
         def excess(voltage: float) -> float:
