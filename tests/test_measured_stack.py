@@ -16,7 +16,7 @@ from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.inverse.chain import inverse
+from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import Start, predict_record, thinned
 from bwbayes.record import Record, read_record

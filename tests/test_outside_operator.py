@@ -29,7 +29,7 @@ from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
 from bwbayes.model.elementwise import select
-from bwbayes.model.inverse.chain import inverse
+from bwbayes.model.inverse import inverse
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial

@@ -23,7 +23,7 @@ from bwbayes.comparison.designed import Promise
 from bwbayes.diagnosis.identifiability import stretches_once
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 
 __all__ = ["promises"]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.record.record import Record
 from bwbayes.report.product import Product
 from bwbayes.report.report import (

@@ -33,8 +33,8 @@ from bwbayes.control.references import Reference
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inverse.chain import inverse
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.inverse import inverse
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.prediction.initial_state import Start, Started, started
 from bwbayes.prediction.prediction import predict_record
@@ -143,7 +143,7 @@ def compensate(
         ``"zero"``: the voltage of a sample brings the displacement to the reference at the next
         sample, just before it changes; ``"first"``: it goes in straight lines.
     from_rest, limits, nearest
-        As of :func:`~bwbayes.model.inverse.chain.inverse`. Otherwise the actuator has waited at
+        As of :func:`~bwbayes.model.inverse.inverse`. Otherwise the actuator has waited at
         zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
         Of the tracking error, um.

@@ -20,7 +20,7 @@ from bwbayes.app.running.campaign import STATUSES, Campaign, Row
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.report.page import render
 from bwbayes.report.result import summary
 from tests.app import example, small

@@ -11,7 +11,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.record import read_record
 from bwbayes.report.page import render
 from tests.app.conftest import Type

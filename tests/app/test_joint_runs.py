@@ -25,7 +25,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume, start
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures.pictures import pictures
 from tests.app import small

@@ -17,7 +17,7 @@ from bwbayes.comparison.designed import Promise
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.sampling.diagnostics import smoothed_weights
 from tests.inference.linear import Linear
 from tests.inference.problems import decaying_sine, short_posterior

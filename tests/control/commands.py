@@ -25,7 +25,7 @@ from bwbayes.control.references import Reference
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.record import Record

@@ -19,7 +19,7 @@ from bwbayes.control.references import Reference, shaped
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.record.record import Record

@@ -15,8 +15,8 @@ from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.inverse.chain import inverse
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.inverse import inverse
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made

@@ -22,7 +22,7 @@ from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import parse_hold
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.formats import read_reference

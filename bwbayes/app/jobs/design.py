@@ -23,7 +23,7 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
 from bwbayes.comparison.designed import Design
 from bwbayes.errors import InputError
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
 from bwbayes.model.reversals import time_between_turns, turning_points
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import (

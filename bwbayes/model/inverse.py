@@ -1,32 +1,46 @@
 """The actuator read backwards: for a displacement over time, the voltage that gives it.
 
-The offset is taken off, creep and dynamics are undone (:mod:`bwbayes.model.inverse.dynamics`), and
-what is left, the drive, is what hysteresis and nonlinearity must make. The drive turns where the
-voltage does, so that each branch between two turns is one root search for all of its samples
-(:mod:`bwbayes.model.inverse.branch`). It asks of an operator only to simulate, one model at a time.
+The offset is taken off, creep and dynamics are undone, and what is left, the drive, is what
+hysteresis and nonlinearity must make. The drive turns where the voltage does, and along a branch
+between two turns both go one way: each sample asks for one root of one rising curve, and one walk
+along the curve serves all samples. It asks of an operator only to simulate, one model at a time.
+
+Of the dynamics the recursion on the samples is inverted, not the differential equation: what it
+returns makes the displacement again to rounding, at every sample. A displacement that jumps, or
+whose speed does, needs a drive that swings from sample to sample around the one of the differential
+equation, for about a lag: smooth it first. A drive that is held acts one sample later, so the
+second sample cannot be chosen, and the last drive, which acts after the record, stays.
+
+A mass on a spring that is sampled much faster than it swings, driven in straight lines, has
+recursions whose inverse runs away (a zero outside of the unit circle, −2 − √3 in the limit). It has
+another inverse, which does not: it looks ahead by some samples, and misses the first ones, unless
+the displacement begins at rest for as long.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.inverse.branch import solve_branch
-from bwbayes.model.inverse.dynamics import undone
-from bwbayes.model.inverse.limits import Limits
+from bwbayes.model.limits import Limits
+from bwbayes.model.linear import Recursion
 from bwbayes.model.operator import UNIT
 from bwbayes.model.reversals import monotone_stretches
 
 __all__ = ["inverse"]
+
+Curve = Callable[[FloatArray], FloatArray]
 
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
@@ -249,3 +263,114 @@ class _Single:
         if not above:
             return center
         return float(scipy.optimize.brentq(excess, center, end, xtol=math.ulp(abs(center) + reach)))
+
+
+def solve_branch(
+    curve: Curve, rise: FloatArray, room: float, guess: float, resolution: float
+) -> FloatArray:
+    """Return the travels (samples,), V, after which a curve has risen as far as is asked for.
+
+    Parameters
+    ----------
+    curve
+        The rise (points,), um, after travels (points,) that grow, V; zero at the start.
+    rise
+        (samples,), um, not negative and never falling.
+    room
+        Travel beyond which the curve is not followed, V; returned where it does not rise enough.
+    guess
+        A first guess of how far the path goes, V.
+    resolution
+        What a travel need not be more exact than, V.
+
+    Notes
+    -----
+    C. Ridders, A new algorithm for computing a single root of a real continuous function, IEEE
+    Transactions on Circuits and Systems 26, 979-980 (1979), within brackets from a coarse walk.
+    """
+    reach = min(guess, room)
+    while reach < room and curve(np.array([reach]))[0] < rise[-1]:
+        reach = min(2 * reach, room)
+    points = reach * np.linspace(0.0, 1.0, 33)
+    heights = np.maximum.accumulate(np.concatenate([[0.0], curve(points[1:])]))
+    above = np.clip(np.searchsorted(heights, rise), 1, points.size - 1)
+    # Those that are not reached, or not left, need no search.
+    low = np.where(rise <= 0, 0.0, np.where(rise >= heights[-1], reach, points[above - 1]))
+    high = np.where((rise <= 0) | (rise >= heights[-1]), low, points[above])
+    below, beyond = heights[above - 1] - rise, heights[above] - rise
+    return _roots(
+        lambda travel: _in_order(curve, travel) - rise, low, high, below, beyond, resolution
+    )
+
+
+def _in_order(curve: Curve, travel: FloatArray) -> FloatArray:
+    """Return the curve after travels (samples,) in any order, walked along as a path."""
+    order = np.argsort(travel, kind="stable")
+    values = np.empty_like(travel)
+    values[order] = curve(travel[order])
+    return values
+
+
+def _roots(
+    function: Curve,
+    low: FloatArray,
+    high: FloatArray,
+    below: FloatArray,
+    beyond: FloatArray,
+    resolution: float,
+) -> FloatArray:
+    """Return the roots (samples,) of rising functions, which are below and beyond zero at ends."""
+    latest = low
+    for _ in range(60):
+        middle = (low + high) / 2
+        between = function(middle)
+        root = np.sqrt(np.maximum(between**2 - below * beyond, 0.0))
+        step = np.divide(between, root, out=np.zeros_like(root), where=root > 0)
+        before, latest = latest, np.clip(middle - (middle - low) * step, low, high)
+        value = function(latest)
+        for place, height in ((middle, between), (latest, value)):
+            under = height < 0
+            low, below = np.where(under, place, low), np.where(under, height, below)
+            high, beyond = np.where(under, high, place), np.where(under, beyond, height)
+        settled = np.abs(latest - before) <= resolution
+        if (settled | (value == 0) | (high - low <= resolution)).all():
+            break
+    return latest
+
+
+def undone(recursion: Recursion, displacement: FloatArray) -> FloatArray:
+    """Return the drive (samples,), um, after which one model has a displacement (samples,), um.
+
+    The model is at rest at the first sample.
+    """
+    numerator, denominator = recursion.numerator[0], recursion.denominator[0]
+    moved: FloatArray = displacement - displacement[0]
+    zeros = np.roots(numerator)
+    if numerator[0] == 0.0 and numerator.size > 1:
+        # The second sample has been settled by the first drive.
+        moved[:2] = 0.0
+        later = scipy.signal.lfilter(denominator, numerator[1:], moved)[1:]
+        drive: FloatArray = np.append(later, later[-1:] if later.size else 0.0)
+    elif (np.abs(zeros) <= 1).all():
+        drive = scipy.signal.lfilter(denominator, numerator, moved)
+    else:
+        drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, moved)
+        drive[0] = 0.0
+    return np.asarray(displacement[0] + drive)
+
+
+def _looking_ahead(
+    first: float, zeros: NDArray[Any], denominator: FloatArray, forced: FloatArray
+) -> FloatArray:
+    """Undo zeros inside of the unit circle forwards, and those outside of it backwards."""
+    drive = scipy.signal.lfilter(denominator, [first], forced).astype(np.complex128)
+    for zero in zeros[np.abs(zeros) <= 1]:
+        drive = scipy.signal.lfilter([1.0], [1.0, -zero], drive)
+    for zero in zeros[np.abs(zeros) > 1]:
+        # w[t-1] = (w[t] - v[t]) / zero, from a drive that does not change after the end.
+        end = drive[-1] / (1 - zero)
+        before, _ = scipy.signal.lfilter(
+            [-1 / zero], [1.0, -1 / zero], drive[:0:-1], zi=[end / zero]
+        )
+        drive = np.concatenate([before[::-1], [end]])
+    return np.asarray(drive.real.copy())
