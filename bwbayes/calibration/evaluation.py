@@ -255,8 +255,8 @@ def smooth_power(count: int, level: float, width: float) -> float:
     # By symmetry b1 has no mean and both are uncorrelated: integrate over the mean of b1.
     rest = np.sqrt(np.maximum(-2 * np.log(level) - (sd[0] * z) ** 2, 0))
     shift = mean[1] * np.sqrt(count)
-    below, above = scipy.special.ndtr((np.stack([shift, -shift]) - rest) / sd[1])
-    beyond = below + above
+    below, above = ((side - rest) / sd[1] for side in (shift, -shift))
+    beyond = scipy.special.ndtr(below) + scipy.special.ndtr(above)
     return float(np.where(rest > 0, beyond, 1) @ weight)
 
 
