@@ -53,7 +53,7 @@ SHORTER = {
 # actuators few.
 DEFAULTS = {
     "bwbayes.report.figures.pictures._draw": lambda *_: Figure(),
-    "bwbayes.report.saving.picture_of": lambda _: picture_of(Figure),
+    "bwbayes.report.outputs.picture_of": lambda _: picture_of(Figure),
     "bwbayes.app.commands.studies.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}

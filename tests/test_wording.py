@@ -8,7 +8,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.wording import as_typed
+from bwbayes.app.commands.ending import as_typed
 from bwbayes.app.jobs.simulate import simulate
 
 

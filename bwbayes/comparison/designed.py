@@ -142,7 +142,7 @@ class Design(Product, Sequence[Promise]):
 
     def report(self) -> Report:
         """Return which signal teaches most, by how much, and what it looks like, to be shown."""
-        from bwbayes.report.figures.design import draw_promises, draw_signal  # noqa: PLC0415
+        from bwbayes.report.figures.control import draw_promises, draw_signal  # noqa: PLC0415
 
         best, amplifier = self.best, self.amplifier
         feasible = [promise for promise in self.promises if not promise.refused]

@@ -1,7 +1,7 @@
-"""The files of a finished run: posterior, bands, summary.
+"""The files of a report and of a finished run: page, pictures, posterior, bands, numbers.
 
 Each is written under another name and renamed when it is whole, so a reader never sees half a
-file. This module alone knows arviz's labeled posterior.
+file. This module alone knows the labeled posterior of arviz.
 """
 
 from __future__ import annotations
@@ -16,11 +16,22 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
 from bwbayes.prediction.bands import Bands
 from bwbayes.record.record import Record
+from bwbayes.report.figures import picture_of, save_pictures
+from bwbayes.report.page import render
+from bwbayes.report.report import Picture, Report
 from bwbayes.report.result import Result
 
-__all__ = ["posterior_tree", "write_bands", "write_posterior", "write_summary"]
+__all__ = [
+    "posterior_tree",
+    "refuse_existing",
+    "save",
+    "write_bands",
+    "write_posterior",
+    "write_summary",
+]
 
 
 @contextmanager
@@ -46,20 +57,11 @@ def posterior_tree(
 ) -> Any:
     """Return the draws as arviz groups, an xarray.DataTree, and whether they have converged.
 
-    Groups: posterior, sample_stats, log_likelihood (of all readings together), observed_data and
-    constant_data. A chain is a walker; the coordinates ``ensemble`` and ``walker`` along it say
-    which. The attribute ``converged`` is 1 or 0: without convergence the draws are none of the
-    posterior.
-
-    Parameters
-    ----------
-    result
-        The run.
-    log_likelihood
-        (steps, ensembles, walkers), nats.
-    records
-        The training records by name. The variables and times of several have their record's name
-        behind their own: ``displacement_loops``.
+    Groups: posterior, sample_stats, log_likelihood (of all readings together, (steps, ensembles,
+    walkers), nats), observed_data and constant_data. A chain is a walker; the coordinates
+    ``ensemble`` and ``walker`` along it say which. Of several training records variables and times
+    have their record's name behind their own: ``displacement_loops``. The attribute ``converged``
+    is 1 or 0: without convergence the draws are none of the posterior.
     """
     import arviz_base  # noqa: PLC0415  # slow to load
 
@@ -148,3 +150,36 @@ def _finite(value: object) -> object:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def save(report: Report, folder: Path, name: str, *, pictures: str = "") -> list[Path]:
+    """Write a report's files to a folder, and return those named after it: JSON, CSV, page.
+
+    Pictures as PNG, in a folder below it if ``pictures`` names one, ``NAME.html``, ``NAME.csv`` and
+    ``NAME.json`` if it has such; the JSON last, as the sign that all is there.
+
+    Raises InputError: the folder cannot be written.
+    """
+    numbers, table, page = (folder / f"{name}.{kind}" for kind in ("json", "csv", "html"))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        blocks = (block for block in report.all_blocks() if isinstance(block, Picture))
+        drawn = {block.name: picture_of(block.draw) for block in blocks}
+        if drawn:
+            save_pictures(drawn, folder / pictures)
+        page.write_text(render(report, drawn), encoding="utf-8")
+        if report.csv:
+            with _draft(table) as draft:
+                draft.write_text(report.csv, encoding="utf-8", newline="")
+        if report.numbers:
+            write_summary(numbers, report.numbers)
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
+    return [*[numbers] * bool(report.numbers), *[table] * bool(report.csv), page]
+
+
+def refuse_existing(files: Sequence[Path], *, overwrite: bool) -> None:
+    """Refuse to replace a file, with an InputError, unless that is asked for."""
+    for path in files:
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists; choose another name, or give `overwrite=True`")

@@ -53,16 +53,9 @@ NO_PLOTS = PagePlots({}, ())
 
 
 def render(report: Report, pictures: Mapping[str, bytes], plots: PagePlots = NO_PLOTS) -> str:
-    """Return a report's page.
+    """Return a report's page, with pictures (PNG by name), and plots in their place for scripts.
 
-    Parameters
-    ----------
-    report
-        What is shown.
-    pictures
-        PNG files by name. A picture of the report without one is left out.
-    plots
-        What is shown in place of pictures where scripts run.
+    A picture of the report without a PNG is left out.
     """
     is_plotted = any(name in plots.drawn for name in pictures)
     scripts = plots.scripts if is_plotted else ()

@@ -2,25 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from bwbayes.record.io.formats import write_record
-from bwbayes.record.record import Record
-from bwbayes.report.report import Report
 from bwbayes.shown import head
 
-__all__ = ["Product"]
+if TYPE_CHECKING:
+    from bwbayes.record.record import Record
+    from bwbayes.report.report import Report
+
+__all__ = ["Product", "Shown"]
 
 
-class Product:
-    """A product with a report; its files are called by its ``NAME``."""
+class Shown:
+    """What shows itself by its report: its head as a repr, all of it in print and a notebook."""
 
-    NAME: ClassVar[str]
+    @property
+    def heading(self) -> str:
+        """What is said above the report, if anything."""
+        return ""
 
     def report(self) -> Report:
         """Return all that there is to say of it."""
         raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return head(str(self))
+
+    def __str__(self) -> str:
+        from bwbayes.report.screen import as_text  # noqa: PLC0415  # slow to load
+
+        return "\n".join(filter(None, [self.heading, as_text(self.report())]))
+
+    def _repr_html_(self) -> str:
+        from bwbayes.report.page import fragment  # noqa: PLC0415  # slow to load
+
+        report = self.report()
+        return fragment(replace(report, title=self.heading or report.title))
+
+
+class Product(Shown):
+    """A product with a report; its files are called by its ``NAME``."""
+
+    NAME: ClassVar[str]
 
     def records(self) -> dict[str, Record]:
         """Return what is saved beside the report, as CSV, by name."""
@@ -34,7 +59,8 @@ class Product:
         InputError
             A file that exists, unless it may be replaced, or that cannot be written.
         """
-        from bwbayes.report.saving import refuse_existing, save  # noqa: PLC0415  # slow to load
+        from bwbayes.record.io.formats import write_record  # noqa: PLC0415  # slow to load
+        from bwbayes.report.outputs import refuse_existing, save  # noqa: PLC0415
 
         folder = Path(folder)
         records = {folder / f"{name}.csv": record for name, record in self.records().items()}
@@ -44,16 +70,3 @@ class Product:
         for path, record in records.items():
             write_record(record, path)
         return [*records, *files]
-
-    def __repr__(self) -> str:
-        return head(str(self))
-
-    def __str__(self) -> str:
-        from bwbayes.report.screen import as_text  # noqa: PLC0415  # slow to load
-
-        return as_text(self.report())
-
-    def _repr_html_(self) -> str:
-        from bwbayes.report.page import fragment  # noqa: PLC0415  # slow to load
-
-        return fragment(self.report())

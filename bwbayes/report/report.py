@@ -1,7 +1,7 @@
 """What a product has to say: a title, banners, tables, pictures and texts, in their order.
 
 A product describes itself by a :class:`Report`; :mod:`~bwbayes.report.screen`,
-:mod:`~bwbayes.report.page` and :mod:`~bwbayes.report.saving` show it. The page has all of it. The
+:mod:`~bwbayes.report.page` and :mod:`~bwbayes.report.outputs` show it. The page has all of it. The
 screen has the banners, and those tables and texts that are meant for it. A text is escaped where it
 is shown; a :class:`~markupsafe.Markup` is taken as HTML.
 """
@@ -63,23 +63,11 @@ class TableColumn:
 class Table:
     """A table with a header for each row and column.
 
-    Parameters
-    ----------
-    name
-        Names it within the page, and its CSV.
-    caption
-        What it holds.
-    columns
-        A column each, or its title; the first one shown holds the headers of the rows.
-    rows
-        The texts of each row, one for each column.
-    records
-        The rows of the CSV behind the page's button, by column: numbers as they are. By default the
-        texts that are shown.
-    note
-        What is to be said below it on the page.
-    on
-        Where it is shown.
+    ``name`` names it within the page, and its CSV; ``caption`` says what it holds. ``columns`` are
+    a column each, or its title; the first one shown holds the headers of the rows. ``rows`` are the
+    texts of each row, one for each column; ``records`` the rows of the CSV behind the page's
+    button, by column, numbers as they are, by default the texts that are shown. ``note`` is said
+    below it on the page; ``on`` is where it is shown.
     """
 
     kind: ClassVar = "table"
@@ -118,16 +106,9 @@ class Table:
 class Picture:
     """A picture with what is said below it.
 
-    Parameters
-    ----------
-    name
-        Names it within the page, ``#loop``, and its file.
-    title, caption
-        What it shows, in a few words and at length.
-    draw
-        Draws it.
-    alt
-        What one would see, for those who do not; by default the title.
+    ``name`` names it within the page, ``#loop``, and its file; ``title`` and ``caption`` say what
+    it shows, in a few words and at length; ``draw`` draws it; ``alt`` is what one would see, for
+    those who do not, by default the title.
     """
 
     kind: ClassVar = "picture"
@@ -212,20 +193,11 @@ class Banner:
 class Report:
     """All that a product says.
 
-    Parameters
-    ----------
-    title
-        On the browser's tab, and at the top of the page unless ``heading`` is.
-    heading, about
-        The page's name, and what it is about in a line.
-    banners
-        How it came out; the first thing to see.
-    blocks
-        The answer, then why one may believe it, then what only some readers ask for.
-    numbers
-        What the JSON file holds, if there is one.
-    csv
-        The text of the CSV file, if there is one.
+    ``title`` stands on the browser's tab, and at the top of the page unless ``heading``, the page's
+    name, does; ``about`` says in a line what it is about. ``banners`` say how it came out, the
+    first thing to see; ``blocks`` have the answer, then why one may believe it, then what only some
+    readers ask for. ``numbers`` are what the JSON file holds, if there is one, and ``csv`` is the
+    text of the CSV file, if there is one.
     """
 
     title: str

@@ -37,40 +37,26 @@ class Result:
 
     Parameters
     ----------
-    name
-        The run's name.
-    outcome
-        How the sampling ended.
+    name, outcome
+        The run's name, and how the sampling ended.
     parameters
         All parameters, fixed ones included.
-    draws
-        (steps, ensembles, walkers, free), parameters in their own units.
-    log_density
-        (steps, ensembles, walkers), nats.
+    draws, log_density
+        (steps, ensembles, walkers, free), parameters in their own units; (steps, ensembles,
+        walkers), nats.
     moves
-        How often each kind of move was proposed to a walker on the way to these draws, and
-        accepted.
-    bands, scores
-        Of every window and record that was predicted; ``scores`` by the bands' name, for those
-        with a measurement. Both empty unless converged.
-    verdicts
-        Whether the bands hold, by their name, for those with a measurement.
-    innovations
-        The innovation of each fitted reading, at the most probable draw, by the record; empty
-        unless converged.
-    loops
-        The loops of the actuator, measured; None unless converged.
-    steps
-        The responses to the steps among the records that were predicted, by name; empty unless
-        converged.
-    agreement
-        Of several records, how each agrees with the others, by name; empty unless converged.
-    explanations
-        What may explain each fitted record better, by name, the best first; empty unless converged.
+        How often each kind of move was proposed to a walker for these draws, and accepted.
+    bands, scores, verdicts
+        Of all that was predicted; by the bands' names, for those with a measurement, their scores,
+        and whether they hold. Empty unless converged, as is all that was worked out below.
+    innovations, agreement, explanations, replicated
+        By fitted record: the innovation of each reading at the most probable draw; of several, how
+        it agrees with the others; what may explain it better, the best first; where it lies among
+        replicated records.
+    loops, steps
+        The loops of the actuator, measured, and its responses to the predicted steps by name.
     learned
-        Information gained from the data: prior against posterior; None unless converged.
-    replicated
-        Each fitted record among replicated ones, by name; empty unless converged.
+        Information gained from the data: prior against posterior.
     facts
         What was run, for people: one line each, by subject.
     remarks

@@ -20,7 +20,6 @@ from bwbayes.report import tables
 from bwbayes.report.figures.pictures import Pictures
 from bwbayes.report.figures.pictures import pictures as all_pictures
 from bwbayes.report.figures.style import title
-from bwbayes.report.priors import priors_table
 from bwbayes.report.report import (
     Banner,
     Block,
@@ -34,6 +33,7 @@ from bwbayes.report.report import (
     standing_banner,
 )
 from bwbayes.report.result import Result
+from bwbayes.report.tables import priors_table
 from bwbayes.report.words import covered, error_text, mark
 
 __all__ = ["prediction_report", "run_report"]
@@ -42,14 +42,9 @@ __all__ = ["prediction_report", "run_report"]
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     """Return what a run says.
 
-    Parameters
-    ----------
-    result
-        The run.
-    numbers
-        As :func:`bwbayes.report.result.summary` returns them; ``seed``, ``wall_s``, ``versions``
-        and ``data_sha256`` are shown too if they are there, and without convergence ``go_on``, the
-        command that goes on.
+    ``numbers`` are as :func:`bwbayes.report.result.summary` returns them; ``seed``, ``wall_s``,
+    ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
+    ``go_on``, the command that goes on.
     """
     pictures = all_pictures(result)
     converged = result.outcome.converged
@@ -219,7 +214,10 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
             tables.scores_table(scores, result.verdicts, titles, records),
             Section(
                 "Other scores",
-                [tables.other_scores_table(scores, titles, records), Glossary(SCORE_TERMS)],
+                [
+                    tables.other_scores_table(scores, titles, records),
+                    Glossary([*SCORE_TERMS.items()]),
+                ],
             ),
         ]
     blocks: list[Block] = [
@@ -227,7 +225,7 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
     ]
     if result.loops is not None:
         measured = tables.loops_table(result.loops, numbers)
-        loops: list[Block] = [measured, pictures["loops"], Glossary(LOOP_TERMS)]
+        loops: list[Block] = [measured, pictures["loops"], Glossary([*LOOP_TERMS.items()])]
         blocks.append(Section("Loops", loops, folded=False))
     if result.steps:
         steps: list[Block] = [tables.steps_table(result.steps, numbers), pictures["steps"]]
@@ -305,51 +303,25 @@ def _circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "versions", ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
-SCORE_TERMS = (
-    (
-        "Sensor band",
-        "Where a new sensor reading lies, sensor noise included; the only band that a measurement "
-        "can check.",
-    ),
-    (
-        "Displacement band",
-        "Where the actuator's displacement lies, model discrepancy included; it can be checked "
-        "only where the displacement without noise is known.",
-    ),
-    (
-        "Parameter band",
-        "Where the model's displacement lies because its parameters are uncertain; it makes no "
-        "promise about the actuator or the sensor.",
-    ),
-    (
-        "CRPS and interval score",
-        "They reward bands that are narrow and right; smaller is better.",
-    ),
-)
+SCORE_TERMS = {
+    "Sensor band": "Where a new sensor reading lies, sensor noise included; the only band that a "
+    "measurement can check.",
+    "Displacement band": "Where the actuator's displacement lies, model discrepancy included; it "
+    "can be checked only where the displacement without noise is known.",
+    "Parameter band": "Where the model's displacement lies because its parameters are uncertain; "
+    "it makes no promise about the actuator or the sensor.",
+    "CRPS and interval score": "They reward bands that are narrow and right; smaller is better.",
+}
 
-LOOP_TERMS = (
-    (
-        "Opening at zero voltage",
-        "Displacement with falling less that with rising voltage, at 0 V.",
-    ),
-    (
-        "Widest opening",
-        "The largest such difference at any voltage, as a part of the range: what data sheets call "
-        "hysteresis.",
-    ),
-    (
-        "Remanence",
-        "Displacement left at 0 V after the highest voltage, against the middle between the loop's "
-        "ends.",
-    ),
-    (
-        "Coercive voltage",
-        "Half of the loop's width in voltage where the displacement passes that middle; in a loop "
-        "that is symmetric about 0 V the voltage that takes the displacement back to it.",
-    ),
-    (
-        "Area",
-        "−∮ x du over one cycle, positive where the displacement lags; times the actuator's force "
-        "per volt (N/V) the energy lost in a cycle, in µJ.",
-    ),
-)
+LOOP_TERMS = {
+    "Opening at zero voltage": "Displacement with falling less that with rising voltage, at 0 V.",
+    "Widest opening": "The largest such difference at any voltage, as a part of the range: what "
+    "data sheets call hysteresis.",
+    "Remanence": "Displacement left at 0 V after the highest voltage, against the middle between "
+    "the loop's ends.",
+    "Coercive voltage": "Half of the loop's width in voltage where the displacement passes that "
+    "middle; in a loop that is symmetric about 0 V the voltage that takes the displacement "
+    "back to it.",
+    "Area": "−∮ x du over one cycle, positive where the displacement lags; times the actuator's "
+    "force per volt (N/V) the energy lost in a cycle, in µJ.",
+}

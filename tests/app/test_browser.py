@@ -28,7 +28,6 @@ from tests.programs import needs
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-WIDTHS = (400, 1400)
 PAGES = ("run", "unconverged", "check", "design", "campaign")
 FIGURES = ("loop", "bands_training", "bands_held-out", "coverage", "corner", "trace", "ranks")
 
@@ -179,33 +178,6 @@ def test_low_contrast_would_be_noticed(chromium: Any, pages: dict[str, Path]) ->
         assert opened.page.evaluate(CONTRAST)[0] < LEAST_CONTRAST
 
 
-# Whether each table's region is too narrow for it, and how wide the words are that say so.
-CUES = """[...document.querySelectorAll(".scroll")].map(region => [
-  region.scrollWidth > region.clientWidth,
-  parseFloat(getComputedStyle(region.firstElementChild, "::before").width)])"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [400, 700, 1000, 1400])
-@pytest.mark.parametrize("name", PAGES)
-def test_a_table_that_scrolls_says_so_and_no_other(
-    chromium: Any, pages: dict[str, Path], name: str, width: int
-) -> None:
-    """Words and a shadow; on a telephone no table scrolls."""
-    with Opened(chromium, pages[name], width) as opened:
-        page = opened.page
-        page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
-        cues = page.evaluate(CUES)
-        assert cues
-        for too_wide, words in cues:
-            assert words > 80 if too_wide else words == 0
-        assert width > 400 or not any(too_wide for too_wide, _ in cues)
-        shadows = page.locator(".scroll").evaluate_all(
-            "all => all.map(e => getComputedStyle(e).backgroundImage)"
-        )
-        assert all("radial-gradient" in shadow for shadow in shadows)
-
-
 def test_intervals_are_seen_on_a_telephone(chromium: Any, pages: dict[str, Path]) -> None:
     """Every one lies on the page, behind the title of its column."""
     with Opened(chromium, pages["run"], 400) as opened:
@@ -238,11 +210,8 @@ def middle_of(page: Any, name: str) -> tuple[float, float, float]:
     return box["x"] + box["width"] / 2, box["y"] + 0.5 * box["height"], box["width"]
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-def test_dragging_zooms_in_and_reset_goes_back(
-    chromium: Any, pages: dict[str, Path], width: int
-) -> None:
-    with Opened(chromium, pages["run"], width) as opened:
+def test_dragging_zooms_in_and_reset_goes_back(chromium: Any, pages: dict[str, Path]) -> None:
+    with Opened(chromium, pages["run"], 400) as opened:
         page = opened.page
         before = sorted(page.evaluate(TIME_RANGES))
         for name in ("bands_training", "bands_held-out"):

@@ -15,9 +15,8 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.studies import compare as compare_command
-from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.config.limits import USUAL_MODELS
-from bwbayes.app.config.models import models_of
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import resolve
 from bwbayes.errors import InputError, InputWarning
@@ -138,7 +137,7 @@ def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
         (fits, {"models": "linear"}, "compare: models: fits are compared as they are; leave it"),
         (fits, {"train": (0, 1)}, "compare: train: fits are compared as they are; leave it out"),
         ([fits[0], record], {}, "compare: Record: is neither a fit nor the folder of a run"),
-        ([fits[0], "nowhere"], {}, "compare: nowhere: is neither a fit nor the folder of a run"),
+        ([fits[0], "nowhere"], {}, "nowhere: no run here; start one with"),
         ([record], {"models": "liner"}, "models: 'liner' is unknown; did you mean linear?"),
         ([record], {"models": []}, "models: names no model"),
         ([record], {"trian": (0, 1)}, "compare: trian: unknown key; did you mean train?"),
@@ -164,24 +163,6 @@ def test_other_readings_are_refused(
     other = fits[1].knowing(problem=resolve(config, Path(), records))
     with pytest.raises(InputError, match=line):
         fits[0].compare(other)
-
-
-def test_a_fit_says_what_to_measure_next(fits: tuple[Fit, Fit]) -> None:
-    fit, linear = fits
-    time = np.arange(150) / 50
-    wave = np.sin(2 * np.pi * time)
-    signals = {"steady": 80 * wave, "fading": 80 * wave * (1 - 0.3 * time), "far": 300 * wave}
-    best, second, last = fit.design("beta", candidates=signals)
-    assert (best.name, second.name) == ("fading", "steady")
-    assert last.refused.startswith("needs ")
-    # Its bands do not hold, which is said.
-    with pytest.warns(InputWarning, match="VALIDATION FAILED: later"):
-        assert linear.design(50 * wave, voltage=(-100, 100))[0].left < 1
-    with (
-        pytest.warns(InputWarning, match="VALIDATION FAILED: later"),
-        pytest.raises(InputError, match="is not a free parameter"),
-    ):
-        linear.design("beta")
 
 
 @pytest.mark.parametrize(

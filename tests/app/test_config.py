@@ -34,10 +34,7 @@ def refused(text: str) -> str:
         ("sead = 1\n" + RECORD, "sead", "seed"),
         ('[recrod]\nfile = "a.csv"\n', "recrod", "record"),
         ("[record]\nsignal = {amplitud = 1.0}", "record.signal.amplitud", "amplitude"),
-        (RECORD + "[stand]\nsample_rat = 50.0", "stand.sample_rat", "sample_rate"),
         (RECORD + "[parameters.d]\nfixd = 1.0", "parameters.d.fixd", "fixed"),
-        (RECORD + "[parameters.signal]\nfixd = 1.0", "parameters.signal.fixd", "fixed"),
-        (RECORD + "[validation.a]\nwindw = [1.0, 2.0]", "validation.a.windw", "window"),
         (
             RECORD + "[validation.a]\nsignal = {amplitude = 1.0, frequncy = 1.0, duration = 1.0}",
             "validation.a.signal.frequncy",
@@ -55,8 +52,6 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
     ("text", "hint"),
     [
         (RECORD + "[sampling]\ndraws = 100", "sampling.draws: unknown key; did you mean ess?"),
-        (RECORD + "[record.signal]\nfreq = 1", "did you mean frequency?"),
-        (RECORD + "ignore = [[0, 1]]", "record.ignore: unknown key; did you mean exclude?"),
         (RECORD + "xyzzy = 1", "record.xyzzy: unknown key; known are file, signal, voltage_is, "),
         (RECORD + "seed = 3", "record.seed: unknown key; it belongs above the first table"),
         (RECORD + "walkers = 20", "record.walkers: unknown key; it belongs under [sampling]"),
@@ -64,12 +59,10 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
         (RECORD + "[parameters.d]\nprior = 3", "prior: write a table like { distribution"),
         ("record = 3", "record: is not a table; known keys are file, signal"),
         ("", "record: is missing"),
-        ("[record]", "record: give either file or signal; correct the config"),
         (
             '[record]\nfile = "a.csv"\nsignal = "identification"\n',
             "record: give either file or signal; correct the config",
         ),
-        (RECORD + "[validation.a]", "validation.a: give one of window, file and signal; correct"),
         (
             RECORD + "[validation.a]\nfile = 'a.csv'\nsignal = 'step10'",
             "validation.a: give one of window, file and signal; correct",
@@ -79,7 +72,6 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
             "validation.a: lead_in_from is for another record; give file or signal",
         ),
         (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
-        (RECORD + "[validation.training-2]\nsignal = 'step10'", "'training-2' is taken"),
         ("seed = 9223372036854775808\n" + RECORD, "seed"),
         (f"seed = 0x{5000 * 'f'}\n{RECORD}", "seed: "),
     ],
@@ -114,9 +106,6 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
     ("text", "path"),
     [
         ("seed = '1'\n" + RECORD, "seed"),
-        ("name = ''\n" + RECORD, "name"),
-        ("record = 3", "record"),
-        (RECORD + "start = 1979-05-27", "record.start"),
         (RECORD + "train = [1.0, 2.0, 3.0]", "record.train"),
         (RECORD + "voltage_is = 'both'", "record.voltage_is"),
         (
@@ -128,12 +117,9 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
             "duration = 1.0}",
             "record.signal",
         ),
-        (RECORD + "[parameters.d]\nprior = 'normal'", "parameters.d.prior"),
         (RECORD + "[parameters.d]\nprior = {distribution = 3}", "parameters.d"),
         (RECORD + "[parameters.d]\nfixed = 1.0\nprior = {distribution = 'beta'}", "parameters.d"),
         (RECORD + "[sampling]\nwalkers = 7", "sampling.walkers"),
-        (RECORD + "[validation.'a/b']\nwindow = [1.0, 2.0]", "validation.a/b"),
-        (RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in = 0.0", "validation.a.lead_in"),
         (RECORD + "[truth]\nd = 'large'", "truth.d"),
     ],
 )
@@ -148,8 +134,6 @@ def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
     "text",
     [
         RECORD + "train = [[0.0, nan]]",
-        "[record]\nsignal = {amplitude = 1.0, frequency = 1.0, duration = nan}",
-        RECORD + "[parameters.d]\nfixed = -inf",
         RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan, sd = 1.0}",
     ],
 )
@@ -162,13 +146,11 @@ def test_number_that_is_not_finite_is_refused(text: str) -> None:
     [
         "[record",
         "seed = 1\nseed = 2\n" + RECORD,
-        RECORD + RECORD,
         "a = " + 5000 * "[",
         "\0",
         "seed = " + 5000 * "9",
         ".".join(50_000 * "a") + " = 1",
         "[" + ".".join(50_000 * "a") + "]",
-        "x = { " + ".".join(50_000 * "a") + " = 1 }",
     ],
 )
 def test_text_that_is_no_toml_is_refused(text: str) -> None:
@@ -184,27 +166,15 @@ def test_unknown_key_of_any_length_is_one_short_line() -> None:
     assert len(text) < 700
 
 
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        (b"", "record: "),
-        (b"\xff\xfe[\0r\0", "is not UTF-8 text"),
-    ],
-)
-def test_unusable_file_is_named(tmp_path: Path, content: bytes, why: str) -> None:
-    path = tmp_path / "my.toml"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=re.escape(f"{path}: {why}")):
-        load(path)
-
-
 def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "utf16.toml").write_bytes(b"\xff\xfe[\0r\0")
     (tmp_path / "large.toml").write_text(RECORD + 1_000_000 * "#")
     for path, why in (
         (tmp_path / "pipe", "not a regular file"),
         (Path("/dev/zero"), "not a regular file"),
         (tmp_path / "large.toml", "larger than 1 MB"),
+        (tmp_path / "utf16.toml", "is not UTF-8 text"),
         (tmp_path / "none.toml", r"none\.toml: No such file"),
         (tmp_path, re.escape(f"{tmp_path}: Is a directory")),
     ):

@@ -15,10 +15,9 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.record import Record, write_record
 
@@ -129,15 +128,6 @@ def test_a_continued_record_beside_another(tmp_path: Path) -> None:
     table = {"record": record, "outliers": [0.5, 3.5]}
     both = problem({"a": table, "other": other}, per_record=["sensor_sd"])
     np.testing.assert_allclose(densities(made), densities(both), rtol=1e-10)
-
-
-def test_python_fits_a_record_in_two_parts() -> None:
-    first, second = parts(whole(), 170)
-    keys: Any = {"dynamics": "none", "hysteresis": "linear", "block": 25, "steps": 25, "workers": 1}
-    with pytest.warns(InputWarning, match="NOT CONVERGED: step limit 25"):
-        made = bw.fit(chained({"first": first, "second": second}), progress=False, **keys)
-    assert made.problem.record.samples == SAMPLES
-    assert "offset" in made.problem.posterior.names
 
 
 def second(**changes: Any) -> Record:

@@ -13,7 +13,6 @@ from bwbayes.app.config.config import load
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.errors import InputError
-from bwbayes.inference import engine
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
@@ -33,14 +32,6 @@ def test_another_engine_is_refused_unless_asked_for(copy: RunFolder) -> None:
     with pytest.raises(InputError, match=r'sampled with the numba engine, not numpy.*`engine="num'):
         resume(copy, small.quiet(), workers=1)
     assert before == ChainFile.read(copy.chain).steps("sampling")
-
-
-def test_machine_without_the_engine_says_what_to_do(
-    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(engine, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"numba is not installed; pip install .* numpy engine"):
-        resume(copy, small.quiet(), workers=1)
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from bwbayes.app.running import cluster as cluster_module
+from bwbayes.app.running import workers as workers_module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.app.running.workers import executor, one_thread, side_by_side
@@ -171,7 +171,7 @@ def _kill_at_first_block(folder: RunFolder, process: Any) -> None:
 def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(cluster_module, "PATIENCE", 0.2)
+    monkeypatch.setattr(workers_module, "PATIENCE", 0.2)
     with pytest.raises(InputError, match="no scheduler there; start one with `dask scheduler`"):
         executor(backend="dask://127.0.0.1:9").__enter__()
     with pytest.raises(InputError, match="'ray' is unknown; write one of local, threads"):
@@ -208,19 +208,6 @@ def test_a_process_that_dies_ends_the_work_at_once() -> None:
     """What is on disk can be resumed; the command line says so (`cli.main`)."""
     with executor(1, backend="processes") as pool, pytest.raises(BrokenProcessPool):
         pool.submit(die).result(PATIENCE)
-
-
-def test_whoever_is_interrupted_does_not_wait_for_processes() -> None:
-    begun = time.monotonic()
-
-    def interrupted() -> None:
-        with executor(1, backend="processes") as pool:
-            pool.submit(time.sleep, PATIENCE)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert time.monotonic() - begun < PATIENCE / 2
 
 
 def linear_algebra_threads() -> set[int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping
-from pathlib import Path
 
 import hypothesis.strategies as st
 import matplotlib as mpl
@@ -15,14 +14,12 @@ import pytest
 from bokeh.models import ColumnDataSource
 from hypothesis import given, settings
 from matplotlib.axes import Axes
-from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
 from bwbayes.inference.parameters import Parameter
-from bwbayes.report.figures import interactive, save_pictures
+from bwbayes.report.figures import interactive
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
-from bwbayes.report.figures.loop import draw_loop
-from bwbayes.report.figures.series import _around_largest_error, draw_bands
+from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
 from bwbayes.report.figures.style import MEAN_COLOR, envelope, zigzag
 from tests.app import example
 
@@ -129,22 +126,6 @@ def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
     assert not shown.start <= 100 < shown.stop
     width = bands.upper["sensor", 95][0] - bands.lower["sensor", 95][0]
     assert 10 * width > np.ptp(bands.mean[shown])
-
-
-def test_files_have_names_that_any_system_takes(tmp_path: Path) -> None:
-    save_pictures({"bands_a/b": b"PNG"}, tmp_path / "new")
-    assert b"PNG" == (tmp_path / "new" / "bands_a%2Fb.png").read_bytes()
-
-
-def test_coverage_is_drawn_in_percent_with_its_error(figures: Mapping[str, Figure]) -> None:
-    """In the order of the legend: sensor, then displacement, of each of the bands."""
-    panel = figures["coverage"].axes[0]
-    lines = [c.lines for c in panel.containers if isinstance(c, ErrorbarContainer)]
-    drawn = [np.asarray(points.get_ydata(), dtype=np.float64) for points, _, _ in lines]
-    whiskers = [np.asarray(bars[0].get_segments()) for _, _, bars in lines]
-    sensor, displacement = [48.1, 89.2, 94.3], [51.4, 91.5, 96.6]
-    np.testing.assert_allclose(np.array([sensor, displacement] * 2), np.stack(drawn))
-    np.testing.assert_allclose(np.array([44.0, 52.2]), whiskers[0][0, :, 1])
 
 
 def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:

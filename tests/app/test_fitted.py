@@ -17,7 +17,6 @@ from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.running import run
-from bwbayes.app.running.folder import RunFolder
 from bwbayes.record import Record, read_record
 from bwbayes.report.outputs import write_bands
 from bwbayes.report.words import digits
@@ -188,27 +187,6 @@ def test_a_prediction_is_the_command_lines(
     assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
 
 
-@pytest.mark.usefixtures("_without_pictures")
-def test_ctrl_c_leaves_a_folder_to_go_on_from(
-    record: Record,
-    keys: dict[str, Any],
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr("bwbayes.app.running.progress.Progress.__call__", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            bw.fit(record, folder=tmp_path / "a", **keys)
-    with pytest.raises(bw.InputError, match=r"a: exists; resume with `bwbayes\.resume\('"):
-        bw.fit(record, folder=tmp_path / "a", **keys)
-    assert bw.resume(tmp_path / "a", workers=1, progress=False).converged
-    small.assert_same_end(folder, tmp_path / "a")
-
-
 # Without convergence
 
 
@@ -331,30 +309,6 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
         bw.fit(record, **wrong)
     assert line in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_the_columns_of_a_file_are_recognized(
-    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def created(*arguments: Any) -> None:
-        raise InterruptedError(arguments[-2].record)
-
-    monkeypatch.setattr(RunFolder, "create", created)
-    assert record.displacement is not None
-    rows = np.stack([1e3 * record.time, record.voltage, record.displacement], axis=1)
-    np.savetxt(
-        tmp_path / "lab.csv",
-        rows,
-        fmt="%.9g",
-        delimiter=",",
-        header="t [ms],U [V],pos",
-        comments="",
-    )
-    with pytest.raises(bw.InputError, match="which unit has 'pos'"):
-        bw.fit(tmp_path / "lab.csv")
-    with pytest.raises(InterruptedError) as seen:
-        bw.fit(tmp_path / "lab.csv", units={"displacement": "um"})
-    np.testing.assert_allclose(record.voltage, seen.value.args[0].voltage, atol=1e-6)
 
 
 @pytest.mark.usefixtures("_no_run")

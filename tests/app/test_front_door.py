@@ -149,7 +149,7 @@ def held_out(problem: Problem) -> np.ndarray[Any, Any]:
 
 
 @pytest.mark.parametrize("kind", ["sine", "decaying", "unipolar", "chirp", "triangle"])
-@pytest.mark.parametrize("periods", [9.3, 16.0, 40.0])
+@pytest.mark.parametrize("periods", [9.3, 40.0])
 def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: float) -> None:
     """Of every amplitude and rate that the drive has: no tail, and no end of a chirp."""
     voltage = drive(kind, periods, np.arange(4000) / 4000)

@@ -197,11 +197,10 @@ def test_a_request_that_falls_into_a_callback_is_not_lost() -> None:
     ("asked", "everyone", "moment"),
     [
         (signal.SIGTERM, False, soon_after(appears(".lock"))),
-        (signal.SIGTERM, True, blocks("pilot", 1)),
         (signal.SIGINT, True, soon_after(appears("chain"))),
         (signal.SIGINT, True, blocks("pilot", 1)),
     ],
-    ids=["terminate point fit", "terminate pilot", "Ctrl-C starting workers", "Ctrl-C pilot"],
+    ids=["terminate point fit", "Ctrl-C starting workers", "Ctrl-C pilot"],
 )
 def test_request_to_stop_ends_in_order(
     tmp_path: Path, asked: signal.Signals, everyone: bool, moment: Moment

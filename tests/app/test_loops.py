@@ -72,12 +72,3 @@ def test_what_a_loop_or_step_has_not_is_not_there(measured: dict[str, Any]) -> N
     numbers: Any = summary(dataclasses.replace(example.run(), **measured))
     assert numbers["loops"]["major"]["opening_um"] is None  # it does not go through zero
     assert numbers["step_responses"]["one"]["creep_percent"] is None
-
-
-def test_without_convergence_neither_is_shown(measured: dict[str, Any]) -> None:
-    run = dataclasses.replace(example.run(converged=False), **measured)
-    assert summary(run)["loops"] is summary(run)["step_responses"] is None
-    page = example.page(run, pictures={"loops": b"", "steps": b""})
-    assert 'id="loops"' not in page
-    assert 'id="steps"' not in page
-    assert not {"loops", "steps"} & example.figures(run).keys()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bwbayes.app.config.config import ModelConfig
-from bwbayes.app.config.models import models_of
+from bwbayes.app.config.keywords import models_of
 from bwbayes.errors import InputError
 
 BASE = ModelConfig(gain=["cubic"], creep=True, dynamics="none", hold="first", passive=False)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from io import StringIO
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes import open_run
-from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.plan import SamplingPlan
@@ -91,10 +88,3 @@ def test_each_step_after_the_sampling_counts_down_by_itself(
         "explanations 0%   ETA unknown",
         "explanations 50%   ETA 1:30",
     ] == console.export_text().splitlines()
-
-
-def test_predictions_say_how_far_they_are(run: Path) -> None:
-    fit, shares = open_run(run), [0.0]
-    predictions(fit.problem, fit.flat_draws, shares.append)
-    assert sorted(shares) == shares
-    assert shares[-1] == pytest.approx(1.0)

@@ -13,8 +13,7 @@ from click.testing import CliRunner, Result
 from bwbayes.app.commands import cli, fitting
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import ConfigProposal, propose
-from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.problem.problem import resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.record import Record
@@ -99,23 +98,6 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
 
 
 # What is held out
-
-
-def _drive(write: Write, voltage: Callable[[FloatArray], FloatArray], samples: int = 600) -> Path:
-    path = write()
-    time = np.arange(samples) / 100
-    drive = voltage(time)
-    rows = np.stack([time, drive, 0.7 * drive + 0.1 * np.sin(40 * time)], axis=1)
-    path.write_text("\n".join([OWN, *(",".join(f"{v:.9g}" for v in row) for row in rows)]) + "\n")
-    return path
-
-
-def test_a_part_is_held_out_whose_drive_the_rest_covers(write: Write) -> None:
-    """Of a growing sine no window reaches to the end."""
-    made = proposed(_drive(write, lambda t: (20 + 10 * t) * np.sin(2 * np.pi * t)))
-    held = made.config.validation["held_out"].window or []
-    assert held[-1][1] < 6.0
-    assert 6.0 == (made.config.records["record"].train or [])[-1][1]
 
 
 # What is wrong
@@ -237,36 +219,3 @@ def test_run_without_a_config_runs_the_proposed_one(
     assert (0.0, 6.0) == (edges.min(), edges.max())
     said = command("run", path, "--out", tmp_path / "again").output
     assert re.search(r"training on 0 to [\d.]+, .* s, holding out the rest; save this config", said)
-
-
-def shown_alone(
-    path: Path, *_: object, show: Callable[[Problem], None] | None = None, **__: object
-) -> int:
-    """Show what a run shows before it samples, and leave the rest."""
-    if show is not None:
-        show(RunFolder(path).problem())
-    return 0
-
-
-@pytest.mark.parametrize("command_line", ["init", "run", "run my.toml"])
-def test_what_the_reader_remarks_is_shown_and_kept(
-    write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command_line: str
-) -> None:
-    """Of a record that is run at once, of a config's, and in the run's folder ever after."""
-    path = write()
-    header, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([f"{header},temperature_C", *(f"{row},21.5" for row in rows)]) + "\n")
-    remark = "mine.csv:1: ignored columns: temperature_C"
-    monkeypatch.setattr(fitting, "finish", shown_alone)
-    name, _, config = command_line.partition(" ")
-    if config:
-        path = path.with_suffix(".toml")
-        path.write_text('[record]\nfile = "mine.csv"\n[model]\ndynamics = "lag"\n')
-    out: list[str | Path] = [] if name == "init" else ["--out", tmp_path / "out"]
-    done = command(name, path, *out)
-    assert 0 == done.return_value
-    assert 1 == done.output.count(remark), done.output
-    if name == "run":
-        kept = RunFolder(tmp_path / "out").problem()
-        assert [remark] == [one.removeprefix(f"{tmp_path}/") for one in kept.remarks]
-        assert resolve(kept.config, tmp_path / "out").config == kept.config

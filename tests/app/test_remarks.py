@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +9,6 @@ from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.model.distributions import Distribution
-from bwbayes.report.priors import priors_table
-from bwbayes.report.report import Report
-from bwbayes.report.screen import as_text
 
 
 def test_run_says_it_too(run: Path) -> None:
@@ -25,20 +21,3 @@ def test_run_says_it_too(run: Path) -> None:
     odd = replace(problem, defaults={**problem.defaults, "d": nanometres})
     (remark,) = assemble(odd, chain, outcome).remarks
     assert "Fix: check its unit" in remark
-
-
-def test_priors_are_shown_as_the_constraints_leave_them(
-    run: Path,
-) -> None:
-    """With a fixed gamma, beta is above it: its stated median is 1 / U = 0.01."""
-    problem = RunFolder(run).problem()
-    table = priors_table(problem.posterior.prior)
-    lines = as_text(Report(title="", blocks=[table]), width=200).splitlines()
-    (place,) = (i for i, line in enumerate(lines) if "beta" in line)
-    numbers = re.findall(r"[\d.]+", lines[place + 1])
-    median, low, _ = (float(x) for x in numbers)
-    assert low > 0.0172
-    assert median > 0.02
-    # Nothing cuts that of the offset.
-    (place,) = (i for i, line in enumerate(lines) if "offset" in line)
-    assert "effective" not in lines[place + 1]

@@ -81,25 +81,6 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
     assert ["8.22 µm"] * 2 == table["90 % sensor band: interval score"]
 
 
-@pytest.mark.parametrize("converged", [True, False])
-def test_acceptance_of_each_move_and_pareto_k_are_shown(converged: bool) -> None:
-    text = page(example.run(converged=converged))
-    expected = {"differential evolution": ["1000", "12.3 %"], "mixture": ["3800", "32.1 %"]}
-    assert expected == rows(text, "moves")
-    assert "Pareto k of the mixture at the draws: 0.31;" in text
-
-
-def test_answer_is_of_held_out_readings_if_there_are_any() -> None:
-    """Coverage with its error, width, and how far the mean misses, before anything else."""
-    text = page(example.run())
-    first = re.sub(r"<.*?>|&nbsp;", " ", text[: text.index("Parameters")].split("</style>")[1])
-    for said in ("held-out (held out), 0 to 2.999 s", "94.3 ± 1.3 %", "6.13 µm", "5.52 µm"):
-        assert said in first
-    assert "training" not in first
-    fitted = page(example.run(every=(example.bands("training", 2500, 0, training=True),)))
-    assert "training, 0 to 2.499 s" in fitted
-
-
 def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     cause = Finding("noise", "the noise is not like that", "try another noise")
     failed = Verdict("held-out", False, False, ("covers 60 %",), cause)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import shutil
-import time
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,6 @@ import click
 import numpy as np
 import pytest
 import xarray
-from rich.console import Console
 
 from bwbayes.app.commands.ending import finish
 from bwbayes.app.fit.fitted import finished
@@ -86,17 +82,6 @@ def test_summary_has_every_free_parameter(summary: dict[str, Any]) -> None:
     assert ["um/V", "1/V", "s"] == [parameters[n]["unit"] for n in ("d", "beta", "lag")]
 
 
-def test_summary_judges_every_prediction(summary: dict[str, Any]) -> None:
-    assert {"held-out", "sine"} <= set(summary["validation"])
-    for row in summary["validation"].values():
-        assert 0 < row["nrmse"] < 0.1
-        assert 0 < row["crps_um"] < row["width_95_um"]
-        assert row["max_error_um"] > 0
-        for kind in ("sensor", "displacement"):
-            assert set(row["coverage"][kind]) == LEVELS
-            assert all(0 <= covered <= 1 for covered in row["coverage"][kind].values())
-
-
 def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run: Path) -> None:
     """Of each draw it is that of all readings; with the log prior it makes the log density."""
     record, posterior = (
@@ -155,20 +140,6 @@ def test_interrupted_command_says_how_to_go_on(
     assert 1 == ChainFile.read(made.chain).blocks("pilot")
     with pytest.raises(InputError, match=r"no draws yet; resume with `bwbayes\.resume"):
         finished(made)
-
-
-def test_progress_shows_rate_eta_acceptance_rhat_and_ess(run: Path) -> None:
-    fit, said = finished(RunFolder(run)), StringIO()
-    progress = Progress(Console(file=said, width=40), fit.problem.plan)
-    progress.begun = progress.printed = time.monotonic() - 60
-    progress("sampling", fit.outcome.check)  # of a run that goes on: nothing was done yet
-    for _ in range(4):
-        progress("sampling", None)
-    assert re.search(r" 30 evaluations/s   ETA unknown   acceptance 0", progress.line("sampling"))
-    line = r"sampling +\d+ steps +0 evaluations/s   ETA unknown   acceptance 0\.\d\d   "
-    assert re.fullmatch(
-        line + r"R-hat 1\.\d{3}   ESS \d+ of 200   Pareto k -?\d\.\d\d\n", said.getvalue()
-    )
 
 
 @pytest.mark.usefixtures("_without_pictures")

@@ -20,8 +20,7 @@ import pytest
 from rich.console import Console
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.config.keywords import config_of
-from bwbayes.app.config.models import models_of, slug
+from bwbayes.app.config.keywords import config_of, models_of, slug
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.problem.problem import resolve

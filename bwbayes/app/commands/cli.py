@@ -1,4 +1,4 @@
-"""The command line: a thin layer over the package.
+"""The command line: a thin layer over the package, and the two commands that print the reference.
 
 Exit status 0: success. 2: invalid input, said in one line. 3: converged, but validation failed: the
 bands do not hold on a record that was measured, fitted or not. 4: not converged, or calibration
@@ -18,15 +18,40 @@ from concurrent.futures.process import BrokenProcessPool
 
 import click
 
-from bwbayes.app.commands.ending import BAD_INPUT, INTERRUPTED, NOT_CONVERGED
+from bwbayes.app.commands.ending import BAD_INPUT, INTERRUPTED, NOT_CONVERGED, as_typed
 from bwbayes.app.commands.fitting import check, init, report, resume, run
+from bwbayes.app.commands.options import WithParts
 from bwbayes.app.commands.products import compensate, design, export, predict, track
-from bwbayes.app.commands.reference import config, models
 from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
-from bwbayes.app.commands.wording import as_typed
 from bwbayes.errors import ColumnsError, InputError, NotConvergedError, one_line
 
 __all__ = ["main"]
+
+
+@click.command()
+@click.argument("key", required=False)
+def config(key: str | None) -> int:
+    """Print the keys of a config: type, unit, default and an example; of all, or of one KEY.
+
+    Example: bwbayes config record.train
+    """
+    from bwbayes.app.config.reference import config_reference
+
+    click.echo(config_reference(key))
+    return 0
+
+
+@click.command(cls=WithParts)
+@click.argument("name", required=False)
+def models(name: str | None) -> int:
+    """Print the parts of a model, or of one NAME its equation, parameters and default priors.
+
+    Example: bwbayes models prandtl-ishlinskii
+    """
+    from bwbayes.app.config.reference import parts_reference
+
+    click.echo(parts_reference(name))
+    return 0
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

@@ -98,8 +98,8 @@ def run(
     from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.running.run import start
-    from bwbayes.report.priors import priors_table
     from bwbayes.report.report import Report, remarks_banner
+    from bwbayes.report.tables import priors_table
 
     chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
     chosen = chosen.renamed(config.stem, seed)

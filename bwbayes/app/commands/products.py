@@ -34,7 +34,7 @@ def _saved(
 ) -> int:
     """Do a job with the run in a folder, save and show its product; return the exit status."""
     from bwbayes.app.fit.fitted import converged
-    from bwbayes.report.saving import refuse_existing
+    from bwbayes.report.outputs import refuse_existing
 
     # What takes long is refused at once, and every single file when it is saved.
     refuse_existing([out / f"{job.__name__}.json"], overwrite=overwrite)
@@ -74,8 +74,8 @@ def predict(
     from bwbayes.app.jobs.predict import write_prediction
     from bwbayes.diagnosis.standing import Standing
     from bwbayes.record import read_record
+    from bwbayes.report.outputs import refuse_existing
     from bwbayes.report.report import Report, standing_banner
-    from bwbayes.report.saving import refuse_existing
 
     if (record is None) == (options["signal"] is None):
         raise InputError("predict: give either a record or a signal")

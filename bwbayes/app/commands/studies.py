@@ -167,9 +167,9 @@ def compare(
     Example: bwbayes compare results/bender results/bender_plays
     """
     from bwbayes.app.config.config import load
-    from bwbayes.app.config.models import models_of
+    from bwbayes.app.config.keywords import models_of
     from bwbayes.app.jobs import compare as job
-    from bwbayes.report.saving import refuse_existing
+    from bwbayes.report.outputs import refuse_existing
 
     path, *others = paths
     if models is None and not others and (path.is_file() or path.suffix == ".toml"):
@@ -183,7 +183,7 @@ def compare(
     refuse_existing([out / "comparison.json"], overwrite=overwrite)
     console = Console(stderr=True, quiet=quiet)
     if config is None or models is None:
-        comparison = job.compare(job.open_runs(paths), console, **options)
+        comparison = job.compare(job.fits_of(paths), console, **options)
     else:
         named_models = models_of(models, config.model)
         options |= {"screen": screen, "overwrite": overwrite}

@@ -132,10 +132,7 @@ class Config(ConfigTable):
     def with_record(self, file: Path) -> Config:
         """Return the config of another file in place of its record's.
 
-        Raises
-        ------
-        InputError
-            It has several records.
+        Raises InputError: it has several records.
         """
         if not isinstance(self.record, RecordConfig):
             names = ", ".join(self.record)
@@ -160,10 +157,8 @@ class Config(ConfigTable):
 def load(path: str | Path) -> Config:
     """Read a config from a TOML file.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, is not valid TOML, or says something that no config can say.
+    Raises InputError: the file cannot be read, is not valid TOML, or says something that no config
+    can say.
     """
     path = Path(path)
     try:

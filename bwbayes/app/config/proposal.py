@@ -56,21 +56,12 @@ class ConfigProposal:
 
 
 def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
-    """Propose a config for a record.
+    """Propose a config, to be in the folder ``where``, for the record in a file.
 
-    Parameters
-    ----------
-    path
-        The record's file.
-    where
-        The folder in which the config is going to be.
-    naming
-        Columns and units, where they are not to be recognized.
+    ``naming`` has columns and units, where they are not to be recognized.
 
-    Raises
-    ------
-    InputError
-        A column that is not recognized or has no unit, or a record that cannot be used.
+    Raises InputError: a column that is not recognized or has no unit, or a record that cannot be
+    used.
     """
     naming = naming or Naming()
     with warnings.catch_warnings(record=True) as caught:

@@ -61,10 +61,7 @@ def config_reference(requested: str | None) -> str:
     A path may have the user's own names in it, and may leave out its first tables:
     ``parameters.d.prior``, ``ess``.
 
-    Raises
-    ------
-    InputError
-        There is no such key.
+    Raises InputError: there is no such key.
     """
     documented = keys(Config)
     if requested is None:
@@ -122,10 +119,7 @@ def parts_reference(requested: str | None) -> str:
 
     ``requested`` is a part's name or the import path of one from outside.
 
-    Raises
-    ------
-    InputError
-        There is no such part.
+    Raises InputError: there is no such part.
     """
     if requested is not None:
         found = [

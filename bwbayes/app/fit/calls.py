@@ -78,7 +78,7 @@ def fit(
         has not converged.
     """
     from bwbayes.app.config.keywords import config_of
-    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch, warn
+    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve
     from bwbayes.app.running import run
     from bwbayes.app.running.explaining import improve_model
@@ -161,23 +161,25 @@ def compare(
         comparison.recommended, comparison.caveats
         comparison = bwbayes.compare(fit, other_fit, "results/bender")
     """
-    from bwbayes.app.config.keywords import config_of
-    from bwbayes.app.config.models import models_of
+    from bwbayes.app.config.keywords import config_of, models_of
     from bwbayes.app.fit.fitted import Fit
-    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch
     from bwbayes.app.jobs import compare as job
-    from bwbayes.report.saving import refuse_existing
+    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
+    from bwbayes.report.outputs import refuse_existing
 
     path, scratch = folder_or_scratch(folder, "comparison")
     refuse_existing([path / "comparison.json"], overwrite=overwrite)
     compared_runs = runs[0] if len(runs) == 1 else list(runs)
     listed = compared_runs if isinstance(compared_runs, list | tuple) else [compared_runs]
-    if any(isinstance(run, Fit) or _is_folder(run) for run in listed):
+    if any(
+        isinstance(run, Fit) or (isinstance(run, str | Path) and Path(run).is_dir())
+        for run in listed
+    ):
         for name in [*keys] if models is None else ["models"]:
             raise InputError(f"compare: {name}: fits are compared as they are; leave it out")
         if len(listed) < 2:
             raise InputError("compare: one fit alone; give two or more, or a record")
-        fits = job.by_name(_finished(fit) for fit in listed)
+        fits = job.fits_of(listed)
         comparison = job.compare(fits, future=future, workers=workers, executor=executor)
     else:
         config, records = config_of(compared_runs, keys, "compare")
@@ -255,7 +257,7 @@ def resume(
     InputWarning
         As :func:`fit` does.
     """
-    from bwbayes.app.fit.surroundings import console_of, warn
+    from bwbayes.app.jobs.at_work import console_of, warn
     from bwbayes.app.running import run
     from bwbayes.app.running.folder import RunFolder
 
@@ -324,7 +326,7 @@ def campaign(
 
     from bwbayes.app.config.config import dump
     from bwbayes.app.config.keywords import config_of
-    from bwbayes.app.fit.surroundings import console_of, folder_or_scratch, warn
+    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
     from bwbayes.app.jobs.campaign import config_text, resume, start
 
     text, where = "", Path()
@@ -347,24 +349,6 @@ def campaign(
     finished = resume(begun, console_of(progress), workers=workers, executor=executor)
     warn(finished.notes, 3)
     return replace(finished, _scratch=scratch)
-
-
-def _is_folder(run: Any) -> bool:
-    return isinstance(run, str | Path) and Path(run).is_dir()
-
-
-def _finished(run: Any) -> tuple[str, Fit]:
-    """Return a fit with its name, or the run in a folder with the folder's name."""
-    from bwbayes.app.fit.fitted import Fit
-
-    if isinstance(run, Fit):
-        return run.name, run
-    if not _is_folder(run):
-        raise InputError(
-            f"compare: {run if isinstance(run, str | Path) else type(run).__name__}: is "
-            "neither a fit nor the folder of a run; give a list of those alone, or records alone"
-        )
-    return Path(run).name, open_run(run)
 
 
 def _write(records: Mapping[str, Record], folder: Path) -> None:

@@ -19,16 +19,15 @@ import numpy as np
 
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.report.product import Shown
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.shown import head
 
 if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
-    from bwbayes.app.fit.surroundings import Scratch
-    from bwbayes.app.jobs.at_work import at_work
+    from bwbayes.app.jobs.at_work import Scratch, at_work
     from bwbayes.app.jobs.compensate import compensate as compensate_fit
     from bwbayes.app.jobs.design import design as design_fit
     from bwbayes.app.jobs.export import export as export_fit
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     from bwbayes.comparison.compared import Comparison
     from bwbayes.diagnosis.standing import Standing
     from bwbayes.diagnosis.validation import Verdict
-    from bwbayes.inference.engine import Engine
     from bwbayes.prediction.loops import Loops
     from bwbayes.report.report import Report
     from bwbayes.report.result import Result
@@ -68,7 +66,7 @@ class _JobOf:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(Shown):
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
     Parameters
@@ -315,33 +313,16 @@ class Fit:
 
         return compare(self, *others, **options)
 
-    def resume(
-        self,
-        *,
-        ess: float | None = None,
-        steps: int | None = None,
-        engine: Engine | None = None,
-        workers: int | None = None,
-        executor: Any = None,
-        progress: bool = True,
-    ) -> Fit:
+    def resume(self, *, executor: Any = None, progress: bool = True, **options: Any) -> Fit:
         """Continue the sampling, with a new target or budget, and return what comes of it.
 
-        Parameters and errors are as in :func:`bwbayes.resume`.
+        Options and errors are as in :func:`bwbayes.resume`.
         """
-        from bwbayes.app.fit.surroundings import console_of, warn
+        from bwbayes.app.jobs.at_work import console_of, warn
         from bwbayes.app.running import run
 
-        fit = run.resume(
-            self.folder,
-            console_of(progress),
-            workers=workers,
-            ess=ess,
-            steps=steps,
-            engine=engine,
-            files=self._scratch is None,
-            backend=executor,
-        )
+        options |= {"files": self._scratch is None, "backend": executor}
+        fit = run.resume(self.folder, console_of(progress), **options)
         warn(fit.notes, 3)
         return fit.knowing(_scratch=self._scratch)
 
@@ -383,26 +364,14 @@ class Fit:
         return self.result
 
     @property
-    def _title(self) -> str:
+    def heading(self) -> str:
+        """Its name, and how it ended."""
         name = self.problem.config.name or ", ".join(
             r.origin for r in self.problem.records.values()
         )
         if self.converged:
             return f"{name}: converged, validation {self.standing.status}"
         return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
-
-    def __repr__(self) -> str:
-        return head(str(self))
-
-    def __str__(self) -> str:
-        from bwbayes.report.screen import as_text
-
-        return f"{self._title}\n{as_text(self.report())}"
-
-    def _repr_html_(self) -> str:
-        from bwbayes.report.page import fragment
-
-        return fragment(replace(self.report(), title=self._title))
 
     def report(self) -> Report:
         """Return what the page of the run says."""

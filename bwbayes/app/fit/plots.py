@@ -15,14 +15,9 @@ from bwbayes.control.tracking import Tracking
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.errors import InputError, suggestion
 from bwbayes.report.figures import drawn
-from bwbayes.report.figures.chain import draw_corner, draw_ranks, draw_trace
 from bwbayes.report.figures.control import draw_tracking
-from bwbayes.report.figures.coverage import draw_coverage
-from bwbayes.report.figures.loop import draw_loop
-from bwbayes.report.figures.measured import draw_loops
+from bwbayes.report.figures.pictures import draw_kind
 from bwbayes.report.figures.record import record_drawings
-from bwbayes.report.figures.residuals import draw_innovations, draw_spectrum
-from bwbayes.report.figures.series import draw_bands
 from bwbayes.report.report import Figure
 
 if TYPE_CHECKING:
@@ -55,40 +50,40 @@ class Plots:
         By default for all that was predicted with the fit, or for the bands of these names.
         """
         bands = self._fit.bands
-        return drawn(draw_loop, [_named(bands, name)[1] for name in names or bands])
+        return drawn(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
 
     def loops(self) -> Figure:
         """Draw the major and a minor loop and the initial curve, measured."""
-        return drawn(draw_loops, self._fit.loops)
+        return drawn(draw_kind, "loops", self._fit.loops)
 
     def bands(self, name: str | None = None) -> Figure:
         """Draw the bands of one window or record along time, by default the first fitted one."""
-        return drawn(draw_bands, _named(self._fit.bands, name)[1])
+        return drawn(draw_kind, "bands", _named(self._fit.bands, name)[1])
 
     def coverage(self) -> Figure:
         """Draw how much the bands cover against what they promise, and the readings' PIT."""
-        return drawn(draw_coverage, [*self._fit.bands.values()], self._fit.result.scores)
+        return drawn(draw_kind, "coverage", [*self._fit.bands.values()], self._fit.result.scores)
 
     def innovations(self, name: str | None = None) -> Figure:
         """Draw whether innovations, what each reading adds, are white, normal, of one size."""
-        return drawn(draw_innovations, self._whitened(name))
+        return drawn(draw_kind, "innovations", self._whitened(name))
 
     def spectrum(self, name: str | None = None) -> Figure:
         """Draw the residual's spectrum beside the noise model's."""
-        return drawn(draw_spectrum, self._whitened(name))
+        return drawn(draw_kind, "spectrum", self._whitened(name))
 
     def corner(self) -> Figure:
         """Draw each parameter of the posterior, and each pair of them."""
         self._fit.require_converged()
-        return drawn(draw_corner, self._fit.result)
+        return drawn(draw_kind, "corner", self._fit.result)
 
     def trace(self) -> Figure:
         """Draw each ensemble's mean and spread, step by step."""
-        return drawn(draw_trace, self._fit.result)
+        return drawn(draw_kind, "trace", self._fit.result)
 
     def ranks(self) -> Figure:
         """Draw how the ranks of each ensemble's draws are spread."""
-        return drawn(draw_ranks, self._fit.result)
+        return drawn(draw_kind, "ranks", self._fit.result)
 
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""

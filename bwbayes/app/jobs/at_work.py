@@ -1,23 +1,40 @@
-"""A fit that has converged put to work, and the voltages it may use."""
+"""A fit put to work: its jobs as methods that warn, the voltages they may use, where it lives.
+
+What the command line prints as a remark is a warning in Python.
+"""
 
 from __future__ import annotations
 
+import shutil
+import sys
+import tempfile
+import warnings
+import weakref
 from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate
 
 import numpy as np
+from rich.console import Console
 
-from bwbayes.app.fit.surroundings import warn
-from bwbayes.errors import InputError, suggestion
+from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem
 
-__all__ = ["at_work", "command_limits", "limits_of"]
+__all__ = [
+    "Scratch",
+    "at_work",
+    "command_limits",
+    "console_of",
+    "folder_or_scratch",
+    "limits_of",
+    "warn",
+]
 
 
 def at_work[**P, R](
@@ -49,10 +66,7 @@ def at_work[**P, R](
 def limits_of(problem: Problem, limits: tuple[float, float] | None) -> Span:
     """Return the voltages that may be used: those given, or those of all that was fitted, V.
 
-    Raises
-    ------
-    InputError
-        They are not two voltages, the lower one first.
+    Raises InputError: they are not two voltages, the lower one first.
     """
     ranges = [record.range_voltage for record in problem.records.values()]
     low, high = limits or (min(low for low, _ in ranges), max(high for _, high in ranges))
@@ -65,3 +79,32 @@ def command_limits(problem: Problem, limits: tuple[float, float] | None) -> Span
     """Return the voltages of a command: those given, or zero and all fitted ones, V."""
     low, high = limits_of(problem, limits)
     return Span(low, high) if limits else Span(min(low, 0.0), max(high, 0.0))
+
+
+class Scratch:
+    """A temporary folder that is removed when nobody needs it any more."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="bwbayes-"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
+def folder_or_scratch(folder: str | Path | None, name: str) -> tuple[Path, Scratch | None]:
+    """Return a user's folder, or without one a temporary one and what keeps it there."""
+    if folder is not None:
+        return Path(folder), None
+    scratch = Scratch()
+    return scratch.path / name, scratch
+
+
+def console_of(progress: bool) -> Console:
+    """Return where progress goes: the terminal's own lines, and in a notebook plain ones."""
+    if Console(quiet=True).is_jupyter:
+        return Console(file=sys.stdout, force_jupyter=False, quiet=not progress)
+    return Console(stderr=True, quiet=not progress)
+
+
+def warn(lines: Iterable[str], level: int) -> None:
+    """Warn of each line; the caller of the function that calls this is level 3."""
+    for line in lines:
+        warnings.warn(line, InputWarning, stacklevel=level)

@@ -12,30 +12,27 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
-from bwbayes.app.jobs.batch import batch
-from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
+from bwbayes.app.running.progress import batch
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
 from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import RANKED, Entry, Experiment, replicate
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
-from bwbayes.report.saving import save
+from bwbayes.report.outputs import save
 
 __all__ = ["experiment", "resume", "start"]
 
@@ -56,10 +53,7 @@ def start(
 
     The config's files are relative to the folder ``where``.
 
-    Raises
-    ------
-    InputError
-        The config, its records or the folder cannot be used.
+    Raises InputError: the config, its records or the folder cannot be used.
     """
     problem = resolve(config, where)
     experiment(problem)
@@ -72,12 +66,8 @@ def experiment(problem: Problem) -> Experiment:
     """Return what the replicates of a problem have in common.
 
     Held out are the validation windows of its own record; other records are made again with each
-    replicate's truth, at the times and with the voltage that they have.
-
-    Raises
-    ------
-    InputError
-        Its voltage shows no loop, or its prior leaves hardly anything.
+    replicate's truth, at the times and with the voltage that they have. Refused (InputError) are a
+    voltage that shows no loop, and a prior that leaves hardly anything.
     """
     # Refused is a prior of which no draw is possible.
     problem.posterior.prior.draw(np.random.default_rng(0), 64)
@@ -117,10 +107,7 @@ def resume(
         local (default), threads, processes, dask, or dask://HOST:PORT. In Python any executor, as
         in :func:`~bwbayes.app.running.workers.executor`.
 
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
+    Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
         problem = resolve(load(folder.config), folder.path)
@@ -149,16 +136,24 @@ def resume(
             _append(folder, json.dumps(made.entry))
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
-        provenance = {
-            "seed": seed,
-            "data_sha256": problem.sha256,
-            "versions": versions(problem.posterior.engine),
-        }
+        plan, packages = problem.plan, versions(problem.posterior.engine)
+        provenance = {"seed": seed, "data_sha256": problem.sha256, "versions": packages}
         calibration = replace(
             judge(ordered, generator(seed, "ranks")),
             name=problem.config.name or "calibration",
             parameters=problem.parameters,
-            facts=_facts(problem, provenance),
+            facts=[
+                *problem.facts.items(),
+                ("held out", ", ".join(problem.validations) or "nothing"),
+                (
+                    "sampling",
+                    f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
+                    f"at most {plan.most_steps} steps",
+                ),
+                ("seed", str(seed)),
+                ("data, SHA-256", problem.sha256),
+                ("versions", ", ".join(f"{name} {text}" for name, text in packages.items())),
+            ],
             provenance=provenance,
         )
         # Nothing in its files depends on when or how it was computed.
@@ -218,33 +213,3 @@ def _read(
             "folder's; restore that, or start again with `overwrite=True`"
         )
     return request.replicates, entries
-
-
-def _facts(problem: Problem, provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return what was run, by subject."""
-    model, plan = problem.config.model, problem.plan
-    windows = {
-        "fitted": [w for dataset in problem.posterior.datasets for w in dataset.training],
-        "held out": [w for validation in problem.validations.values() for w in validation.windows],
-    }
-    samples = [sum(w.stop - w.start for w in several) for several in windows.values()]
-    one = len(problem.records) == 1
-    voltages = {
-        "voltage" if one else f"voltage, {name}": f"{record.origin}: {record.samples} samples "
-        f"every {record.interval:g} s"
-        for name, record in problem.records.items()
-    }
-    return [
-        *voltages.items(),
-        (", ".join(windows), ", ".join(f"{count} samples" for count in samples)),
-        ("model", in_words(model)),
-        ("noise", model.noise),
-        (
-            "sampling",
-            f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
-            f"at most {plan.most_steps} steps",
-        ),
-        ("seed", str(provenance["seed"])),
-        ("data, SHA-256", str(provenance["data_sha256"])),
-        ("versions", ", ".join(f"{name} {text}" for name, text in provenance["versions"].items())),
-    ]

@@ -1,34 +1,49 @@
 """A campaign: one posterior for each record of a folder, and what they say together.
 
 :func:`start` makes the folder; :func:`resume` fits the records whose runs have not ended, side by
-side, and writes table and page over all of them. A record's run depends on the config, the seed and
-the record alone, and the tables on the runs alone, so it does not matter in how many pieces or with
-how many workers a campaign is done, and records that come later are fitted by themselves.
+side and each as ``bwbayes run`` fits it, and writes table and page over all of them. One that
+cannot be used comes back as a refusal of one line. A record's run depends on the config, the seed
+and the record alone, and the tables on the runs alone, so it does not matter in how many pieces or
+with how many workers a campaign is done, and records that come later are fitted by themselves.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import tomllib
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
-from bwbayes.app.config.config import checked, dump, load
-from bwbayes.app.jobs.batch import batch
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.config.config import Config, checked, dump, load, parse
+from bwbayes.app.config.proposal import propose
+from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.running.campaign import Campaign, Row
-from bwbayes.app.running.campaign_folder import CampaignFolder, Origin, records_in
-from bwbayes.app.running.record_task import SPECIMEN, Ended, fit_record
+from bwbayes.app.running.campaign_folder import (
+    ENDED,
+    CampaignFolder,
+    Origin,
+    digest,
+    ended,
+    records_in,
+)
+from bwbayes.app.running.fingerprint import fingerprint
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.progress import batch
+from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.population import FEWEST, Population, population
-from bwbayes.population.specimen import Specimen
-from bwbayes.report.saving import save
+from bwbayes.population.specimen import Specimen, specimen_of
+from bwbayes.report.outputs import save, write_summary
 
 __all__ = ["config_text", "resume", "start"]
 
@@ -61,10 +76,7 @@ def start(
     ``config`` is that of all ``records``, as TOML, its files relative to the folder ``where``;
     empty lets each record propose its own. With ``pictures`` every run has figures and report.
 
-    Raises
-    ------
-    InputError
-        No records, or a folder of something else.
+    Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
     origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
@@ -91,10 +103,7 @@ def resume(
         in :func:`~bwbayes.app.running.workers.executor`. The machines of a cluster must all see the
         campaign's folder and that of the records by the same path.
 
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
+    Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
         origin, config = folder.origin(), folder.config.read_text(encoding="utf-8")
@@ -112,11 +121,11 @@ def resume(
             if not folder.is_done(file)
         ]
         folder.summary.unlink(missing_ok=True)
-        ended: Ended
-        for ended in batch(
+        outcome: Ended
+        for outcome in batch(
             fit_record,
             tasks,
-            lambda ended: "refused" if ended.refused else ended.short,
+            lambda outcome: "refused" if outcome.refused else outcome.short,
             console=console,
             kind="record",
             done=len(fitted) - len(tasks),
@@ -124,8 +133,8 @@ def resume(
             workers=workers,
             backend=executor,
         ):
-            if ended.refused:
-                refused[ended.file.name] = ended.short
+            if outcome.refused:
+                refused[outcome.file.name] = outcome.short
         console.print("combining the records ...", highlight=False)
         rows = tuple(_row(folder, file, refused.get(file.name, "")) for file in files)
         campaign = Campaign(folder, rows, _population(folder, rows))
@@ -159,3 +168,73 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
     standing = Standing.read(numbers)
     status = standing.status if standing.holds else f"validation {standing.status}"
     return Row(file.stem, file.name, status, "; ".join(standing.lines), numbers)
+
+
+# What a population needs of a run, in the run's folder.
+SPECIMEN = "specimen.npz"
+
+
+class Ended(NamedTuple):
+    """What came of a record: ``short`` says why it was refused, or that it did not converge."""
+
+    file: Path
+    short: str = ""
+    refused: bool = False
+
+
+def fit_record(file: Path, config: str, where: Path, run: Path, pictures: bool) -> Ended:
+    """Fit a record to its end in the folder ``run``, from wherever that stands.
+
+    A run of an earlier form of the record or config is replaced. ``config`` is that of all records
+    in TOML, its files relative to the folder ``where``; empty for one that is proposed from the
+    record. Figures, report and bands are written with ``pictures`` alone.
+    """
+    with warnings.catch_warnings():
+        # They are the run's remarks, and a hundred records of one kind say the same.
+        warnings.simplefilter("ignore", InputWarning)
+        try:
+            record = digest(file)
+            problem = resolve(_config_of(file, config, where), where)
+            folder = _run_folder(run, problem)
+            fit = resume_run(folder, Console(quiet=True), workers=1, files=pictures)
+            if not pictures:
+                write_summary(folder.summary, fit.numbers)
+            if fit.converged:
+                source = generator(fit.problem.config.seed, "specimen")
+                specimen = specimen_of(file.stem, fit.problem.posterior, fit.flat_draws, source)
+                specimen.save(run / SPECIMEN)
+            (run / ENDED).write_text(ended(record, run), encoding="utf-8")
+            return Ended(file, "" if fit.converged else "not converged")
+        except InputError as error:
+            # Of a file in the folder of the records its name says enough.
+            return Ended(file, str(error).replace(f"{file.parent}{os.sep}", ""), True)
+        # One record must not end the others, whatever is wrong with it.
+        except Exception as error:
+            return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
+
+
+def _config_of(file: Path, text: str, where: Path) -> Config:
+    """Return the config of a record."""
+    if text:
+        config = parse(text, "campaign.toml").with_record(file)
+    else:
+        proposal = propose(file, where)
+        if proposal.pointless is not None:
+            raise InputError(f"{file}: {proposal.pointless.error}")
+        config = proposal.config
+    return config.model_copy(update={"name": file.stem})
+
+
+def _run_folder(path: Path, problem: Problem) -> RunFolder:
+    """Return the run's folder as it stands, if it is of this problem; a new one if not."""
+    if path.exists():
+        try:
+            existing = RunFolder.open(path)
+            # A target or budget that was changed by `bwbayes resume` is kept.
+            same_posterior = fingerprint(load(existing.config)) == fingerprint(problem.config)
+            if same_posterior and existing.problem().record.sha256 == problem.record.sha256:
+                return existing
+        except (InputError, OSError):
+            pass  # half a folder, or one of an earlier version
+        shutil.rmtree(path, ignore_errors=True)
+    return RunFolder.create(path, problem, overwrite=False)

@@ -17,7 +17,7 @@ from bwbayes.app.running.explaining import explained, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record
-from bwbayes.report.priors import priors_table
+from bwbayes.report.outputs import save
 from bwbayes.report.report import (
     Banner,
     Picture,
@@ -26,7 +26,7 @@ from bwbayes.report.report import (
     Text,
     remarks_banner,
 )
-from bwbayes.report.saving import save
+from bwbayes.report.tables import priors_table
 
 __all__ = ["check"]
 
@@ -34,17 +34,9 @@ __all__ = ["check"]
 def check(config: Config, folder: Path, out: Path) -> Report:
     """Check a config and its record, fit a point, write ``out/check.html``; return its report.
 
-    Parameters
-    ----------
-    config
-        The config; its files are relative to `folder`.
-    out
-        The page's folder, made if need be; an existing page is replaced.
+    The config's files are relative to `folder`; an existing page is replaced.
 
-    Raises
-    ------
-    InputError
-        The config or its record cannot be used.
+    Raises InputError: the config or its record cannot be used.
     """
     problem = resolve(config, folder)
     posterior, seed = problem.posterior, problem.config.seed

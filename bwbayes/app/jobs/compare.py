@@ -1,9 +1,9 @@
 """Which model? Fits of the same readings, each judged by what a comparison weighs.
 
-:func:`compare` takes fits that exist, :func:`open_runs` those in folders. :func:`compare_models`
-runs a config with several models side by side, each into a folder of its own, and goes on with
-those that are there already. All are screened by their MAP estimates first; only what is within
-reach is sampled. Their options are those of :func:`bwbayes.compare`.
+:func:`compare` takes fits and runs that exist. :func:`compare_models` runs a config with several
+models side by side, each into a folder of its own, and goes on with those that are there already.
+All are screened by their MAP estimates first; only what is within reach is sampled. Their options
+are those of :func:`bwbayes.compare`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, ModelConfig, dump
-from bwbayes.app.config.models import slug
-from bwbayes.app.fit.fitted import finished
+from bwbayes.app.config.keywords import slug
+from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
-from bwbayes.app.problem.model import actuator_of, in_words
+from bwbayes.app.problem.parameters import actuator_of, in_words
 from bwbayes.app.problem.problem import Problem, generator, resolve
 from bwbayes.app.problem.records import training_records
 from bwbayes.app.running.folder import RunFolder
@@ -46,34 +46,34 @@ from bwbayes.prediction.scores import score
 from bwbayes.record import Record
 from bwbayes.sampling.chain import draws, log_densities
 
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["by_name", "compare", "compare_models", "open_runs"]
+__all__ = ["compare", "compare_models", "fits_of"]
 
 
-def open_runs(folders: Sequence[Path]) -> dict[str, Fit]:
-    """Return the fits of the runs in folders, by the folders' names.
+def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:
+    """Return fits by their names, and the runs in folders by the folders'.
 
-    Raises
-    ------
-    InputError
-        No such run, or one that is there twice.
+    Where two would have the same name, folders go by their path, and fits by number too.
+
+    Raises InputError: neither a fit nor the folder of a run, or a folder that is there twice.
     """
-    if len({folder.resolve() for folder in folders}) < len(folders):
+    fits, names, runs = [], [], list(runs)
+    folders = [Path(run).resolve() for run in runs if isinstance(run, str | Path)]
+    if len(set(folders)) < len(folders):
         raise InputError("compare: the same run is there twice; leave one out")
-    names = [folder.name for folder in folders]
-    if len(set(names)) < len(names):
-        names = [str(folder) for folder in folders]
-    return {name: finished(RunFolder.open(path)) for name, path in zip(names, folders, strict=True)}
-
-
-def by_name(named: Iterable[tuple[str, Fit]]) -> dict[str, Fit]:
-    """Return fits by their names; those of one name by number too."""
-    pairs = list(named)
-    if len(dict(pairs)) == len(pairs):
-        return dict(pairs)
-    return {f"{name} {number}": fit for number, (name, fit) in enumerate(pairs, start=1)}
+    for number, run in enumerate(runs, start=1):
+        if isinstance(run, Fit):
+            fits.append(run)
+            names.append((run.name, f"{run.name} {number}"))
+        elif isinstance(run, str | Path):
+            fits.append(finished(RunFolder.open(Path(run))))
+            names.append((Path(run).name, str(run)))
+        else:
+            raise InputError(
+                f"compare: {type(run).__name__}: is neither a fit nor the folder of a run; give a "
+                "list of those alone, or records alone"
+            )
+    by_name, longer = (dict(zip(column, fits, strict=True)) for column in zip(*names, strict=True))
+    return by_name if len(by_name) == len(fits) else longer
 
 
 def compare(
@@ -86,10 +86,7 @@ def compare(
 ) -> Comparison:
     """Compare fits of the same readings, of different models, by name.
 
-    Raises
-    ------
-    InputError
-        Fits of different readings: their numbers would not be about the same thing.
+    Raises InputError: fits of different readings: their numbers would not be about the same thing.
     """
     console = console or Console(quiet=True)
     first, *others = fits
@@ -131,10 +128,8 @@ def compare_models(
     ``bwbayes resume FOLDER`` does the same for another one. The machines of a cluster must all see
     the folder ``out`` by the same path.
 
-    Raises
-    ------
-    InputError
-        The config, its records or a folder cannot be used, or a folder has another run.
+    Raises InputError: the config, its records or a folder cannot be used, or a folder has another
+    run.
     """
     _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
     folders: dict[str, RunFolder] = {}
@@ -206,10 +201,8 @@ def _require_same(pair: str, first: Problem, other: Problem) -> None:
 def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison:
     """Compare models of the same readings; ``problem`` is that of any of them."""
     facts = [(model.name, model.model) for model in candidates]
-    facts += [
-        (name, f"{record.origin}: {record.samples} samples every {record.interval:g} s")
-        for name, record in problem.records.items()
-    ]
+    about = ("record", "fitted")
+    facts += [item for item in problem.facts.items() if item[0].partition(" ")[0] in about]
     facts.append(("readings fitted", str(candidates[0].readings)))
     facts.append(("held out", ", ".join(problem.validations) or "nothing"))
     return recommend(candidates, facts)

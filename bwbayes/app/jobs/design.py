@@ -130,10 +130,7 @@ def candidates_of(
 ) -> dict[str, FloatArray]:
     """Return the candidates' voltages (samples,) by name, V, at a record's interval.
 
-    Raises
-    ------
-    InputError
-        A file that cannot be read, or has no signal.
+    Raises InputError: a file that cannot be read, or has no signal.
     """
     if not isinstance(candidates, str | Path):
         return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}

@@ -17,7 +17,7 @@ from bwbayes.control.exported import Exported, exported
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold, parse_hold
-from bwbayes.report.saving import refuse_existing
+from bwbayes.report.outputs import refuse_existing
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
@@ -89,10 +89,7 @@ def export(
 def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
     """Return an actuator at a controller's pace: samples a second up to 10 MHz, with this hold.
 
-    Raises
-    ------
-    InputError
-        A rate that is not above zero, or is too high.
+    Raises InputError: a rate that is not above zero, or is too high.
     """
     if rate is not None and not 0 < rate <= 1e7:
         raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {1e7:g}")

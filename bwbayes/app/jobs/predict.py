@@ -118,10 +118,7 @@ def prediction_notes(prediction: Prediction) -> list[str]:
 def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:
     """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
 
-    Raises
-    ------
-    InputError
-        They cannot be written.
+    Raises InputError: they cannot be written.
     """
     table, numbers, picture = files
     try:

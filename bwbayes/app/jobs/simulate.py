@@ -13,7 +13,7 @@ from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform
 from bwbayes.record.waveforms import signal as named
-from bwbayes.report.saving import refuse_existing
+from bwbayes.report.outputs import refuse_existing
 
 __all__ = ["simulate"]
 

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from bwbayes.app.config.config import Config, RecordConfig, ValidationConfig
+from bwbayes.app.config.config import Config
 from bwbayes.app.problem.parameters import place_of
 from bwbayes.app.problem.records import whole
 from bwbayes.errors import InputError, suggestion
@@ -30,86 +29,44 @@ def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[
     A whole has the name of its first record, and its start. Windows of the others are those of the
     whole, later by what was before; readings that a config leaves out of a part stay out.
 
-    Parameters
-    ----------
-    config
-        Its ``[record.NAME]`` say what they continue.
-    records
-        The training records by name, with what is left out of them.
-
-    Raises
-    ------
-    InputError
-        A record that continues none of the others, itself, one that another continues too, or one
-        that it cannot follow: of another interval or hold, cut at its end, with time in between.
+    Raises InputError: a record that continues none of the others, itself, one that another
+    continues too, or one that it cannot follow: of another interval or hold, cut at its end, with
+    time in between.
     """
-    following = _following(config)
-    if not following:
-        return config, dict(records)
-    wholes: dict[str, Record] = {}
-    tables: dict[str, RecordConfig] = {}
-    # The whole that each record belongs to, and how much later it is on the clock of that, s.
-    roots: dict[str, str] = {}
-    shifts: dict[str, float] = {}
-    for root in records:
-        if config.records[root].continues is not None:
-            continue
-        names = [root]
-        while names[-1] in following:
-            names.append(following[names[-1]])
-        joint = records[root]
-        shifts[root] = 0.0
-        for before, name in pairwise(names):
-            _require_next(config, before, name, records)
-            shifts[name] = joint.start + joint.duration - records[name].start
-            joint = _put_together(joint, records[name])
-        roots |= dict.fromkeys(names, root)
-        wholes[root] = joint
-        tables[root] = _table(config, {name: shifts[name] for name in names}, records)
-    circle = [name for name in records if name not in roots]
-    if circle:
-        names_of_it = ", ".join([*circle, circle[0]])
-        place = place_of(circle[0])
-        raise InputError(f"{place}.continues: a circle ({names_of_it}); one is the first")
-    validation = {name: _moved(v, roots, shifts) for name, v in config.validation.items()}
-    return config.model_copy(update={"record": tables, "validation": validation}), wholes
-
-
-def _following(config: Config) -> dict[str, str]:
-    """Return which record comes after which, by the name of the one before."""
-    following: dict[str, str] = {}
-    for name, source in config.records.items():
-        before = source.continues
-        if before is None:
-            continue
-        others = [other for other in config.records if other != name]
-        hint = suggestion(before, others) if others else "remove it"
-        wrong = {
-            "the record itself; name the one measured before it": before == name,
-            f"no other record {before!r}; {hint}": before not in others,
-            f"{following.get(before)} continues {before} too; one record can": before in following,
-            f"it starts where {before} ends; remove its from_rest": source.from_rest,
-            "the stand starts every signal at rest; give files": source.file is None,
-        }
-        _refuse(name, wrong)
-        following[before] = name
-    return following
-
-
-def _refuse(name: str, wrong: Mapping[str, bool]) -> None:
-    """Refuse what a record continues, for the first reason that is true."""
-    for reason, true in wrong.items():
-        if true:
-            raise InputError(f"{place_of(name)}.continues: {reason}")
+    wholes = dict(records)
+    before = {n: s.continues for n, s in config.records.items() if s.continues is not None}
+    for name, first in before.items():
+        _require_next(config, first, name, records)
+    while before:
+        name = next((name for name, first in before.items() if first not in before), "")
+        if not name:
+            first, *others = before
+            names = ", ".join([first, *others, first])
+            raise InputError(f"{place_of(first)}.continues: a circle ({names}); one is the first")
+        first = before.pop(name)
+        config = _appended(config, first, name, wholes)
+        before = {n: first if b == name else b for n, b in before.items()}
+    return config, wholes
 
 
 def _require_next(config: Config, before: str, name: str, records: Mapping[str, Record]) -> None:
-    """Refuse a record that cannot go on where another ends."""
-    first, other = records[before], records[name]
+    """Refuse a record that cannot go on where the one ``before`` ends."""
+    others = [other for other in config.records if other != name]
+    reason = "the record itself; name the one measured before it"
+    if before != name:
+        reason = f"no other record {before!r}; "
+        reason += suggestion(before, others) if others else "remove it"
+    if before not in others:
+        raise InputError(f"{place_of(name)}.continues: {reason}")
+    rival = next(n for n, source in config.records.items() if source.continues == before)
+    first, other, source = records[before], records[name], config.records[name]
     end = first.start + first.duration
     # A clock of its own begins where that of the record before did, or earlier.
     own_clock = other.start <= first.start + first.interval / 2
     wrong = {
+        f"{rival} continues {before} too; one record can": rival != name,
+        f"it starts where {before} ends; remove its from_rest": source.from_rest,
+        "the stand starts every signal at rest; give files": source.file is None,
         f"sampled every {other.interval:g} s, {before} every {first.interval:g} s; remove it, they "
         "are two records": not np.isclose(first.interval, other.interval, rtol=1e-6, atol=0),
         f"its voltage is the {other.voltage_is}, that of {before} the {first.voltage_is}; see "
@@ -118,48 +75,40 @@ def _require_next(config: Config, before: str, name: str, records: Mapping[str, 
         f"begins at {other.start:g} s, {before} ends at {end:g} s; a record can only be continued "
         "at once": not own_clock and abs(other.start - end) > first.interval / 2,
     }
-    _refuse(name, {reason: bool(true) for reason, true in wrong.items()})
+    for reason, is_wrong in wrong.items():
+        if is_wrong:
+            raise InputError(f"{place_of(name)}.continues: {reason}")
 
 
-def _put_together(first: Record, other: Record) -> Record:
-    """Return the record of two, the second right after the first."""
+def _appended(config: Config, before: str, name: str, records: dict[str, Record]) -> Config:
+    """Put a record behind another, in ``records`` too; windows and outliers are on one clock."""
+    first, other = records[before], records.pop(name)
+    shift = first.start + first.duration - other.start
+    parts = (config.records[before], first, 0.0), (config.records[name], other, shift)
+    sources = [source for source, _, _ in parts]
+    changes: dict[str, Any] = {"train": None, "outliers": None}
+    if any(source.train is not None for source in sources):
+        changes["train"] = [
+            [edge + later for edge in window]
+            for source, record, later in parts
+            for window in source.train or [list(whole(record))]
+        ]
+    if all(source.outliers is not None for source in sources):
+        changes["outliers"] = [t + later for s, _, later in parts for t in s.outliers or ()]
+    changes["remarks"] = [text for source in sources for text in source.remarks or ()] or None
+    tables = {n: source for n, source in config.records.items() if n != name}
+    tables[before] = tables[before].model_copy(update=changes)
+    validation = dict(config.validation)
+    for key, held_out in validation.items():
+        if held_out.of == name:
+            window = held_out.window
+            if window is not None and not held_out.another:
+                window = [[edge + shift for edge in edges] for edges in window]
+            validation[key] = held_out.model_copy(update={"of": before, "window": window})
     series: dict[str, Any] = {}
-    for name in ("voltage", "displacement", "truth"):
-        values = getattr(first, name), getattr(other, name)
-        series[name] = None if any(v is None for v in values) else np.concatenate(values)
-    return replace(first, **series, origin=f"{first.origin}, then {other.origin}")
-
-
-def _table(
-    config: Config, shifts: Mapping[str, float], records: Mapping[str, Record]
-) -> RecordConfig:
-    """Return what a config says of a whole: windows and outliers of all parts, on one clock."""
-    sources = {name: config.records[name] for name in shifts}
-    train = outliers = None
-    if any(source.train is not None for source in sources.values()):
-        train = [
-            [edge + shifts[name] for edge in window]
-            for name, source in sources.items()
-            for window in source.train or [list(whole(records[name]))]
-        ]
-    if all(source.outliers is not None for source in sources.values()):
-        outliers = [
-            time + shifts[name]
-            for name, source in sources.items()
-            for time in source.outliers or ()
-        ]
-    remarks = [text for source in sources.values() for text in source.remarks or ()] or None
-    changes = {"train": train, "outliers": outliers, "remarks": remarks, "continues": None}
-    return next(iter(sources.values())).model_copy(update=changes)
-
-
-def _moved(
-    validation: ValidationConfig, roots: Mapping[str, str], shifts: Mapping[str, float]
-) -> ValidationConfig:
-    """Return a validation of the whole for one of a part."""
-    of, window = validation.of, validation.window
-    if of is None:
-        return validation
-    if window is not None and not validation.another:
-        window = [[edge + shifts[of] for edge in edges] for edges in window]
-    return validation.model_copy(update={"of": roots[of], "window": window})
+    for kind in ("voltage", "displacement", "truth"):
+        values = getattr(first, kind), getattr(other, kind)
+        series[kind] = None if any(v is None for v in values) else np.concatenate(values)
+    origin = f"{first.origin}, then {other.origin}"
+    records[before] = replace(first, **series, origin=origin)
+    return config.model_copy(update={"record": tables, "validation": validation})

@@ -20,12 +20,15 @@ from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config, ParameterConfig, RecordConfig
 from bwbayes.app.problem.continued import joined
-from bwbayes.app.problem.model import actuator_of, explicit_model, recoverable
 from bwbayes.app.problem.parameters import (
+    actuator_of,
     as_config,
     contexts_of,
+    explicit_model,
+    in_words,
     parameters_of,
     readings_of,
+    recoverable,
 )
 from bwbayes.app.problem.records import (
     Slices,
@@ -122,6 +125,22 @@ class Problem:
         return sha256(json.dumps(digests).encode()).hexdigest()
 
     @property
+    def facts(self) -> dict[str, str]:
+        """What is fitted, for people: one line each, by subject."""
+        facts = {}
+        for name, record in self.records.items():
+            which = "" if len(self.records) == 1 else f" {name}"
+            facts[f"record{which}"] = (
+                f"{record.origin}: {record.samples} samples every {record.interval:g} s"
+            )
+            facts[f"fitted{which}"] = ", ".join(
+                f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
+                for w in self.posterior.alone(name).only.training
+            )
+        model = self.config.model
+        return facts | {"model": in_words(model), "noise": model.noise}
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """All parameters of the model and the noise."""
         return self.posterior.prior.parameters
@@ -194,10 +213,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     training records ("record", if there is one alone), and others by the names of their
     validations.
 
-    Raises
-    ------
-    InputError
-        Anything in the config or the records that cannot be used.
+    Raises InputError: anything in the config or the records that cannot be used.
     """
     in_memory = records or {}
     with warnings.catch_warnings(record=True) as caught:

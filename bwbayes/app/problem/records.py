@@ -16,8 +16,7 @@ from bwbayes.app.config.config import (
     SignalConfig,
     ValidationConfig,
 )
-from bwbayes.app.problem.model import planned, stand_of
-from bwbayes.app.problem.parameters import place_of
+from bwbayes.app.problem.parameters import place_of, planned, stand_of
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
@@ -159,11 +158,8 @@ def validations_of(
 ) -> dict[str, Validation]:
     """Return what is held out, by name: windows, and records from memory, files or the stand.
 
-    Raises
-    ------
-    InputError
-        A record that cannot be used; a lead-in or window that does not fit into it, which is said
-        now: it would be a pity after the sampling.
+    Raises InputError: a record that cannot be used; a lead-in or window that does not fit into it,
+    which is said now: it would be a pity after the sampling.
     """
     validations = {}
     for name, source in config.validation.items():
@@ -206,11 +202,8 @@ def windows_of(
 ) -> tuple[dict[str, Slices], dict[str, Slices]]:
     """Return the windows of training records, as slices: to fit by record, held out by validation.
 
-    Raises
-    ------
-    InputError
-        A window outside of its record, windows that overlap, or one without a reading; a
-        measurement under two names that is fitted twice, in windows that overlap.
+    Raises InputError: a window outside of its record, windows that overlap, or one without a
+    reading; a measurement under two names that is fitted twice, in windows that overlap.
     """
     training: dict[str, Slices] = {}
     held_out: dict[str, Slices] = {}

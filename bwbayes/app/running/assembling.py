@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.app.problem.model import in_words
 from bwbayes.app.problem.problem import Problem, generator
 from bwbayes.app.running.cache import load, save, state_of
 from bwbayes.app.running.explaining import explained, lines
@@ -142,28 +141,13 @@ def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
 
 def _facts(problem: Problem, chain: ChainFile) -> dict[str, str]:
     """Return what was run, for people: one line each, by subject."""
-    facts = {}
-    for name, record in problem.records.items():
-        which = "" if len(problem.records) == 1 else f" {name}"
-        facts[f"record{which}"] = (
-            f"{record.origin}: {record.samples} samples every {record.interval:g} s"
-        )
-        facts[f"fitted{which}"] = ", ".join(
-            f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
-            for w in problem.posterior.alone(name).only.training
-        )
-    steps = ", ".join(f"{chain.steps(phase)} steps of {phase}" for phase in PHASES)
+    plan, steps = problem.plan, ", ".join(f"{chain.steps(p)} steps of {p}" for p in PHASES)
     accepted = {
         phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
         for phase in PHASES
     }
-    return {
-        **facts,
-        "model": in_words(problem.config.model),
-        "noise": problem.config.model.noise,
-        "sampling": (
-            f"{problem.plan.ensembles} ensembles of {problem.plan.walkers} walkers; {steps}"
-        ),
+    return problem.facts | {
+        "sampling": f"{plan.ensembles} ensembles of {plan.walkers} walkers; {steps}",
         "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
         "engine": problem.posterior.engine,
     }

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from bwbayes.population.population import Population, PopulationParameter, next_
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.report.figures import drawn
+from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Block,
@@ -37,7 +38,7 @@ from bwbayes.report.report import (
     Text,
 )
 from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
-from bwbayes.shown import brief, head
+from bwbayes.shown import brief
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
@@ -52,8 +53,6 @@ STATUSES = {
     "validation inconclusive": 5,
     "passed": 0,
 }
-
-QUANTILES = (0.025, 0.5, 0.975)
 
 
 @dataclass(frozen=True)
@@ -78,18 +77,13 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Campaign:
+class Campaign(Product):
     """Records that were fitted one by one, and what they say together.
 
-    Parameters
-    ----------
-    folder
-        The campaign's folder.
-    rows
-        How each record ended.
-    together
-        What they say together: their population, or why there is none.
+    ``rows`` say how each record ended; ``together`` is their population, or why there is none.
     """
+
+    NAME: ClassVar[str] = "campaign"
 
     folder: CampaignFolder
     rows: tuple[Row, ...]
@@ -150,24 +144,26 @@ class Campaign:
         """
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        lines = []
-        for row in self.rows:
-            line: dict[str, object] = {
+        own = ("mean", "sd", "lower_95", "upper_95")
+        lines = [
+            {
                 "record": row.name,
                 "file": row.file,
                 "status": row.status,
                 "reason": row.reason,
                 "outlier_in": " ".join(self.outliers.get(row.name, ())),
                 "steps": row.numbers.get("steps"),
+                **{
+                    f"{name}_{key}_{unit}": self._estimates(row).get(name, {}).get(key)
+                    for name, unit in self._units.items()
+                    for key in (
+                        *own,
+                        *(f"shrunk_{edge}" for edge in own[2:] if name in self._spreads),
+                    )
+                },
             }
-            estimates = self._parameters(row)
-            for name, unit in self._units.items():
-                statistics = ["mean", "sd", "lower_95", "upper_95"]
-                statistics += ["shrunk_lower_95", "shrunk_upper_95"] * (name in self._spreads)
-                for statistic in statistics:
-                    value = estimates.get(name, {}).get(statistic)
-                    line[f"{name}_{statistic}_{unit}"] = value
-            lines.append(line)
+            for row in self.rows
+        ]
         return pd.DataFrame(lines).astype({"steps": "Int64"}).set_index("record")
 
     def fit(self, name: str) -> Fit:
@@ -216,16 +212,11 @@ class Campaign:
             raise InputError("campaign: no record has converged, so there is nothing to draw")
         return drawn(self._draw)
 
-    def __repr__(self) -> str:
-        return head(str(self))
-
-    def __str__(self) -> str:
-        return "\n".join([f"{len(self.rows)} records: {self._counted}", *self.notes])
-
     def report(self) -> Report:
         """Return how the records of a campaign ended, and what they say together."""
         kinds: list[Kind] = [STATUS_KINDS.get(row.status, "bad") for row in self.rows]
         worst: Kind = min(kinds, key=["bad", "note", "good"].index, default="good")
+        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items() if count)
         outliers = [f"{record}: {', '.join(names)}" for record, names in self.outliers.items()]
         attention = [(row.name, mark(row.status), row.reason) for row in self.rows if row.reason]
         columns = ("Record", "Status", "Reason")
@@ -246,7 +237,7 @@ class Campaign:
             title=f"{name}, campaign",
             heading=f"Campaign: {name}",
             banners=[
-                Banner(worst, f"{len(self.rows)} records", [self._counted]),
+                Banner(worst, f"{len(self.rows)} records", [counts]),
                 *[Banner("note", "Off the population", items=outliers)] * bool(outliers),
             ],
             blocks=[
@@ -267,17 +258,13 @@ class Campaign:
     def _units(self) -> dict[str, str]:
         return {name: str(e["unit"]) for row in self.rows for name, e in row.parameters.items()}
 
-    @property
-    def _counted(self) -> str:
-        return ", ".join(f"{count} {status}" for status, count in self.counts.items() if count)
-
-    def _parameters(self, row: Row) -> dict[str, dict[str, Any]]:
+    def _estimates(self, row: Row) -> dict[str, dict[str, Any]]:
         """Return a record's estimates by parameter: by itself, and what the population says."""
-        parameters = {name: dict(estimate) for name, estimate in row.parameters.items()}
-        for name in parameters.keys() & self._spreads.keys():
+        estimates = {name: dict(estimate) for name, estimate in row.parameters.items()}
+        for name in estimates.keys() & self._spreads.keys():
             among = self._spreads[name].specimens.get(row.name)
             if among is not None:
-                parameters[name] |= {
+                estimates[name] |= {
                     "shrunk_median": among.median,
                     "shrunk_lower_95": among.lower,
                     "shrunk_upper_95": among.upper,
@@ -286,7 +273,7 @@ class Campaign:
                     "pareto_k": among.pareto_k,
                     "taken_for_normal": among.normal,
                 }
-        return parameters
+        return estimates
 
     def _numbers(self) -> dict[str, object]:
         """Return a campaign's numbers as ``campaign.json`` holds them."""
@@ -296,7 +283,7 @@ class Campaign:
                 "file": row.file,
                 "status": row.status,
                 "reason": row.reason or None,
-                "parameters": self._parameters(row) or None,
+                "parameters": self._estimates(row) or None,
                 **{key: row.numbers.get(key) for key in copied},
             }
             for row in self.rows
@@ -312,73 +299,52 @@ class Campaign:
         }
 
     def _draw(self) -> Figure:
-        from bwbayes.report.figures.campaign import (  # noqa: PLC0415  # slow to load
-            Interval,
-            ParameterPanel,
-            draw_parameters,
-        )
+        from bwbayes.report.figures.campaign import draw_parameters  # noqa: PLC0415  # slow to load
 
-        panels = []
-        for name, unit in self._units.items():
-            alone, shrunk, specimen = {}, {}, None
-            for row in self.rows:
-                if name in row.parameters:
-                    own = row.parameters[name]
-                    alone[row.name] = Interval(own["lower_95"], own["median"], own["upper_95"])
-            if name in self._spreads:
-                spread = self._spreads[name]
-                for record, among in spread.specimens.items():
-                    edges = among.lower, among.median, among.upper
-                    shrunk[record] = Interval(*edges, among.outlier)
-                specimen = Interval(*np.quantile(spread.new, QUANTILES))
-            panels.append(ParameterPanel(label_with_unit(name, unit), alone, shrunk, specimen))
-        return draw_parameters([row.name for row in self.rows if row.parameters], panels)
+        estimates = {row.name: self._estimates(row) for row in self.rows if row.parameters}
+        return draw_parameters(estimates, {name: s.new for name, s in self._spreads.items()})
 
     def _records_table(self) -> Table:
         """Return a row for each record: its parameters by themselves."""
-        rows, numbers = [], []
-        for row in self.rows:
-            texts = []
-            flat: dict[str, object] = {"record": row.name, "status": row.status}
-            for name in self._units:
-                own = row.parameters.get(name)
-                texts.append("" if own is None else _range(own["lower_95"], own["upper_95"]))
-                flat |= {f"{name} {key}": own[key] for key in ("mean", "sd")} if own else {}
-            rows.append((row.name, mark(row.status), *texts))
-            numbers.append(flat)
-        return Table(
+        columns = [
+            TableColumn("Record", text=lambda row: row.name),
+            TableColumn("Status", text=lambda row: mark(row.status)),
+        ]
+        for name, unit in self._units.items():
+            text = partial(_own_interval, name)
+            columns.append(TableColumn(label_with_unit(name, unit), text=text))
+        return Table.of(
             "records",
             "Records, 95 % intervals of each by itself",
-            ("Record", "Status", *(label_with_unit(*item) for item in self._units.items())),
-            rows,
-            records=numbers,
-            note="More is in campaign.csv and campaign.json; each record's own run is in records/.",
+            self.rows,
+            columns,
+            records=self.table.reset_index().to_dict("records"),
+            note="More is in campaign.json; each record's own run is in records/.",
         )
 
     def _population_table(self) -> Table:
-        rows = []
-        for spread in self._spreads.values():
-            low, _, high = np.quantile(spread.new, QUANTILES)
-            normal = sum(among.normal for among in spread.specimens.values())
-            rows.append(
-                (
-                    spread.name,
-                    unit_text(spread.unit),
-                    _estimate(spread.mean),
-                    _estimate(spread.spread, percent=spread.logarithmic),
-                    _range(low, high),
-                    ", ".join(spread.outliers),
-                    f"{spread.pareto_k:.2f}",
-                    f"{normal} of {len(spread.specimens)}",
-                )
-            )
-        columns = ("Parameter", "Unit", "Middle", "Spread", "A specimen not measured yet, 95 %")
-        judged = (TableColumn(title, on="page") for title in ("Pareto k", "Taken for normal"))
-        return Table(
+        def normal(spread: PopulationParameter) -> str:
+            count = sum(among.normal for among in spread.specimens.values())
+            return f"{count} of {len(spread.specimens)}"
+
+        columns = (
+            TableColumn("Parameter", text=lambda spread: spread.name),
+            TableColumn("Unit", text=lambda spread: unit_text(spread.unit)),
+            TableColumn("Middle", text=lambda spread: _estimate(spread.mean)),
+            TableColumn("Spread", text=lambda s: _estimate(s.spread, percent=s.logarithmic)),
+            TableColumn(
+                "A specimen not measured yet, 95 %",
+                text=lambda spread: _range(*np.quantile(spread.new, [0.025, 0.975])),
+            ),
+            TableColumn("Outliers", on="screen", text=lambda spread: ", ".join(spread.outliers)),
+            TableColumn("Pareto k", on="page", text=lambda spread: f"{spread.pareto_k:.2f}"),
+            TableColumn("Taken for normal", on="page", text=normal),
+        )
+        return Table.of(
             "population",
             "Population",
-            (*columns, TableColumn("Outliers", on="screen"), *judged),
-            rows,
+            self._spreads.values(),
+            columns,
             note="Medians, and 95 % intervals. A parameter above zero has a population that is "
             "normal in the logarithm: its middle is the median, its spread relative, in percent. "
             "Each parameter by itself. The records' own posteriors were reweighted; where Pareto k "
@@ -387,9 +353,14 @@ class Campaign:
         )
 
 
+def _own_interval(name: str, row: Row) -> str:
+    own = row.parameters.get(name)
+    return "" if own is None else _range(own["lower_95"], own["upper_95"])
+
+
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
     """Write a median and a 95 % interval; a relative spread in percent."""
-    low, median, high = np.quantile(draws, QUANTILES) * (100 if percent else 1)
+    low, median, high = np.quantile(draws, [0.025, 0.5, 0.975]) * (100 if percent else 1)
     return f"{median:.3g}{' %' if percent else ''} ({_range(low, high)})"
 
 

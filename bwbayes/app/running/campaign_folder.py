@@ -61,21 +61,11 @@ class CampaignFolder(Folder):
     def create(cls, path: Path, config: str, origin: Origin, *, overwrite: bool) -> Self:
         """Make the folder of a new campaign, whole or not at all; or return one of the same begun.
 
-        Parameters
-        ----------
-        path
-            The folder.
-        config
-            The config's text, empty for none.
-        origin
-            Where records and config's files are.
-        overwrite
-            Replace a campaign that is there already, with all its runs.
+        ``config`` is its text, empty for none; ``origin`` says where records and the files of the
+        config are; ``overwrite`` replaces a campaign that is there already, with all its runs.
 
-        Raises
-        ------
-        InputError
-            Something else is there, or a campaign of another config or of other records.
+        Raises InputError: something else is there, or a campaign of another config or of other
+        records.
         """
         if path.exists() and not overwrite:
             existing = cls.open(path)
@@ -99,10 +89,7 @@ class CampaignFolder(Folder):
     def origin(self) -> Origin:
         """Return where it began.
 
-        Raises
-        ------
-        InputError
-            The folder does not say it.
+        Raises InputError: the folder does not say it.
         """
         try:
             return Origin.model_validate_json(self.mark.read_bytes())
@@ -126,10 +113,7 @@ def records_in(folder: Path) -> list[Path]:
 
     Hidden ones do not count, nor does the truth (``NAME.truth.csv``) beside a simulated record.
 
-    Raises
-    ------
-    InputError
-        No such folder, or no such file in it.
+    Raises InputError: no such folder, or no such file in it.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder; give the one that the records are in")

@@ -43,18 +43,8 @@ def explained(
 ) -> tuple[Explanation, ...]:
     """Explain a training record's readings better than its fit does, the best explanation first.
 
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    name
-        The record's name.
-    places
-        The posterior's modes (modes, free), coordinates.
-    watch
-        Is called with the share that is done.
-    thorough
-        Something is known to be wrong.
+    ``places`` are the posterior's modes (modes, free), coordinates; ``watch`` is called with the
+    share that is done; ``thorough`` where something is known to be wrong.
     """
     posterior, record = problem.posterior, problem.records[name]
     scene = Scene.of(
@@ -80,12 +70,8 @@ def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
 def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
-    Parameters
-    ----------
-    problem
-        Its posterior has the rough discrepancy; of several records that stays.
-    point
-        Where that posterior is.
+    Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy; of several
+    records that stays.
     """
     default = "discrepancy"
     if len(problem.records) > 1:
@@ -114,19 +100,11 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
 def improve_model(
     config: Config, folder: Path, console: Console, records: Mapping[str, Record] | None = None
 ) -> Config:
-    """Return a config with all parts of the model that pay.
+    """Return a config with all parts of the model that pay; progress goes to the console.
 
-    Parameters
-    ----------
-    config, folder, records
-        As :func:`~bwbayes.app.problem.problem.resolve` takes them; one record is fitted.
-    console
-        Where progress goes.
+    Config, folder and records are as :func:`~bwbayes.app.problem.problem.resolve` takes them.
 
-    Raises
-    ------
-    InputError
-        The config cannot be used, or several records are fitted.
+    Raises InputError: the config cannot be used, or several records are fitted.
     """
     if len(config.records) > 1:
         raise InputError("improve: is for one training record; improve a fit of one of them first")

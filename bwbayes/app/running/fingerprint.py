@@ -40,21 +40,11 @@ def fingerprint(config: Config) -> str:
 
 
 def require_own(problem: Problem, chain: Path, attributes: Mapping[str, str | int]) -> None:
-    """Refuse a chain of another posterior than a folder's config describes.
+    """Refuse a ``chain`` of another posterior than a folder's config and records describe.
 
-    Parameters
-    ----------
-    problem
-        What config and records say now.
-    chain
-        The chain's file, for the error.
-    attributes
-        What the chain notes: the readings' digest, and its fingerprint.
+    ``attributes`` are what the chain notes: the readings' digest, and its fingerprint.
 
-    Raises
-    ------
-    InputError
-        They differ, and the text says in what; or the chain has no fingerprint.
+    Raises InputError: they differ, and the text says in what; or the chain has no fingerprint.
     """
     if attributes.get("data_sha256") != problem.sha256:
         raise InputError(f"{chain}: belongs to another record; undo the edit or start a new run")

@@ -61,10 +61,7 @@ class Folder:
     def open(cls, path: Path) -> Self:
         """Return the folder of what exists.
 
-        Raises
-        ------
-        InputError
-            There is none of this kind.
+        Raises InputError: there is none of this kind.
         """
         folder = cls(path)
         if folder.is_of_its_kind():
@@ -85,10 +82,7 @@ class Folder:
     def require_free(cls, path: Path, overwrite: bool) -> None:
         """Refuse a place where a new folder cannot be made.
 
-        Raises
-        ------
-        InputError
-            It exists and ``overwrite`` is not given, or it is not one of this kind.
+        Raises InputError: it exists and ``overwrite`` is not given, or it is not one of this kind.
         """
         if path.name == "..":
             raise InputError(f"{path}: is not a valid folder name; choose another")
@@ -106,10 +100,8 @@ class Folder:
     def drafted(self) -> Iterator[Self]:
         """Give a draft of the folder, with ``records`` in it, that takes its place when whole.
 
-        Raises
-        ------
-        InputError
-            It cannot be written, or another process is writing the one that it replaces.
+        Raises InputError: it cannot be written, or another process is writing the one that it
+        replaces.
         """
         draft = self.path.absolute().with_name(f".{self.path.name}.partial")
         try:
@@ -130,10 +122,7 @@ class Folder:
     def locked(self) -> Iterator[None]:
         """Hold the folder as its only writer.
 
-        Raises
-        ------
-        InputError
-            Another process holds it, or it cannot be written.
+        Raises InputError: another process holds it, or it cannot be written.
         """
         lock = FileLock(self.path / ".lock")
         try:
@@ -168,10 +157,8 @@ class RunFolder(Folder):
     def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
         """Make a new folder, whole or not at all; ``mark`` goes into a calibration's file.
 
-        Raises
-        ------
-        InputError
-            It exists and ``overwrite`` is not given, it is not a run's, or cannot be written.
+        Raises InputError: it exists and ``overwrite`` is not given, it is not a run's, or cannot be
+        written.
         """
         from bwbayes.app.config.config import dump
         from bwbayes.record import write_record

@@ -37,11 +37,9 @@ from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.report.figures import drawn
-from bwbayes.report.page import fragment
+from bwbayes.report.product import Shown
 from bwbayes.report.report import Figure, Report
 from bwbayes.report.run import prediction_report
-from bwbayes.report.screen import as_text
-from bwbayes.shown import head
 
 __all__ = [
     "Prediction",
@@ -55,7 +53,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prediction(Bands):
+class Prediction(Shown, Bands):
     """Bands of one record or window, and how they turned out.
 
     ``scores`` and ``verdict`` hold the bands against the readings and are None without any;
@@ -105,22 +103,14 @@ class Prediction(Bands):
             **held,
         }
 
-    def __repr__(self) -> str:
-        return head(str(self))
-
-    def __str__(self) -> str:
-        return "\n".join([self._title, as_text(self.report(), width=100)]).rstrip()
-
-    def _repr_html_(self) -> str:
-        return fragment(replace(self.report(), title=self._title))
-
     def report(self) -> Report:
         """Return how the prediction turned out, and what to know of it."""
         notes = self.verdict.notes if self.verdict else ()
         return prediction_report(self.name, self.scores, self.verdict, [*self.remarks, *notes])
 
     @property
-    def _title(self) -> str:
+    def heading(self) -> str:
+        """Name, times and width of the sensor band."""
         width = float(np.mean(self.upper["sensor", 95] - self.lower["sensor", 95]))
         first, last = (
             clock(time, self.interval) for time in (self.time[0], self.time[-1] + self.interval)
@@ -142,28 +132,13 @@ def predict_another(
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    flat
-        Its draws, (draws, free), parameters in their own units; a thousand of them are used.
-    record
-        The other record, at any sampling interval.
-    start
-        What is known of its start.
-    name
-        Name of the bands.
-    window
-        Start and stop in s of the part that is predicted and judged; by default all of it.
-    of
-        The training record whose own parameters it takes where nothing tells its own; by default
-        the first.
+    ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
+    which a thousand are used. Of the record, at any sampling interval, ``start`` is what is known
+    of its start, ``window`` the start and stop in s of the part that is predicted and judged, if
+    not all of it, and ``of`` the training record whose own parameters it takes where nothing tells
+    its own, by default the first. ``name`` is that of the bands.
 
-    Raises
-    ------
-    InputError
-        A lead-in or window that does not fit into the record.
+    Raises InputError: a lead-in or window that does not fit into the record.
     """
     posterior, seed = problem.posterior, problem.config.seed
     beyond = beyond_training(posterior, record.voltage, record.interval)
@@ -202,10 +177,7 @@ def predict_after(
 def training_record(problem: Problem, name: str | None) -> str:
     """Return the name of a training record, by default of the first.
 
-    Raises
-    ------
-    InputError
-        No training record is called so.
+    Raises InputError: no training record is called so.
     """
     if name is not None and name not in problem.records:
         hint = suggestion(name, list(problem.records))

@@ -1,13 +1,15 @@
 """What a person sees while a run samples: how far, how fast, how long still, how well.
 
 On a terminal one line is kept up to date; elsewhere (a log file, a pipe) a line is printed now and
-then. Quiet means nothing at all.
+then. Quiet means nothing at all. :func:`batch` makes many calls side by side, with such a line.
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Self
 
 import numpy as np
@@ -15,11 +17,13 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from bwbayes.app.running.workers import executor, side_by_side
+from bwbayes.calibration.replicates import as_done
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
 
-__all__ = ["CountProgress", "Progress", "StepProgress"]
+__all__ = ["CountProgress", "Progress", "StepProgress", "batch"]
 
 
 class _Line:
@@ -149,3 +153,34 @@ class Progress(_Line):
 def _minutes(seconds: float) -> str:
     minutes, remainder = divmod(max(round(seconds), 0), 60)
     return f"{minutes}:{remainder:02d}"
+
+
+def batch[T](
+    call: Callable[..., T],
+    arguments: Sequence[tuple[object, ...]],
+    label: Callable[[T], str],
+    *,
+    console: Console,
+    kind: str,
+    done: int,
+    short: Mapping[str, int],
+    workers: int | None,
+    backend: str | Executor | None,
+) -> Iterator[T]:
+    """Call a function with each of the arguments, and yield each result as soon as it is there.
+
+    ``label`` says what a result is short of, if anything; ``done`` and ``short`` count those of
+    this ``kind`` that were there before. They go into processes, also with the compiled engine:
+    most of their time goes into Python.
+    """
+    if not arguments:
+        return
+    count = min(workers or os.cpu_count() or 1, len(arguments))
+    with (
+        executor(count, backend=backend) as pool,
+        CountProgress(console, kind, done, len(arguments), short) as progress,
+    ):
+        together = side_by_side(pool, workers, len(arguments))
+        for result in as_done(pool, together, call, arguments):
+            yield result
+            progress(label(result))

@@ -44,10 +44,7 @@ __all__ = ["begin", "draw", "redraw", "resume", "start", "write_files"]
 def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
     """Make the folder of a new run; the config's files are relative to the folder ``where``.
 
-    Raises
-    ------
-    InputError
-        The config, its records or the folder cannot be used.
+    Raises InputError: the config, its records or the folder cannot be used.
     """
     return RunFolder.create(out, resolve(config, where), overwrite)
 
@@ -55,10 +52,7 @@ def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) ->
 def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
     """Return a run's problem and its MAP estimate, which is worked out if it is not there yet.
 
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
+    Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
         problem, chain = _chain(folder, Console(quiet=True))
@@ -68,10 +62,7 @@ def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
 def draw(folder: RunFolder) -> Fit:
     """Sample a run to its end, from wherever it stands, and work nothing out of it yet.
 
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
+    Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
         return _drawn(folder, Console(quiet=True), workers=1)
@@ -93,25 +84,14 @@ def resume(
 ) -> Fit:
     """Finish a run, from wherever it stands; progress goes to the console.
 
-    Parameters
-    ----------
-    workers, backend
-        As of :func:`~bwbayes.app.running.workers.executor`; the result does not depend on them.
-    ess, steps, engine
-        A new target, budget or engine. Another engine has the same posterior, but from here on not
-        the same bits.
-    files
-        Write what a run leaves besides its config, records and chain.
-    background
-        Draw in a process of its own, if there may be several: sooner, and the same figures.
-    show, answer
-        Are called with the problem before anything is done with it, and with the fit before its
-        files are written.
+    ``workers`` and ``backend`` are as of :func:`~bwbayes.app.running.workers.executor`; the result
+    does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or engine;
+    another engine has the same posterior, but from here on not the same bits. ``files`` are what a
+    run leaves besides its config, records and chain; in the ``background`` they are drawn by a
+    process of its own. ``show`` and ``answer`` are called with the problem before anything is done
+    with it, and with the fit before its files are written.
 
-    Raises
-    ------
-    InputError
-        The folder's files do not fit together, or another process is writing them.
+    Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     start_time = time.monotonic()
     # First of all: it goes on from this process as it is now.
@@ -142,10 +122,7 @@ def resume(
 def redraw(folder: RunFolder) -> Fit:
     """Write the files of a finished run again, from its chain.
 
-    Raises
-    ------
-    InputError
-        The run has no draws yet, or another process is writing it.
+    Raises InputError: the run has no draws yet, or another process is writing it.
     """
     with folder.locked(), one_thread():
         folder.require_finished()

@@ -1,12 +1,15 @@
 """Where ensembles, replicates and records are worked on: here, in processes, or on a cluster.
 
-The executors are those of ``concurrent.futures`` and of ``distributed``. Matrix products here are
-small and the ensembles already share the cores, so the linear algebra library is kept to one
-thread: more would only wait for each other, and could change the last bits.
+The executors are those of ``concurrent.futures`` and of ``distributed``. On a dask cluster a call
+whose worker dies is made again elsewhere, and because every call is a pure function the result has
+the same bits; if the scheduler itself is gone, what is on disk can be resumed anywhere. Matrix
+products here are small and the ensembles already share the cores, so the linear algebra library is
+kept to one thread: more would only wait for each other, and could change the last bits.
 """
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -14,9 +17,18 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
+from importlib import import_module
+from importlib.metadata import version
 from typing import Any, Literal
 
 import cloudpickle
@@ -30,6 +42,9 @@ __all__ = ["KINDS", "ByValue", "executor", "one_thread", "processes", "side_by_s
 
 # What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
 KINDS = ("local", "threads", "processes", "dask")
+
+# Seconds to wait for a scheduler, and for its first worker.
+PATIENCE = 20.0
 
 
 @contextmanager
@@ -51,10 +66,7 @@ def executor(
         already; or any executor with the methods of ``concurrent.futures``, or a
         ``distributed.Client``, which stay open.
 
-    Raises
-    ------
-    InputError
-        Another word, or a cluster that does not answer.
+    Raises InputError: another word, or a cluster that does not answer.
     """
     if backend is not None and not isinstance(backend, str):
         yield _given(backend)
@@ -69,10 +81,7 @@ def executor(
     if kind == "local":
         kind = "processes" if engine == "numpy" and count > 1 else "threads"
     if kind == "dask":
-        # Here, because few have dask, and it takes a second to load.
-        from bwbayes.app.running.cluster import cluster  # noqa: PLC0415
-
-        with cluster(address, workers) as pool:
+        with _cluster(address, workers) as pool:
             yield pool
     elif kind == "processes":
         with processes(count) as pool:
@@ -120,9 +129,7 @@ def _given(backend: Any) -> Executor:
     if isinstance(backend, ThreadPoolExecutor | ByValue):
         return backend
     if hasattr(backend, "get_executor"):
-        from bwbayes.app.running.cluster import on_client  # noqa: PLC0415
-
-        return on_client(backend)
+        return _on_client(backend)
     if not callable(getattr(backend, "submit", None)):
         raise InputError(
             f"executor: {type(backend).__name__} has no submit; give an executor of "
@@ -189,3 +196,86 @@ def _leave_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+def _on_client(client: Any) -> ByValue:
+    """Return an executor on the workers of a ``distributed.Client``, which stays open."""
+    workers = max(sum(client.nthreads().values()), 1)
+    return ByValue(client.get_executor(pure=False), workers)
+
+
+@contextmanager
+def _cluster(address: str, workers: int | None) -> Iterator[ByValue]:
+    """Give an executor on the cluster at HOST:PORT; without one, on processes of this machine.
+
+    Raises
+    ------
+    InputError
+        No ``distributed``, no scheduler, no worker, or one with another bwbayes.
+    BrokenExecutor
+        The scheduler is gone, or workers die under one call.
+    """
+    try:
+        dask: Any = import_module("dask")  # only those who ask for it have it
+        distributed: Any = import_module("distributed")
+    except ImportError:
+        raise InputError(
+            "executor dask: distributed is not installed; install bwbayes[dask]"
+        ) from None
+    # What a person has to know is said in one line; the rest is for those who run the cluster.
+    for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    scheduler: Any = f"tcp://{address}"
+    settings = {
+        "distributed.comm.timeouts.connect": PATIENCE,
+        # A posterior is, with every call.
+        "distributed.admin.large-graph-warning-threshold": "1GB",
+    }
+    with dask.config.set(settings):
+        try:
+            if not address:
+                scheduler = distributed.LocalCluster(
+                    n_workers=workers or dask.system.CPU_COUNT,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
+            client = distributed.Client(scheduler, timeout=PATIENCE)
+        except (OSError, TimeoutError, ValueError):
+            raise InputError(
+                f"executor dask://{address}: no scheduler there; start one with `dask scheduler`"
+            ) from None
+        try:
+            _require_workers(client, address)
+            yield _on_client(client)
+        except CancelledError:
+            raise BrokenExecutor("the scheduler is gone; resume") from None
+        except distributed.scheduler.KilledWorker:
+            raise BrokenExecutor("several workers died during one call; free memory") from None
+        finally:
+            client.close(timeout=PATIENCE)
+            if not address:
+                scheduler.close(timeout=PATIENCE)
+
+
+def _require_workers(client: Any, address: str) -> None:
+    """Wait for a worker, and refuse those that would compute something else."""
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE)
+        versions: dict[str, str] = client.run(_version)
+    except TimeoutError:
+        raise InputError(
+            f"executor dask://{address}: the scheduler has no worker; start some with "
+            f"`dask worker {address} --nthreads 1`"
+        ) from None
+    for name, text in versions.items():
+        if text != _version():
+            raise InputError(
+                f"executor dask://{address}: the worker {name} has {text or 'no bwbayes'}, "
+                f"here is {_version()}; install the same"
+            )
+
+
+def _version() -> str:
+    return " ".join(f"{name} {version(name)}" for name in ("bwbayes", "numpy", "scipy", "emcee"))

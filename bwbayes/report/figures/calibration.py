@@ -9,7 +9,9 @@ from matplotlib.figure import Figure
 
 from bwbayes.calibration.evaluation import LIMIT, Calibration
 from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.report.calibration import EXTRA_WORDS
 from bwbayes.report.figures import style
+from bwbayes.report.words import label_with_unit
 
 __all__ = ["draw_coverage", "draw_ecdf", "draw_histograms"]
 
@@ -99,11 +101,7 @@ def _draw_bands(panel: Axes, calibration: Calibration, other: str) -> None:
 
 def _labels(calibration: Calibration) -> list[str]:
     """Return the label of each statistic."""
-    labels = {
-        "log_likelihood": "log likelihood",
-        "opening": "loop opening (µm)",
-        "range": "displacement range (µm)",
-    }
+    labels = {name: label_with_unit(*words) for name, words in EXTRA_WORDS.items()}
     labels |= {parameter.name: style.axis_label(parameter) for parameter in calibration.parameters}
     return [labels[name] for name in calibration.statistics]
 

@@ -2,68 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
-from matplotlib.axes import Axes
+import numpy as np
 from matplotlib.figure import Figure
 
+from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
+from bwbayes.report.words import label_with_unit
 
-__all__ = ["Interval", "ParameterPanel", "draw_parameters"]
-
-
-class Interval(NamedTuple):
-    """A median and a 95 % interval; of an outlier or not."""
-
-    lower: float
-    median: float
-    upper: float
-    outlier: bool = False
+__all__ = ["draw_parameters"]
 
 
-class ParameterPanel(NamedTuple):
-    """A parameter in all records, by their names.
-
-    ``alone`` has the intervals of the records by themselves, ``shrunk`` with the population for a
-    prior, ``specimen`` is where a specimen not measured yet lies, if there is a population.
-    """
-
-    label: str
-    alone: Mapping[str, Interval]
-    shrunk: Mapping[str, Interval]
-    specimen: Interval | None
-
-
-def draw_parameters(records: Sequence[str], parameters: Sequence[ParameterPanel]) -> Figure:
+def draw_parameters(
+    records: Mapping[str, Mapping[str, Mapping[str, Any]]], new: Mapping[str, FloatArray]
+) -> Figure:
     """Draw a panel for each parameter: the records' 95 % intervals in the order of their names.
 
-    Gray alone and blue with the population for a prior, the population's median and where 95 % of
-    specimens not measured yet lie. Outliers are red.
+    ``records`` are the records' estimates by parameter, as ``campaign.json`` has them, ``new`` the
+    draws of a specimen not measured yet. Gray alone and blue with the population for a prior, the
+    population's median and where 95 % of specimens not measured yet lie. Outliers are red.
     """
-    figure, panels = style.panel_grid(len(parameters), 3, 2.6, "record")
-    for panel, parameter in zip(panels, parameters, strict=True):
-        _draw_parameter(panel, records, parameter)
-        panel.set(ylabel=style.plain(parameter.label), xlim=(0, len(records) + 1))
+    units = {name: own["unit"] for estimates in records.values() for name, own in estimates.items()}
+    figure, panels = style.panel_grid(len(units), 3, 2.6, "record")
+    for panel, (name, unit) in zip(panels, units.items(), strict=True):
+        if name in new:
+            low, median, high = np.quantile(new[name], [0.025, 0.5, 0.975])
+            panel.axhspan(low, high, color=style.BAND_COLORS["sensor"], zorder=0)
+            panel.axhline(median, color=style.COLORS[0], lw=0.8, zorder=1)
+        for x, estimates in enumerate(records.values(), start=1):
+            own = estimates.get(name)
+            if own is None:
+                continue
+            panel.vlines(x, own["lower_95"], own["upper_95"], color=style.LEAD_IN_COLOR, lw=0.8)
+            if "shrunk_median" in own:
+                color = style.COLORS[1] if own["outlier"] else style.COLORS[0]
+                edges = own["shrunk_lower_95"], own["shrunk_upper_95"]
+                panel.vlines(x + 0.25, *edges, color=color, lw=1.4)
+                panel.plot(x + 0.25, own["shrunk_median"], "o", color=color, ms=2.5)
+            else:
+                panel.plot(x, own["median"], ".", color=style.LEAD_IN_COLOR, ms=3)
+        label = style.plain(label_with_unit(name, unit))
+        panel.set(ylabel=label, xlim=(0, len(records) + 1))
         # The names of more records would overlap.
         if len(records) <= 24:
-            names = [style.plain(name) for name in records]
+            names = [style.plain(record) for record in records]
             panel.set_xticks(range(1, len(records) + 1), names, rotation=90, fontsize=7)
     return figure
-
-
-def _draw_parameter(panel: Axes, records: Sequence[str], parameter: ParameterPanel) -> None:
-    if parameter.specimen is not None:
-        low, median, high, _ = parameter.specimen
-        panel.axhspan(low, high, color=style.BAND_COLORS["sensor"], zorder=0)
-        panel.axhline(median, color=style.COLORS[0], lw=0.8, zorder=1)
-    for x, name in enumerate(records, start=1):
-        alone, shrunk = parameter.alone.get(name), parameter.shrunk.get(name)
-        if alone is not None:
-            panel.vlines(x, alone.lower, alone.upper, color=style.LEAD_IN_COLOR, lw=0.8)
-        if shrunk is not None:
-            color = style.COLORS[1] if shrunk.outlier else style.COLORS[0]
-            panel.vlines(x + 0.25, shrunk.lower, shrunk.upper, color=color, lw=1.4)
-            panel.plot(x + 0.25, shrunk.median, "o", color=color, ms=2.5)
-        elif alone is not None:
-            panel.plot(x, alone.median, ".", color=style.LEAD_IN_COLOR, ms=3)

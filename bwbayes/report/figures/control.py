@@ -1,8 +1,8 @@
-"""Commands and controllers: what is reached, its error, the loop before and after, tracking."""
+"""What is planned: the signals of a design, commands and their errors, and how a loop tracks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,15 @@ from matplotlib.ticker import (
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
 
-__all__ = ["draw_command", "draw_error", "draw_loops", "draw_tracking"]
+__all__ = [
+    "draw_command",
+    "draw_error",
+    "draw_loops",
+    "draw_promises",
+    "draw_signal",
+    "draw_tracking",
+]
+
 
 COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.MEAN_COLOR}
 
@@ -126,4 +134,37 @@ def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
         panel.xaxis.set_major_formatter(ScalarFormatter())
         panel.xaxis.set_minor_formatter(NullFormatter())
     style.share_legend(figure)
+    return figure
+
+
+def draw_promises(
+    names: Sequence[str], remaining: FloatArray, error: FloatArray, label: str
+) -> Figure:
+    """Draw a dot with two standard errors for each candidate; nothing new at 100 %.
+
+    ``remaining`` and ``error`` (candidates,) are parts, the best first.
+    """
+    figure, ((panel,),) = style.new_figure(7, 1.2 + 0.32 * len(names))
+    rows, percent = np.arange(len(names)), 100 * remaining
+    colors = [style.MEAN_COLOR, *[style.COLORS[0]] * (len(names) - 1)]
+    panel.hlines(rows, percent, 100, color="#bbbbbb", lw=1)
+    panel.errorbar(percent, rows, xerr=200 * error, fmt="none", ecolor="#222222", capsize=5)
+    panel.scatter(percent, rows, color=colors, s=28, zorder=3)
+    panel.axvline(100, color="#222222", lw=1, ls=":")
+    panel.set_yticks(rows, [style.plain(name) for name in names])
+    panel.invert_yaxis()
+    panel.set(xlim=(0, 104), xlabel=style.plain(f"{label} (%)"))
+    return figure
+
+
+def draw_signal(
+    name: str, voltage: FloatArray, interval: float, limits: tuple[float, float]
+) -> Figure:
+    """Draw a voltage (samples,), V, every ``interval`` s, between the amplifier's limits."""
+    figure, ((panel,),) = style.new_figure(7, 2.8)
+    time = interval * np.arange(voltage.size, dtype=np.float64)
+    panel.plot(*style.zigzag(time, voltage), color=style.MEAN_COLOR)
+    for limit in limits:
+        panel.axhline(limit, color="#222222", lw=1, ls=":")
+    panel.set(title=style.plain(name), xlabel="time (s)", ylabel="voltage (V)")
     return figure

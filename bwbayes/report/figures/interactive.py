@@ -25,7 +25,7 @@ from markupsafe import Markup
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import style
-from bwbayes.report.figures.loop import LOOP_KINDS, path, polygons
+from bwbayes.report.figures.series import LOOP_KINDS, path, polygons
 from bwbayes.report.page import PagePlots, Script
 from bwbayes.report.result import Result
 

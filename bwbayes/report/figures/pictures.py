@@ -9,7 +9,7 @@ from typing import Any
 from bwbayes.report.report import Figure, Picture
 from bwbayes.report.result import Result
 
-__all__ = ["Pictures", "pictures"]
+__all__ = ["Pictures", "draw_kind", "pictures"]
 
 type Pictures = dict[str, Picture]
 
@@ -43,16 +43,16 @@ def pictures(result: Result) -> Pictures:
 
 def _picture(name: str, *shown: Any) -> Picture:
     kind, _, record = name.partition("_")
-    module, title, caption, alt = PICTURES[kind]
-    draw = partial(_draw, module, f"draw_{kind}", *shown)
+    _, title, caption, alt = PICTURES[kind]
     if record:
         title, alt = f"{title}: {record}", f"{alt} ({record})"
-    return Picture(name, title, caption, draw, alt)
+    return Picture(name, title, caption, partial(draw_kind, kind, *shown), alt)
 
 
-def _draw(module: str, function: str, *shown: Any) -> Figure:
-    """Draw with a function of one of this package's modules, which are slow to load."""
-    figure: Figure = getattr(import_module(f"bwbayes.report.figures.{module}"), function)(*shown)
+def draw_kind(kind: str, *shown: Any) -> Figure:
+    """Draw a kind of picture with the function of its module, which is slow to load."""
+    module = import_module(f"bwbayes.report.figures.{PICTURES[kind][0]}")
+    figure: Figure = getattr(module, f"draw_{kind}")(*shown)
     return figure
 
 
@@ -60,7 +60,7 @@ def _draw(module: str, function: str, *shown: Any) -> Figure:
 # what to say to those who do not see it.
 PICTURES = {
     "loop": (
-        "loop",
+        "series",
         "Hysteresis loop",
         "Displacement against voltage. New readings lie in the sensor band, the model in the "
         "parameter band.",

@@ -22,14 +22,8 @@ def record_drawings(
 ) -> dict[str, Callable[[], Figure]]:
     """Return what draws a record's figures, by name: ``time``, ``loop`` and ``drive``.
 
-    Parameters
-    ----------
-    record
-        The record, with or without a displacement.
-    training
-        The windows that are fitted; what lies outside is shown in gray.
-    findings
-        What is wrong; where it is only a part of the record, the part is marked.
+    What lies outside of the ``training`` windows is shown in gray; where only a part of the record
+    has a finding, the part is marked.
     """
     drawings: dict[str, Callable[[], Figure]] = {
         "time": partial(_draw_time, record, training, findings)
