@@ -72,13 +72,13 @@ def _series(
     """
     passed.add(h5py.h5o.get_info(group.id).addr)
     prefix = group.name.strip("/") + "/" * (group.name != "/")
-    notes[prefix] = {key: note(group.attrs[key]) for key in NOTES if key in group.attrs}
+    notes[prefix] = {key: _note(group.attrs, key) for key in NOTES if key in group.attrs}
     links = [name for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
     items = {name: group[name] for name in links if not name.startswith("#")}
     for name, item in items.items():
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
             continue
-        is_text = item.attrs.get("MATLAB_class") == b"char"
+        is_text = "MATLAB_class" in item.attrs and _note(item.attrs, "MATLAB_class") == "char"
         if "MATLAB_empty" in item.attrs or item.shape is None:
             continue
         if name in NOTES and is_text:
@@ -87,12 +87,19 @@ def _series(
         elif name in NOTES and name.endswith("_s") and item.size and item.dtype.kind in "iuf":
             notes[prefix][name] = note(item[()])
         elif not is_text:
-            unit = next((note(v) for k, v in item.attrs.items() if k.lower()[:4] == "unit"), "")
+            unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
             load = partial(_loaded, path, item.name)
             yield from vectors(prefix, name, item.shape, item.dtype, load, unit)
     for item in items.values():
         if isinstance(item, h5py.Group) and h5py.h5o.get_info(item.id).addr not in passed:
             yield from _series(path, item, notes, passed)
+
+
+def _note(attributes: Any, name: str) -> str:
+    """Read an attribute; not a list, which is no note, and damaged ends the process in HDF5."""
+    kind = attributes.get_id(name).dtype
+    is_list = kind.kind == "O" and h5py.check_string_dtype(kind) is None
+    return "" if is_list else note(attributes[name])
 
 
 def _loaded(path: Path, name: str) -> Any:
