@@ -253,3 +253,14 @@ def test_a_file_cannot_have_another_file_opened(
     with h5py.File(path, "r+") as file:
         refer(file, "voltage_V", tmp_path / "pipe")
     assert ": no column for the voltage; add it" in fault(path)
+
+
+def test_a_list_is_no_note(tmp_path: Path) -> None:
+    """Damaged text of variable length may look like one, and reading that ends the process."""
+    path = tmp_path / "a.h5"
+    write_record(Record(np.arange(20.0), np.arange(20.0), 0.1, origin="a bench"), path)
+    with h5py.File(path, "a") as file:
+        del file.attrs["origin"]
+        texts = np.array([np.arange(3, dtype="u1"), None], dtype=object)[:1]
+        file.attrs.create("origin", texts, dtype=h5py.vlen_dtype("u1"))
+    assert read_record(path).origin == "a.h5"
