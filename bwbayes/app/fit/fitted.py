@@ -344,13 +344,7 @@ class Fit(Shown):
         return copied.path
 
     def require_converged(self) -> None:
-        """Refuse a sampling that has not converged.
-
-        Raises
-        ------
-        NotConvergedError
-            It has not.
-        """
+        """Raise a NotConvergedError unless the sampling has converged."""
         if not self.converged:
             call = "fit.resume(" if self._scratch else f"bwbayes.resume({str(self.folder.path)!r}, "
             raise NotConvergedError(
@@ -383,10 +377,7 @@ class Fit(Shown):
 def finished(folder: RunFolder) -> Fit:
     """Return the fit that a run's folder holds, as far as its chain goes: only that is read.
 
-    Raises
-    ------
-    InputError
-        The chain is missing, damaged or still in its pilot.
+    Raises InputError: the chain is missing, damaged or still in its pilot.
     """
     chain = ChainFile.read(folder.chain)
     if chain.blocks("sampling") == 0:
@@ -397,12 +388,7 @@ def finished(folder: RunFolder) -> Fit:
 def converged(path: Path) -> Fit:
     """Return the fit in a folder, if it is finished and has converged.
 
-    Raises
-    ------
-    NotConvergedError
-        The sampling has not converged.
-    InputError
-        No such run, or it is not finished.
+    Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
     """
     folder = RunFolder.open(path)
     fit = finished(folder)
