@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,17 @@ import click
 import numpy as np
 import pytest
 import xarray
+from rich.console import Console
 
 from bwbayes.app.commands.ending import finish
+from bwbayes.app.config.config import load
 from bwbayes.app.fit.fitted import finished
+from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
+from bwbayes.model.distributions import Distribution
 from bwbayes.record import read_record
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import Check
@@ -174,3 +180,45 @@ def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder)
     assert (copy.path / "report.html").stat().st_size > 100_000
     names = {path.name for path in (run / "figures").iterdir()}
     assert names == {path.name for path in (copy.path / "figures").iterdir()}
+
+
+def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
+    folder = RunFolder(run)
+    fit = finished(folder)
+    problem, chain, outcome = fit.problem, fit.chain, fit.outcome
+    outcome = replace(outcome, converged=False)  # no bands are needed
+    assert () == assemble(problem, chain, outcome).remarks
+    nanometres = Distribution("lognormal", {"median": 1e-3, "sigma": 0.6})
+    odd = replace(problem, defaults={**problem.defaults, "d": nanometres})
+    (remark,) = assemble(odd, chain, outcome).remarks
+    assert "Fix: check its unit" in remark
+
+
+# A run remembers its engine
+
+
+def test_chain_file_and_summary_name_the_engine(run: Path) -> None:
+    assert "numba" == load(RunFolder(run).config).sampling.engine
+    attributes = ChainFile.read(RunFolder(run).chain).attributes()
+    assert "numba" == attributes["engine"]
+    assert "numba" in json.loads(str(attributes["versions"]))
+    assert "numba" in small.numbers(run)["versions"]
+
+
+def test_another_engine_is_refused_unless_asked_for(copy: RunFolder) -> None:
+    text = copy.config.read_text().replace('engine = "numba"', 'engine = "numpy"')
+    copy.config.write_text(text)
+    before = ChainFile.read(copy.chain).steps("sampling")
+    with pytest.raises(InputError, match=r'sampled with the numba engine, not numpy.*`engine="num'):
+        resume(copy, small.quiet(), workers=1)
+    assert before == ChainFile.read(copy.chain).steps("sampling")
+
+
+@pytest.mark.slow
+def test_asked_for_another_engine_goes_on_and_is_said(run: Path, copy: RunFolder) -> None:
+    said = StringIO()
+    ess = 2 * small.lowest_ess(run)
+    result = resume(copy, Console(file=said, width=200), workers=1, ess=ess, engine="numpy")
+    assert result.outcome.converged
+    assert "resuming with the numpy engine a chain begun with numba" in said.getvalue()
+    assert "numpy" == load(copy.config).sampling.engine
