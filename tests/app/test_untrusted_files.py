@@ -16,10 +16,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
@@ -33,7 +31,7 @@ from bwbayes.report.screen import as_text
 from bwbayes.report.tables import priors_table
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
-from tests.app.mutations import CONFIGS, GOOD, QUICK, good_arrays
+from tests.app.mutations import CONFIGS, GOOD, QUICK, good_arrays, stored
 from tests.sampling.chains import finish, new
 
 # Code in data files
@@ -71,52 +69,36 @@ def as_itself(payload: bytes) -> bytes:
 def as_numpy_file(payload: bytes) -> bytes:
     """Give the header of an array of objects, with the payload as its pickle."""
     buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        buffer, {"descr": "|O", "fortran_order": False, "shape": (40,)}
-    )
+    header = {"descr": "|O", "fortran_order": False, "shape": (40,)}
+    np.lib.format.write_array_header_1_0(buffer, header)
     return buffer.getvalue() + payload
 
 
-def in_hdf5(place: str) -> Callable[[bytes], bytes]:
-    """Return a maker of HDF5 files with the payload as opaque, as bytes, or in a note."""
+def among(suffix: str, *names: str, value: Callable[[bytes], Any]) -> Callable[[bytes], bytes]:
+    """Return a maker of files with the payload in the place of arrays, or as notes (``@``)."""
+    return lambda payload: stored(good_arrays() | dict.fromkeys(names, value(payload)), suffix)
 
-    def make(payload: bytes) -> bytes:
-        buffer = io.BytesIO()
-        with h5py.File(buffer, "w") as file:
-            for name, values in good_arrays().items():
-                file[name] = values
-            match place:
-                case "opaque":
-                    del file["voltage_V"]
-                    file["voltage_V"] = np.array([np.void(payload)] * 40)
-                case "note":
-                    file.attrs["origin"] = np.void(payload)
-                    file.attrs["voltage_is"] = np.void(payload)
-                case "object":
-                    # As PyTables and pandas mark what they pickle.
-                    file["voltage_V"].attrs["PSEUDOATOM"] = "object"
-                    file["voltage_V"].attrs["h5py_pickle"] = np.void(payload)
-        return buffer.getvalue()
+
+def marked(payload: bytes) -> Callable[[Any, str], None]:
+    """Return a maker of a dataset that is marked as PyTables and pandas mark what they pickle."""
+
+    def make(file: Any, name: str) -> None:
+        file[name] = good_arrays()[name]
+        file[name].attrs["PSEUDOATOM"] = "object"
+        file[name].attrs["h5py_pickle"] = np.void(payload)
 
     return make
 
 
-def in_matlab(value: Callable[[bytes], Any]) -> Callable[[bytes], bytes]:
-    """Return a maker of MATLAB files of version 5 with the payload in the voltage's place."""
-
-    def make(payload: bytes) -> bytes:
-        buffer = io.BytesIO()
-        scipy.io.savemat(buffer, good_arrays() | {"voltage_V": value(payload)})
-        return buffer.getvalue()
-
-    return make
+def numbers(payload: bytes) -> Any:
+    return np.frombuffer(payload, dtype=np.uint8)
 
 
 def of_class(code: int) -> Callable[[bytes], bytes]:
-    """Return a maker of MATLAB files whose voltage says that it is an object, or a function."""
+    """Return a maker of MATLAB files whose voltage says that it is an object, or opaque."""
 
     def make(payload: bytes) -> bytes:
-        data = bytearray(in_matlab(lambda p: np.frombuffer(p, dtype=np.uint8))(payload))
+        data = bytearray(among("mat", "voltage_V", value=numbers)(payload))
         flags = data.index(b"voltage_V") - 8 - 16 - 8
         assert data[flags] == 9  # uint8
         data[flags] = code
@@ -125,17 +107,21 @@ def of_class(code: int) -> Callable[[bytes], bytes]:
     return make
 
 
+def opaque(payload: bytes) -> Any:
+    return np.array([np.void(payload)] * 40)
+
+
 PLANTS: dict[str, tuple[str, Callable[[bytes], bytes]]] = {
     "pickle as csv": ("csv", as_itself),
     "pickle as h5": ("h5", as_itself),
     "pickle as mat": ("mat", as_itself),
     "npy as h5": ("h5", as_numpy_file),
-    "opaque in h5": ("h5", in_hdf5("opaque")),
-    "note in h5": ("h5", in_hdf5("note")),
-    "attribute in h5": ("h5", in_hdf5("object")),
-    "opaque in mat 7.3": ("mat", in_hdf5("opaque")),
-    "cell in mat": ("mat", in_matlab(lambda p: np.array([p.decode("latin-1")] * 2, dtype=object))),
-    "struct in mat": ("mat", in_matlab(lambda p: {"code": np.frombuffer(p, dtype=np.uint8)})),
+    "opaque in h5": ("h5", among("h5", "voltage_V", value=opaque)),
+    "note in h5": ("h5", among("h5", "@origin", "@voltage_is", value=np.void)),
+    "attribute in h5": ("h5", among("h5", "voltage_V", value=marked)),
+    "opaque in mat 7.3": ("mat", among("mat-7.3", "voltage_V", value=opaque)),
+    "cell in mat": ("mat", among("mat", "voltage_V", value=lambda p: np.array([str(p)] * 2, "O"))),
+    "struct in mat": ("mat", among("mat", "voltage_V", value=lambda p: {"code": numbers(p)})),
     "object in mat": ("mat", of_class(3)),
     "opaque in mat": ("mat", of_class(17)),
 }
