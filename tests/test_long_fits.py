@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from typing import NamedTuple
-
 import pytest
 
 from tests.measured import keep
-
-GIB = 2**30
-MILLION = 1_000_000
+from tests.memory import on_linux, peak
 
 # All that a run does: point fit, sampling, bands, scores, replicated records, figures, report.
 SCRIPT = """
@@ -37,30 +31,14 @@ with TemporaryDirectory() as folder:
     assert fit.converged, fit.outcome.stop_reason
     assert fit.chain.ends[0].coordinates.shape[0] == 64
     assert (run / "report.html").is_file() and (run / "bands.csv").stat().st_size > 100 * samples
-# Not ru_maxrss, which a process takes over from the one that starts it.
-status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-print(int(status["VmHWM"].split()[0]) * 1024)
 """
 
 
-class Fitted(NamedTuple):
-    """A fit of so many samples, and the largest memory of its process, bytes."""
-
-    samples: int
-    peak: int
-
-
-def fitted(samples: int, **keys: object) -> Fitted:
-    """Fit a record in a process of its own, write its files, and return its largest memory."""
-    script = SCRIPT.format(samples=samples, keys=keys)
-    done = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, check=True)
-    return Fitted(samples, int(done.stdout))
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
+@on_linux
 def test_whole_fit_of_million_samples_takes_two_gibibytes() -> None:
     """To convergence with 400 effective draws: more of them take longer, not more memory."""
-    whole = fitted(MILLION, dynamics="lag", ess=400)
-    keep("long fit", {"gib": whole.peak / GIB})
-    assert whole.peak <= 2 * GIB
+    keys = {"dynamics": "lag", "ess": 400}
+    whole = peak(SCRIPT.format(samples=1_000_000, keys=keys)) / 2**30
+    keep("long fit", {"gib": whole})
+    assert whole <= 2

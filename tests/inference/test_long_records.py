@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 from bwbayes.inference.engine import Engine
+from tests.memory import on_linux, peak
 
 SCRIPT = """
-from pathlib import Path
 from dataclasses import replace
 import numpy as np
 from bwbayes.sampling.ensemble import advance, start
@@ -26,22 +23,10 @@ point = PointFit(place, nearby, 0.0, place[np.newaxis], nearby)
 begin = start(posterior, point, 0, 64, generator)
 (block,) = advance(posterior, [pilot_moves()], [begin], 1)
 assert np.isfinite(block.log_density).all()
-# Not ru_maxrss, which a process takes over from the one that starts it.
-status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-print(status["VmHWM"].split()[0])
 """
 
 
-def peak_kib(engine: Engine, samples: int) -> int:
-    """Largest memory of a process that moves 64 walkers a step, KiB."""
-    script = SCRIPT.format(engine=engine, samples=samples)
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    return int(done.stdout)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
+@on_linux
 @pytest.mark.parametrize(
     ("engine", "samples"),
     [
@@ -52,4 +37,5 @@ def peak_kib(engine: Engine, samples: int) -> int:
     ],
 )
 def test_million_samples_take_less_than_a_gibibyte(engine: Engine, samples: int) -> None:
-    assert peak_kib(engine, samples) < 2**20
+    """Of a process that moves 64 walkers a step."""
+    assert peak(SCRIPT.format(engine=engine, samples=samples)) < 2**30

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import check
+from tests.memory import on_linux, peak
 from tests.sampling.samplings import PLAN, POSTERIOR, run
 
 # Ten parameters, the default's 64 walkers; ensembles that disagree, so that all checks are made.
@@ -55,13 +54,10 @@ assert not outcome.converged
 assert outcome.check.steps == plan.most_steps == again.steps("sampling")
 kept = draws(posterior, again)
 assert kept.shape[:3] == log_densities(again).shape
-# Not ru_maxrss, which a process takes over from the one that starts it.
-status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-print(status["VmHWM"].split()[0])
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's /proc")
+@on_linux
 @pytest.mark.parametrize(
     ("steps", "mebibytes"), [(4_000, 768), pytest.param(20_000, 1024, marks=pytest.mark.slow)]
 )
@@ -69,14 +65,7 @@ def test_the_default_budget_takes_less_than_a_gibibyte(
     tmp_path: Path, steps: int, mebibytes: int
 ) -> None:
     """The whole of it is slow; a fifth of it, as a quick twin, three quarters of that memory."""
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tmp_path / "chain"), str(steps)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert 0 == done.returncode, done.stderr
-    assert int(done.stdout) < 1024 * mebibytes
+    assert peak(SCRIPT, tmp_path / "chain", steps) < 2**20 * mebibytes
 
 
 def test_a_long_chain_is_judged_by_every_so_many_steps(monkeypatch: pytest.MonkeyPatch) -> None:
