@@ -19,7 +19,6 @@ white noise model, fitted to records of the same kind, fails by far.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,17 +28,19 @@ import pytest
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.calibration.evaluation import LIMIT, Calibration, judge
-from bwbayes.calibration.replicates import Experiment, Replicate, replicates
-from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.calibration.replicates import Experiment, Replicate
+from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from tests.measured import keep
 from tests.together import (
     LEVEL,
+    SEED,
+    WrongCorrelation,
     errors_off,
+    made,
     narrowed,
     narrowed_a_tenth,
     shifted,
@@ -48,7 +49,6 @@ from tests.together import (
 )
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
-SEED = 1
 FEW = 10
 
 FULL = 500
@@ -63,11 +63,6 @@ def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
     changed = parse("[record]\nfile = 'x'\n[parameters]\n" + "\n".join(lines), "changes")
     parameters = config.parameters | changed.parameters
     return resolve(config.model_copy(update={"parameters": parameters}), CONFIG.parent)
-
-
-def made(common: Experiment, count: int, seed: int = SEED) -> list[Replicate]:
-    with one_thread(), ThreadPoolExecutor(1) as pool:
-        return list(replicates(common, seed, range(count), pool))
 
 
 def judged(outcome: list[Replicate]) -> Calibration:
@@ -121,19 +116,6 @@ def test_white_noise_model_fails_the_bands() -> None:
 
 
 @dataclass(frozen=True)
-class WrongCorrelation(DiscrepancyNoise):
-    """Noise whose correlation decays three times as fast as its correlation time says."""
-
-    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return that of a third of the correlation time."""
-        return super().transition(theta * [1, 1, 1 / 3], readings)
-
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return that of a third of the correlation time."""
-        return super().fresh(theta * [1, 1, 1 / 3], readings)
-
-
-@dataclass(frozen=True)
 class Swapped(Posterior):
     """A posterior whose model has the sign of γ, against β, the wrong way round."""
 
@@ -160,7 +142,7 @@ class Swapped(Posterior):
 def wrong_correlation() -> Experiment:
     common = experiment(problem(fixed=("alpha", "beta", "gamma", "lag")))
     right = common.posterior
-    wrong = right.altered(noise=WrongCorrelation(right.only.actuator.interval))
+    wrong = right.altered(noise=WrongCorrelation(right.only.actuator.interval, 3.0))
     return replace(common, posterior=wrong, source=right)
 
 

@@ -21,7 +21,6 @@ seconds of a record do not tell an exponent, a loop and its shape of which nothi
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,9 +32,8 @@ from scipy import stats
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
-from bwbayes.calibration.replicates import Experiment, Replicate, replicates
+from bwbayes.calibration.replicates import Experiment, Replicate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS
@@ -43,9 +41,7 @@ from bwbayes.record.io.formats import write_record
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from tests.measured import keep
-from tests.together import LEVEL, Plant, errors_off, narrowed, shifted, together_test
-
-SEED = 1
+from tests.together import LEVEL, SEED, Plant, errors_off, made, narrowed, shifted, together_test
 
 # Replicates of the default suite, and of the slow one.
 QUICK, REPLICATES = 40, 150
@@ -176,8 +172,7 @@ def band_limit(bands: int, count: int) -> float:
 def calibrated(variant: Variant, folder: Path, count: int) -> Sound:
     """Make the first replicates of a variant."""
     common = typical_experiment(variant, folder)
-    with one_thread(), ThreadPoolExecutor(1) as pool:
-        return common, list(replicates(common, SEED, range(count), pool))
+    return common, made(common, count)
 
 
 def remarks(outcome: Calibration) -> list[str]:

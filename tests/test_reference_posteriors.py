@@ -24,13 +24,13 @@ import pytest
 from bwbayes.app.config.config import RecordConfig, load
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import Outcome
 from tests.reference.make import digest, from_cube
 from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
 from tests.sampled import sampled
+from tests.together import WrongCorrelation
 
 # What a run may be off by: in sds, in parts, in sds.
 LIMITS = {"mean": 0.1, "sd": 0.05, "quantile_5": 0.15, "quantile_95": 0.15}
@@ -164,22 +164,10 @@ def test_twin_draws_that_are_too_narrow_are_found(
     assert all(off[f"{name} sd"] > 1 for name in reference.case.free), off
 
 
-class Slower(DiscrepancyNoise):
-    """Noise that takes readings to be half as far apart again."""
-
-    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return that of half as many readings more."""
-        return super().transition(theta, 1.5 * np.asarray(readings))
-
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return that of half as many readings more."""
-        return super().fresh(theta, 1.5 * readings)
-
-
 def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> None:
     """Its correlation decays as if the samples were half as far apart again."""
     problem = reference.problem
-    wrong = Slower(reference.case.interval)
+    wrong = WrongCorrelation(reference.case.interval, 1.5)
     planted = replace(
         problem,
         posterior=problem.posterior.altered(noise=wrong),

@@ -1,4 +1,4 @@
-"""A test of all parameters of a calibration together, and one of its bands.
+"""Calibrations: a test of all parameters together, one of the bands, and defects to plant.
 
 Ranks of a replicate's whitened coordinates are nearly independent, so that replicates tell as much
 as many more of a single parameter would. Its errors come from the spread between replicates.
@@ -7,12 +7,16 @@ as many more of a single parameter would. Its errors come from the spread betwee
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, stats
 
+from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.replicates import Replicate
+from bwbayes.calibration.replicates import Experiment, Replicate, replicates
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior
 
 # Level at which the test is used.
@@ -21,6 +25,27 @@ LEVEL = 0.01
 SEED = 1
 
 Plant = Callable[[FloatArray], FloatArray]
+
+
+def made(common: Experiment, count: int, seed: int = SEED) -> list[Replicate]:
+    """Make so many replicates, on one thread."""
+    with one_thread(), ThreadPoolExecutor(1) as pool:
+        return list(replicates(common, seed, range(count), pool))
+
+
+@dataclass(frozen=True)
+class WrongCorrelation(DiscrepancyNoise):
+    """Noise that takes readings to be so many times as far apart as they are."""
+
+    apart: float = 1.0
+
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return that of more readings."""
+        return super().transition(theta, self.apart * np.asarray(readings))
+
+    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return that of more readings."""
+        return super().fresh(theta, self.apart * readings)
 
 
 def nothing(draws: FloatArray) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit, fit, peaks
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator, State
-from bwbayes.model.distributions import Distribution
 from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.problems import posterior_of, short_posterior
 
@@ -61,55 +58,6 @@ def test_the_covariance_is_that_of_the_curvature(fits: Fits, name: str) -> None:
             pp, pm, mp, mm = posterior.log_density(np.array(corners))
             hessian[i, j] = -(pp - pm - mp + mm) / (4 * step**2)
     np.testing.assert_allclose(np.eye(size), hessian, atol=0.15)
-
-
-@dataclass(frozen=True)
-class MirrorActuator(Actuator):
-    """A model that tells the sign of its offset only by ``worse`` um from sample to sample."""
-
-    worse: float = 0.0
-
-    def advance(  # type: ignore[override]
-        self,
-        theta: FloatArray,
-        voltage: FloatArray,
-        state: State | None = None,
-        unrest: FloatArray | None = None,
-        *,
-        from_rest: bool = False,
-    ) -> tuple[FloatArray, State]:
-        """Return the displacement, its offset taken as a size."""
-        sizes = np.abs(theta)
-        moved, end = super().advance(sizes, voltage, state, unrest, from_rest=from_rest)
-        jagged = self.worse * (-1.0) ** np.arange(voltage.size)
-        return moved + jagged * (theta[:, -1:] < 0), end
-
-
-def mirrored(worse: float = 0.0) -> Posterior:
-    """Return a posterior with optima at offsets of 6 um and, worse or not, of -6 um."""
-    usual = short_posterior(
-        "white",
-        200,
-        fixed={"initial": 0.0, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172},
-        priors={"offset": Distribution("normal", {"mean": 0.0, "sd": 10.0})},
-    )
-    return usual.altered(
-        displacement=usual.only.displacement + 6.0,
-        actuator=MirrorActuator("none", "first", 0.01, worse=worse),
-        noise=WhiteNoise(),
-        from_rest=False,
-    )
-
-
-def test_the_mode_is_the_best_of_the_optima_and_one_not_much_worse_is_kept() -> None:
-    """The other is some nats worse: the sum of squares is 200 x 0.1^2 larger, at an sd of 0.3."""
-    posterior = mirrored(worse=0.1)
-    point = fit(posterior, np.random.default_rng(7))
-    free, _ = posterior.prior.constrain(point.optima)
-    np.testing.assert_allclose([6.0, -6.0], free[:, 1], atol=0.15)
-    density = posterior.log_density(point.optima)
-    assert density[0] == point.log_density
-    assert 3 < density[0] - density[1] < 30
 
 
 class Impossible(WhiteNoise):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from scipy.optimize import brentq
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.actuator import Actuator
@@ -37,78 +34,6 @@ def columns(actuator: Actuator, **known: float) -> dict[str, FloatArray]:
 def measured(loop: Traced) -> dict[str, float]:
     every = {name: values for name, values in measures(loop).items() if values is not None}
     return {name: float(values[0]) for name, values in every.items()}
-
-
-class Symmetric:
-    """The steady loop of n = 1 Bouc-Wen between ±U, in closed form, with h(U) = −h(−U) = H.
-
-    On the way up h decays from −H with c₂ = β − γ, passes zero after v₀ volts and goes on with
-    c₁ = β + γ; on the way down it is the same turned about zero.
-    """
-
-    def __init__(self, u: float, d: float, alpha: float, beta: float, gamma: float) -> None:
-        self.u, self.d, self.alpha = u, d, alpha
-        self.c1, self.c2 = beta + gamma, beta - gamma
-        top = alpha / self.c1
-        self.h = float(brentq(lambda h: self.ends(h) - h, 0.0, top, xtol=1e-15, rtol=1e-14))
-        self.zero = self.to_zero(self.h)
-
-    def to_zero(self, h: float) -> float:
-        """Return the travel from −h to zero, V."""
-        return float(np.log1p(h * self.c2 / self.alpha) / self.c2)
-
-    def ends(self, h: float) -> float:
-        """Return where h ends at U that started with −h at −U, um."""
-        left = 2 * self.u - self.to_zero(h)
-        return float(-self.alpha * np.expm1(-self.c1 * left) / self.c1)
-
-    def rising(self, voltage: float) -> float:
-        """Return h on the way up, um."""
-        v = voltage + self.u
-        if v < self.zero:
-            level = self.alpha / self.c2
-            return float(level - (level + self.h) * np.exp(-self.c2 * v))
-        return float(-self.alpha * np.expm1(-self.c1 * (v - self.zero)) / self.c1)
-
-    def measures(self) -> dict[str, float]:
-        """Return what is measured, by name."""
-        below, above = self.alpha / self.c2, self.alpha / self.c1
-        rest = 2 * self.u - self.zero
-        integral = below * self.zero + (below + self.h) * np.expm1(-self.c2 * self.zero) / self.c2
-        integral += above * (rest + np.expm1(-self.c1 * rest) / self.c1)
-        size = 2 * (self.d * self.u - self.h)
-        coercive = brentq(lambda u: self.d * u - self.rising(u), 0.0, self.u, xtol=1e-13)
-        return {
-            "range_um": size,
-            "opening_um": 2 * self.rising(0.0),
-            "remanence_um": self.rising(0.0),
-            "coercive_V": float(coercive),
-            "area_um_V": 2 * integral,
-        }
-
-
-@settings(deadline=None, max_examples=60)
-@given(
-    st.floats(5, 150),
-    st.floats(0.05, 0.6),
-    st.floats(0.01, 0.05),
-    st.floats(-0.9, 0.9).filter(lambda part: abs(part) > 1e-3),
-)
-def test_symmetric_loop_of_bouc_wen_is_the_closed_form(
-    half: float, part: float, beta: float, turned: float
-) -> None:
-    """The opening and the remanence are samples; the others are interpolated or integrated."""
-    d, gamma = 0.7, turned * beta
-    actuator = still()
-    column = columns(actuator, d=d, alpha=part * d, beta=beta, gamma=gamma, exponent=1.0)
-    loop = steady_loop(actuator, column, -half, half, 801)
-    assert loop.closed
-    expected, got = Symmetric(half, d, part * d, beta, gamma).measures(), measured(loop)
-    size = expected["range_um"]
-    tolerance = {"coercive_V": 1e-5 * half, "area_um_V": 1e-7 * size * half}
-    for name, value in expected.items():
-        assert value == pytest.approx(got[name], abs=tolerance.get(name, 1e-8 * size)), name
-    assert 100 * expected["opening_um"] / size <= got["widest_percent"] + 1e-6
 
 
 def slow_plays(voltage: FloatArray, d: float, thresholds: Any, weights: Any) -> FloatArray:

@@ -31,13 +31,12 @@ from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
-from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.initial_state import started
 from bwbayes.prediction.prediction import Start
 from bwbayes.record.record import Record
@@ -50,7 +49,6 @@ from tests.prediction.moving import (
     covered,
     errors_off,
     posterior_of_case,
-    predicted,
     record_of,
     studied,
     widening,
@@ -111,20 +109,6 @@ def test_twin_earlier_drives_taken_for_as_large_as_the_range_do_not_cover_them()
     with patch.object(RemembersExtrema, "earlier", Operator.earlier):
         every = studied(Case(hysteresis="preisach"), QUICK, seed=1)
     assert np.mean(covered(every, 95)) < LEAST
-
-
-@pytest.mark.parametrize("name", ["bouc-wen", "preisach"])
-def test_bands_are_the_same_on_either_engine(name: str) -> None:
-    """Draws of different histories among them, which are simulated apart."""
-    case = Case(hysteresis=name)
-    record = record_of(case, np.random.default_rng(8))
-    engines: tuple[Engine, ...] = ("numba", "numpy")
-    compiled, plain = (
-        predicted(case, posterior_of_case(case, engine), record, 3) for engine in engines
-    )
-    for kind in KINDS:
-        np.testing.assert_allclose(compiled.lower[kind, 95], plain.lower[kind, 95], atol=1e-6)
-    np.testing.assert_allclose(compiled.mean, plain.mean, rtol=0, atol=1e-8)
 
 
 def test_twin_dynamics_taken_to_be_at_rest_do_not_cover_them() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import emcee
 import numpy as np
@@ -11,13 +10,9 @@ import pytest
 from emcee.moves import DEMove, StretchMove
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.engine import Engine
 from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import Weighted, pilot_moves, sampling_moves
-from bwbayes.sampling.proposals import StudentMixture
-from tests.inference.problems import short_posterior
+from bwbayes.sampling.moves import Weighted, pilot_moves
 from tests.sampling.targets import gaussian, target
 
 FREE, WALKERS = 3, 12
@@ -55,28 +50,6 @@ def test_the_steps_are_emcees_own(name: str) -> None:
     np.testing.assert_array_equal(sampler.get_chain(), block.coordinates)
     np.testing.assert_array_equal(sampler.backend.accepted, block.accepted)
     np.testing.assert_array_equal(last.random_state[1], block.end.random_state[:624])
-
-
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
-def test_ensembles_that_move_together_move_as_alone(engine: Engine) -> None:
-    """On a record, to rounding: densities are worked out for groups of models."""
-    if engine == "numba":
-        pytest.importorskip("numba")
-    posterior = replace(short_posterior(samples=120, dynamics="lag"), engine=engine)
-    generator = np.random.default_rng(2)
-    point = pointfit.fit(posterior, generator)
-    draws = generator.multivariate_normal(point.mode, point.covariance, 400)
-    moves = sampling_moves(StudentMixture.fitted(draws))
-    walkers = 2 * posterior.prior.dimensions
-    states = [start(posterior, point, i, walkers, np.random.default_rng(i)) for i in range(3)]
-    together = advance(posterior, [moves] * 3, states, 20)
-    for state, block in zip(states, together, strict=True):
-        (alone,) = advance(posterior, [moves], [state], 20)
-        np.testing.assert_array_equal(alone.coordinates, block.coordinates)
-        np.testing.assert_allclose(alone.log_density, block.log_density, rtol=1e-13)
-        np.testing.assert_array_equal(alone.accepted, block.accepted)
-        np.testing.assert_array_equal(alone.moves, block.moves)
-        np.testing.assert_array_equal(alone.end.random_state, block.end.random_state)
 
 
 def distance(point: FloatArray) -> float:
