@@ -1,8 +1,6 @@
-"""Readings that are missing or spoilt: the answer is that of the readings that are good.
+"""Readings that are spoilt: spikes are set aside, and the bands are as wide as without them.
 
-Missing readings are left out of the likelihood exactly, so the density of a posterior's draws is
-that of a dense Gaussian to rounding: nothing is left to Monte Carlo. Spikes are set aside, and the
-bands are as wide as without them; the twin leaves them in.
+The twin leaves them in.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The posterior of several records: a sum over them, with what is shared there once.
 
-Exactness is held against the posteriors of the records alone, and against the whole record where
-two records are its halves.
+It is held against the posteriors of the records alone, and against the whole record where two
+records are its halves.
 """
 
 from __future__ import annotations

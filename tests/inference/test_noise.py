@@ -1,7 +1,7 @@
-"""Every noise is the Gaussian that it says it is, at extreme values too.
+"""Every noise is the Gaussian that it says it is.
 
-The oracles are a dense Gaussian, with the covariance of a driven oscillator from a matrix
-exponential of its equation of motion, and eighty digits.
+The oracle is a dense Gaussian, with the covariance of a driven oscillator from a matrix exponential
+of its equation of motion.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The point fit stands on the mode, knows the curvature there, and tells optima apart."""
+"""The point fit stands on the mode, knows the curvature there, and sees all modes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured loops are those of closed forms and of slow loops, whatever the path's sampling."""
+"""Measured loops are those of slow loops, of the whole range and of half of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values of the mixture against scipy's normal distribution, double sums and the exact mixture."""
+"""Values of the mixture against double sums and the exact mixture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Step responses are those of closed forms, and a forecast goes on where the record ends."""
+"""Step responses are those of closed forms."""
 
 from __future__ import annotations
 

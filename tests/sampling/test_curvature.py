@@ -1,4 +1,4 @@
-"""Bends straighten ridges, are undone exactly, and keep every volume."""
+"""Bends follow ridges, and are undone exactly."""
 
 from __future__ import annotations
 

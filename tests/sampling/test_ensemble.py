@@ -1,4 +1,4 @@
-"""An ensemble moves as emcee moves it, alone or with others; starts are tight, far, and apart."""
+"""An ensemble moves as emcee moves it; starts are tight, far, and apart."""
 
 from __future__ import annotations
 

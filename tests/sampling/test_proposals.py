@@ -1,7 +1,6 @@
-"""Proposals propose what their density says, and their acceptance ratio keeps a distribution.
+"""Proposals propose what their density says, whatever they were fitted to.
 
-How sure :func:`~tests.sampling.targets.worst_score` is, and how rarely wrong, is told there; that
-right proposals leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
+That they leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
 """
 
 from __future__ import annotations
