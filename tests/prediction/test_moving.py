@@ -125,7 +125,7 @@ def at_rest(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
 
 
 def test_lead_ins_that_do_not_fit_are_found() -> None:
-    """Of an actuator that moves 1.3 times as far; with a drift, a slow transient, a jump of 20 um."""
+    """Of an actuator that moves 1.3 times as far; with a drift, a transient, a jump of 20 um."""
     posterior, generator = posterior_of_case(Case()), np.random.default_rng(4)
     theta = posterior.prior.theta(np.empty((20, 0)))
     for number in range(12):
