@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.model.power import PowerStep
-from bwbayes.model.relaxing import phi_functions
 from tests.model.operators.slow import (
     Model,
     assert_close,
@@ -95,9 +93,8 @@ def test_any_exponent_inverts_the_hypergeometric_travel(exponent: float) -> None
     np.testing.assert_allclose(got[0], height, rtol=1e-11)
 
 
-@pytest.mark.parametrize("exponents", [(1.0,), (1.0, 1.5, 2.0, 5.0, 10.0)])
-def test_finite_for_parameters_over_many_decades(exponents: tuple[float, ...]) -> None:
-    generator = np.random.default_rng(14)
+def test_finite_for_parameters_over_many_decades() -> None:
+    generator, exponents = np.random.default_rng(14), (1.0, 1.0, 1.5, 2.0, 5.0, 10.0)
     voltage = np.concatenate([np.zeros(2), random_walk(14, turns=8, samples=5)])
     for _ in range(5):
         alpha = 10 ** generator.uniform(-6, 6, 1000)
@@ -228,8 +225,7 @@ def test_beyond_the_constraints_a_path_gives_energy() -> None:
     assert supplied - np.diff((h**2 / (2 * (0.31 + alpha2 * path**2)))[[0, -1]])[0] < -1.0
 
 
-@pytest.mark.parametrize("start", [2.5, -6.0])
-@pytest.mark.parametrize("terms", TERMS)
+@pytest.mark.parametrize(("terms", "start"), zip(TERMS, (2.5, -6.0, 2.5), strict=True))
 @every_path
 def test_asymmetric_loops_agree_with_their_equation(path: str, terms: Values, start: float) -> None:
     voltage, model = paths()[path], {**PLAIN, **terms, "gamma": 0.005, "initial": start}
@@ -246,7 +242,7 @@ def test_asymmetric_loops_agree_with_their_equation(path: str, terms: Values, st
     assert_close(h, got, 1e-9)
 
 
-@pytest.mark.parametrize("rate", [1e-9, 1e-3, 0.033, 1.0, 40.0])
+@pytest.mark.parametrize("rate", [1e-9, 0.033, 40.0])
 @pytest.mark.parametrize("model", [DUHEM, EVEN], ids=["odd", "even"])
 @pytest.mark.parametrize("path", ["walk", "steps of all sizes", "unipolar"])
 def test_duhem_agrees_with_the_equation_as_published(path: str, model: Values, rate: float) -> None:
@@ -280,21 +276,6 @@ def test_simpler_loops_are_bouc_wen(path: str) -> None:
     expected = by_integration(voltage, lambda u, w, s: s * a * (c * u - w) + b, start)
     column = rows(**{name: value for name, value in PLAIN.items() if name != "gamma"})
     assert_close(expected, run(BacklashLike(), column, voltage)[0], 1e-9)
-
-
-@pytest.mark.parametrize("z", [0.0, 1e-9, 1e-3, 0.5, 1.0, 1.0000001, 1.5, 9.0, 30.0, 700.0, 1e9])
-def test_phi_functions_to_rounding(z: float) -> None:
-    """Against their series in exact fractions, or what is left of them where exp(−z) is nothing."""
-    if z < 40:
-        x, factorial = Fraction(z), [Fraction(math.factorial(order)) for order in range(204)]
-        exact = [
-            float(sum(((-x) ** j / factorial[j + k] for j in range(200)), start=Fraction(0)))
-            for k in (1, 2, 3)
-        ]
-    else:
-        exact = [1 / z, (1 - 1 / z) / z, (0.5 - (1 - 1 / z) / z) / z]
-    got = [float(value[0]) for value in phi_functions(np.array([z]))]
-    np.testing.assert_allclose(got, exact, rtol=2e-15)
 
 
 def test_asymmetric_bounds_leave_out_nothing_that_holds() -> None:
