@@ -152,18 +152,12 @@ def shaped(
     levels: int = 5,
     smoothed: float | None = None,
 ) -> Reference:
-    """Return one of the usual shapes.
+    """Return one of the usual shapes: ``"sine"``, ``"triangle"``, ``"staircase"`` or ``"raster"``.
 
-    Parameters
-    ----------
-    shape
-        ``"sine"``; ``"triangle"``; ``"staircase"``, as many ``levels`` from the middle to either
-        end; ``"raster"``, lines that are written slowly, with quick ways back.
-    interval, amplitude, frequency, middle, periods
-        Sampling interval, s; um; Hz; um from where the actuator stands at zero volts; how many
-        periods, or lines.
-    smoothed
-        Sd of the smoothing, s; by default a hundredth of a period.
+    A staircase has as many ``levels`` from the middle to either end; a raster are lines that are
+    written slowly, with quick ways back, and ``periods`` counts them. The interval is in s,
+    amplitude and middle in um, the frequency in Hz; ``smoothed`` is the sd of the smoothing, s, by
+    default a hundredth of a period.
 
     Raises
     ------

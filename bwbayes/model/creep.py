@@ -2,13 +2,9 @@
 
 A piezo actuator's creep is nearly linear in the drive and in the logarithm of the time: after a
 step it grows by about a percent of it per decade. A sum of first-order lags with log-spaced times
-does just that, one lag per decade here, each with a strength of its own:
-
-    x_creep = Σ cᵢ Lᵢ[w (1 + κ |u| / U)],   Tᵢ Lᵢ′ + Lᵢ = w (1 + κ |u| / U).
-
-Equal strengths c give c log₁₀(t) between the shortest and the longest of the times. κ lets the
-creep grow with the voltage. The lags stand beside the dynamics, not behind them: their times are so
-much longer that the order does not show.
+does just that, one lag per decade here, each with a strength of its own; equal strengths c give
+c log₁₀(t) between the shortest and the longest of the times. The lags stand beside the dynamics,
+not behind them: their times are so much longer that the order does not show.
 """
 
 from __future__ import annotations
