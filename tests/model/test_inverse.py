@@ -117,7 +117,7 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
         names = of.likelihood.actuator.parameters
         theta = theta[:, [i for i, n in enumerate(names) if n in actuator.parameters]]
     calm(actuator, theta)
-    voltage = decaying_sine(60 if integrated else 120 if parts else 300)
+    voltage = decaying_sine(30 if integrated else 120 if parts else 300)
     reference = actuator.displacement(theta, voltage, from_rest=from_rest)
     assert_returned(actuator, theta, reference, from_rest=from_rest)
 
