@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray
 
@@ -24,7 +23,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.lanes import (
     CHANGE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FRESH, GAIN, GAIN_2,
     GAP, INNOVATION, INVERSE, KEPT, KEPT_12, KEPT_22, LANES, LATEST, LOG, PRODUCTS, RATIO, RESPONSE,
-    SENSOR, SQUARES, VALUE,
+    SENSOR, SQUARES, VALUE, inner,
 )
 # fmt: on
 # isort: on
@@ -38,7 +37,7 @@ SETTLED = 2e-15
 ROUNDING = 1e-13
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def follow(
     state: FloatArray,
     second: bool | None,
@@ -84,7 +83,7 @@ def follow(
         _fold(state, second, readings.size, weight, decays, series)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _fold(
     state: FloatArray,
     second: bool | None,
@@ -124,7 +123,7 @@ def _fold(
                 state[ESTIMATE_2 + at + i] = response * _part_2(state, i, decays[k])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _part(state: FloatArray, second: bool | None, i: int, rho: float) -> float:
     """Return c, the estimate of a response that keeps ρ of itself, over the response."""
     if second is None:
@@ -135,7 +134,7 @@ def _part(state: FloatArray, second: bool | None, i: int, rho: float) -> float:
     return float((gain * left + across * pull) / total)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _part_2(state: FloatArray, i: int, rho: float) -> float:
     """Return c₂, that of the second state."""
     gain, across = state[GAIN + i], state[KEPT_12 + i]
@@ -144,7 +143,7 @@ def _part_2(state: FloatArray, i: int, rho: float) -> float:
     return float((first * pull - across * gain) / total)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def is_tracked(
     state: FloatArray, second: bool | None, decays: FloatArray, series: IntArray
 ) -> bool:
@@ -164,7 +163,7 @@ def is_tracked(
     return True
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def is_settled(state: FloatArray) -> bool:
     """Tell whether no model's covariance changed by the last reading."""
     settled = True
@@ -173,7 +172,7 @@ def is_settled(state: FloatArray) -> bool:
     return settled
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def gain(
     state: FloatArray,
     second: bool | None,
@@ -201,7 +200,7 @@ def gain(
     _take_logs(state)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def innovate(
     second: bool | None,
     gaps: IntArray,
@@ -245,7 +244,7 @@ def innovate(
                     other[i] += gains_2[row + i] * innovation
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _advance(state: FloatArray, second: bool | None) -> None:
     """Take the covariance to the next reading, with the gain of this one on the way."""
     for i in range(LANES):
@@ -271,7 +270,7 @@ def _advance(state: FloatArray, second: bool | None) -> None:
         state[CHANGE + i] = abs(state[COVARIANCE + i] - state[CHANGE + i])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _predict(state: FloatArray, second: bool | None, step: int) -> None:
     """Take the covariance on by a step, whose rows begin there."""
     for i in range(LANES):
@@ -289,7 +288,7 @@ def _predict(state: FloatArray, second: bool | None, step: int) -> None:
             state[COVARIANCE_22 + i] = d * end - b * low + state[step + 5 * LANES + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
     """Take the covariance over missing readings by the filter's step (rows,) over them."""
     _take_logs(state)
@@ -298,7 +297,7 @@ def _skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
     _predict(state, second, GAP)
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _take_logs(state: FloatArray) -> None:
     """Move the product of variances to the sum of logs, before it gets too large."""
     for i in range(LANES):
@@ -306,7 +305,7 @@ def _take_logs(state: FloatArray) -> None:
         state[RATIO + i] = 1.0
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def gather(state: FloatArray, readings: int) -> None:
     """Add to the sums what so many readings with one variance brought."""
     if readings == 0:

@@ -25,7 +25,7 @@ from bwbayes.inference.compiled import filter as noise
 from bwbayes.inference.compiled.lanes import (
     A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FREE, KEPT, LANES, LOG,
     LOG_DETERMINANT, PAIRS, PARAMETERS, PROCESS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, SERIES,
-    STATE, STRENGTH, SUMS, VALUE,
+    STATE, STRENGTH, SUMS, VALUE, inner,
 )
 # fmt: on
 # isort: on
@@ -41,7 +41,7 @@ SHORT_PIECE = 32
 FORGOTTEN = 1e-18
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _one_by_one(
     state: FloatArray,
     second: bool | None,
@@ -86,7 +86,7 @@ def _one_by_one(
             _add_products(gaps, inverse, values, work[3 + j], state[pair : pair + LANES])
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _subtract(displacement: FloatArray, simulated: FloatArray, residual: FloatArray) -> None:
     """Write readings (samples,) less what models do (samples times lanes,)."""
     for t in range(displacement.size):
@@ -95,7 +95,7 @@ def _subtract(displacement: FloatArray, simulated: FloatArray, residual: FloatAr
             residual[row + i] = displacement[t] - simulated[row + i]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _respond(
     samples: int,
     a1: FloatArray,
@@ -114,7 +114,7 @@ def _respond(
             later[i] = -a2[i] * x
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _add_products(
     gaps: IntArray, inverse: FloatArray, first: FloatArray, second: FloatArray, total: FloatArray
 ) -> None:
@@ -126,7 +126,7 @@ def _add_products(
                 total[i] += first[row + i] * second[row + i] * inverse[row + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _is_heard(state: FloatArray, series: int) -> bool:
     """Tell whether any model's filter still hears of the unknown start in one of its series."""
     for i in range(series * LANES, (series + 1) * LANES):
@@ -136,7 +136,7 @@ def _is_heard(state: FloatArray, series: int) -> bool:
     return False
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
     """Put all that a model remembers to the record's first sample."""
     for i in range(len(PARAMETERS) * LANES, STATE):
@@ -155,7 +155,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
             state[RESPONSE + at] = state[STRENGTH + k * LANES + i]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _group(
     second: bool | None,
     kind: Kind,
@@ -223,7 +223,7 @@ def _group(
         result[LOG_DETERMINANT, i] = state[LOG + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _aligned(size: int) -> FloatArray:
     """Return an empty row whose vectors do not straddle the cache's lines (of 64 bytes)."""
     row = np.empty(size + 8)
@@ -286,7 +286,8 @@ def sums(
             for row in range(group.shape[1]):
                 lane_group[row * LANES + i] = group[model, row]
             for row in range(steps.shape[2]):
-                lane_steps[:, row * LANES + i] = steps[:, model, row]
+                for gap in range(steps.shape[0]):
+                    lane_steps[gap, row * LANES + i] = steps[gap, model, row]
         _group(
             second, kind, lane_group, plan, curve, lags, growth, state, voltage, displacement,
             gaps, lane_steps, offset, free, slow, results,

@@ -7,7 +7,18 @@ these numbers into what it compiles, so whoever changes them deletes what it has
 
 from __future__ import annotations
 
+from typing import Any
+
+from numba import njit
+
 from bwbayes.model.creep import MOST_TIMES
+
+
+def inner(**options: Any) -> Any:
+    """Compile what compiled functions alone call, without what Python would call it by."""
+    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return njit(nogil=True, cache=True, **wrappers, **options)
+
 
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.
 LANES = 32

@@ -7,7 +7,6 @@ them see the drive's distance from that of the first sample, at which they may h
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray
 
@@ -15,7 +14,7 @@ from bwbayes.arrays import FloatArray
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
     A1, A2, B0, B1, B2, CREPT, CUBIC, EQUILIBRIUM, GROWTH, LAG, LANES, LEVEL, QUADRATIC,
-    STRENGTH, X1, X2,
+    STRENGTH, X1, X2, inner,
 )
 # fmt: on
 # isort: on
@@ -68,7 +67,7 @@ def physics(
     return rows | {row: column[name] for row, name in others.items() if name in column}
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def displace(
     state: FloatArray,
     curve: FloatArray,
@@ -92,7 +91,7 @@ def displace(
         _creep(state, lags, growth, first, last, drive)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _bend(state: FloatArray, curve: FloatArray, first: int, last: int, drive: FloatArray) -> None:
     """Add q₂ (x² − x₀²) + q₃ (x³ − x₀³)."""
     for t in range(first, last):
@@ -102,7 +101,7 @@ def _bend(state: FloatArray, curve: FloatArray, first: int, last: int, drive: Fl
             drive[row + i] += square * state[QUADRATIC + i] + cube * state[CUBIC + i]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
     """Let the dynamics follow."""
     for t in range(samples):
@@ -115,7 +114,7 @@ def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
             drive[row + i] = state[LEVEL + i] + x
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _creep(
     state: FloatArray,
     lags: FloatArray,
@@ -137,10 +136,11 @@ def _creep(
         at, strength = LAG + k * LANES, STRENGTH + k * LANES
         lag = state[at : at + LANES].copy()
         _lag(followed, lags[k], state[strength : strength + LANES].copy(), lag, drive)
-        state[at : at + LANES] = lag
+        for i in range(LANES):  # a slice's shape would be checked, by more code than all of this
+            state[at + i] = lag[i]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _lag(
     followed: FloatArray,
     coefficients: FloatArray,

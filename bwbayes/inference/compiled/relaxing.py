@@ -8,10 +8,9 @@ fastest of them moves little in a sample, and doubled from there elsewhere.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.inference.compiled.lanes import LANES, inner
 from bwbayes.model import relaxing as formulas
 from bwbayes.model.compiled import compiled
 from bwbayes.model.relaxing import BENT, SHORT, RelaxingStep
@@ -47,7 +46,7 @@ def planned(step: RelaxingStep) -> FloatArray:
     return np.array([[curved, step.signed]], dtype=np.float64)
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def relaxing(
     step: RelaxingStep,  # noqa: ARG001
     group: FloatArray,
@@ -79,7 +78,7 @@ def relaxing(
             out[row + i] = group[W + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _take(group: FloatArray, before: float, u: float) -> None:
     """Let the rates hold that do between two voltages."""
     pair = 2 * int(u > before) + int(before + u > 0.0)
@@ -91,7 +90,7 @@ def _take(group: FloatArray, before: float, u: float) -> None:
         group[AHEAD + i] = group[RATES + (4 + pair) * LANES + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _move(
     group: FloatArray,
     before: float,
@@ -110,7 +109,7 @@ def _move(
         _cross(group, s, u, v)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _straight(group: FloatArray, s: float, u: float, v: float, short: bool) -> int:
     """Move h along a step, with φ₁ known or z small; return how many models passed zero."""
     passed = 0
@@ -127,7 +126,7 @@ def _straight(group: FloatArray, s: float, u: float, v: float, short: bool) -> i
     return passed
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _cross(group: FloatArray, s: float, u: float, v: float) -> None:
     """Redo the models whose g passed zero within the step, where its rate changes."""
     for i in range(LANES):
@@ -138,7 +137,7 @@ def _cross(group: FloatArray, s: float, u: float, v: float) -> None:
             group[W + i] = group[D + i] * u - s * new - group[REST + i]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _bend(group: FloatArray, s: float, before: float, u: float, v: float, short: bool) -> None:
     """Move h along a step with one rate and a strength that changes, with φ known or z small."""
     for i in range(LANES):
@@ -160,7 +159,7 @@ def _bend(group: FloatArray, s: float, before: float, u: float, v: float, short:
         group[W + i] = f - h - group[REST + i]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _phi(group: FloatArray, s: float, v: float, steepest: float, curved: bool) -> None:
     """Work out φ₁, and φ₂ and φ₃ if they are needed, by their series and doublings of z.
 

@@ -18,7 +18,7 @@ from numba.extending import overload
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import extrema, pinned, relaxing
-from bwbayes.inference.compiled.lanes import LANES
+from bwbayes.inference.compiled.lanes import LANES, inner
 from bwbayes.model.compiled import FormulaType, move
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
@@ -117,7 +117,7 @@ def _compiled_along(
     return along
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "nsz"})
+@inner(fastmath={"contract", "nsz"})
 def _given(
     kind: None,  # noqa: ARG001
     group: FloatArray,
@@ -134,7 +134,7 @@ def _given(
             out[(t - first) * LANES + i] = drive[t] - group[LANES + i]
 
 
-@njit(nogil=True, cache=True)
+@inner()
 def _stepped(
     step: HysteresisStep,
     group: FloatArray,

@@ -100,7 +100,9 @@ def walk(
     rows |= {LAG + LANES * k: lag[:, 0] for k, lag in enumerate(crept)}
     for row, values in rows.items():
         state[:, row : row + LANES] = values[at].reshape(-1, LANES)
-    return Walk(stage, shared(actuator, voltage), state, voltage, drive)
+    # Not to be written to, whatever it was: of one type, for which one walk is compiled.
+    known = np.broadcast_to(voltage, voltage.shape)
+    return Walk(stage, shared(actuator, voltage), state, known, drive)
 
 
 def _lanes(models: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
