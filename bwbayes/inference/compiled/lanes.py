@@ -16,8 +16,8 @@ from bwbayes.model.creep import MOST_TIMES
 
 def inner(**options: Any) -> Any:
     """Compile what compiled functions alone call, without what Python would call it by."""
-    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return njit(nogil=True, cache=True, **wrappers, **options)
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return njit(nogil=True, cache=True, **options)
 
 
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.
