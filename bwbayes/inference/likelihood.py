@@ -243,16 +243,15 @@ class Likelihood:
         ``displacement`` is as in :meth:`score`.
         """
         readings, n_series = self.readings, 1 + self.unknowns + shapes.shape[-2]
-        # Shapes are many: a model's series are to stay in the cache.
-        elements = 1 << 16 if shapes.size else 1 << 23
+        # Shapes are many: NumPy is to have a model's series in the cache. Compiled code takes many
+        # models in the time of one.
+        elements = 1 << 16 if shapes.size and self.engine == "numpy" else 1 << 23
         every = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
         results = []
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:
-                voltage = self.voltage[: readings.samples]
-                simulated = self.actuator.displacement(model, voltage, from_rest=self.from_rest)
-                moved = simulated[:, readings.where]
+                moved = self.simulate(model, self.voltage[: readings.samples])[:, readings.where]
             else:
                 moved = displacement[batch]
             residual = (readings.values - moved)[:, np.newaxis]

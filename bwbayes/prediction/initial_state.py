@@ -251,8 +251,10 @@ def going_on(
 def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
     """Give every draw θ (draws, parameters) the start that the training record tells."""
     likelihood = posterior.likelihood
-    start = likelihood.start(theta)
-    unrest = _normal(start.mean, start.covariance, generator)
+    unrest = np.empty((len(theta), 0))
+    if likelihood.unknowns:
+        start = likelihood.start(theta)
+        unrest = _normal(start.mean, start.covariance, generator)
     model, none = posterior.only.table.actuator(theta), np.zeros(len(theta))
     which = np.zeros(len(theta), dtype=np.int64)
     actuators, from_rest = (likelihood.actuator,), posterior.only.from_rest
