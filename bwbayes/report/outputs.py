@@ -1,7 +1,7 @@
 """The files of a report and of a finished run: page, pictures, posterior, bands, numbers.
 
 Each is written under another name and renamed when it is whole, so a reader never sees half a
-file. This module alone knows the labeled posterior of arviz.
+file.
 """
 
 from __future__ import annotations
@@ -63,50 +63,45 @@ def posterior_tree(
     have their record's name behind their own: ``displacement_loops``. The attribute ``converged``
     is 1 or 0: without convergence the draws are none of the posterior.
     """
-    import arviz_base  # noqa: PLC0415  # slow to load
+    import xarray as xr  # noqa: PLC0415  # slow to load
 
-    _, ensembles, walkers, _ = result.draws.shape
-
-    def chains(values: FloatArray) -> FloatArray:
-        return np.moveaxis(values, 0, 2).reshape(
-            ensembles * walkers, len(values), *values.shape[3:]
-        )
-
-    of = {f"_{name}" if len(records) > 1 else "": record for name, record in records.items()}
-    measured = {f"displacement{end}": np.asarray(record.displacement) for end, record in of.items()}
-    driven = {f"voltage{end}": record.voltage for end, record in of.items()}
-    times = {f"time{end}": record.time for end, record in of.items()}
-    drawn = chains(result.draws)
-    tree = arviz_base.from_dict(
-        {
-            "posterior": {p.name: drawn[..., i] for i, p in enumerate(result.free)},
-            "sample_stats": {"lp": chains(result.log_density)},
-            "observed_data": measured,
-            "constant_data": driven,
-        },
-        coords=times,
-        dims={f"{name}{end}": [f"time{end}"] for end in of for name in ("displacement", "voltage")},
-        check_conventions=False,  # more walkers than steps are as they should be
-    )
-    along = {
+    steps, ensembles, walkers, _ = result.draws.shape
+    index = {
+        "chain": np.arange(ensembles * walkers),
+        "draw": np.arange(steps),
         "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
         "walker": ("chain", np.tile(np.arange(walkers), ensembles)),
     }
-    for group in ("posterior", "sample_stats"):
-        tree[group] = tree[group].to_dataset().assign_coords(along)
-    density = ("chain", "draw"), chains(log_likelihood)
-    statistics = tree["sample_stats"].to_dataset()
-    tree["log_likelihood"] = statistics.drop_vars("lp").assign(displacement=density)
-    for group, names, unit in (
-        ("observed_data", measured, "um"),
-        ("constant_data", driven, "V"),
-    ):
-        for name, time in zip(names, times, strict=True):
-            tree[group][name].attrs["units"] = unit
-            tree[group][time].attrs["units"] = "s"
-    tree.attrs["converged"] = tree["posterior"].attrs["converged"] = int(result.outcome.converged)
-    for parameter in result.free:
-        tree["posterior"][parameter.name].attrs["units"] = parameter.unit
+
+    def chains(values: FloatArray, unit: str = "") -> tuple[Any, ...]:
+        by_walker = np.moveaxis(values, 0, 2).reshape(ensembles * walkers, steps)
+        return ("chain", "draw"), by_walker, {"units": unit} if unit else {}
+
+    converged = {"converged": int(result.outcome.converged)}
+    draws = {p.name: chains(result.draws[..., i], p.unit) for i, p in enumerate(result.free)}
+    measured: dict[str, Any] = {}
+    driven: dict[str, Any] = {}
+    for name, record in records.items():
+        end = f"_{name}" if len(records) > 1 else ""
+        time = xr.Variable(f"time{end}", record.time, {"units": "s"})
+        for group, series, values, unit in (
+            (measured, f"displacement{end}", record.displacement, "um"),
+            (driven, f"voltage{end}", record.voltage, "V"),
+        ):
+            dims = [f"time{end}"]
+            group[series] = xr.DataArray(
+                np.asarray(values), {dims[0]: time}, dims, attrs={"units": unit}
+            )
+    tree = xr.DataTree.from_dict(
+        {
+            "posterior": xr.Dataset(draws, index, converged),
+            "sample_stats": xr.Dataset({"lp": chains(result.log_density)}, index),
+            "log_likelihood": xr.Dataset({"displacement": chains(log_likelihood)}, index),
+            "observed_data": xr.Dataset(measured),
+            "constant_data": xr.Dataset(driven),
+        }
+    )
+    tree.attrs |= converged
     return tree
 
 

@@ -13,13 +13,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import groupby
+from operator import attrgetter
 from typing import NamedTuple
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from bwbayes.report.report import Report, Table, TableColumn
+from bwbayes.report.report import Report, Table
 
 __all__ = ["PagePlots", "Script", "csv_link", "fragment", "render"]
 
@@ -85,8 +86,15 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
         "pixels": _pixels,
         "csv_link": csv_link,
-        "is_wordy": _is_wordy,
-        "spans": _spans,
+        # Whether each column holds words, which go to the left.
+        "is_wordy": lambda rows: [
+            not all(map(NUMBER.match, column)) for column in zip(*rows, strict=True)
+        ],
+        # The titles above those of the columns, but the first, with how many each spans.
+        "spans": lambda columns: [
+            (title, len(list(spanned)))
+            for title, spanned in groupby(columns[1:], key=attrgetter("group"))
+        ],
     }
     return environment
 
@@ -97,17 +105,6 @@ def _pixels(png: bytes) -> tuple[int, int] | None:
         return None
     width, height = struct.unpack(">2I", png[16:24])
     return width, height
-
-
-def _is_wordy(rows: Sequence[Sequence[str]]) -> list[bool]:
-    """Return, for each column, whether it holds words, which go to the left."""
-    return [not all(NUMBER.match(text) for text in column) for column in zip(*rows, strict=True)]
-
-
-def _spans(columns: Sequence[TableColumn]) -> list[tuple[str, int]]:
-    """Return the titles above those of the columns, but the first, with how many each spans."""
-    groups = groupby(columns[1:], key=lambda column: column.group)
-    return [(title, len(list(spanned))) for title, spanned in groups]
 
 
 def csv_link(table: Table) -> str:
