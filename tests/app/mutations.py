@@ -22,7 +22,7 @@ import scipy.io
 
 from bwbayes.record import read_record, write_record
 
-__all__ = ["CONFIGS", "GOOD", "KINDS", "QUICK", "Case", "case", "good_arrays", "stored"]
+__all__ = ["CONFIGS", "GOOD", "KINDS", "QUICK", "Case", "case", "good_arrays", "made", "stored"]
 
 Generator = np.random.Generator
 
