@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -223,52 +223,44 @@ def windows_of(
 
 
 def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict[str, Slices]]:
-    """Return the windows of one training record."""
+    """Return the windows of one training record, which overlap none that is fitted."""
     train, table = config.records[name].train, place_of(name)
-    pairs = [whole(record)] if train is None else sorted((a, b) for a, b in train)
-    windows = {f"{table}.train": pairs}
-    names = []
-    for other, validation in config.validation.items():
+    stated = {"": [list(whole(record))] if train is None else train}
+    for key, validation in config.validation.items():
         if validation.window and not validation.another and validation.of in (name, None):
-            names.append(other)
-            windows[f"validation.{other}.window"] = sorted((a, b) for a, b in validation.window)
-    slices = {}
-    for where, pairs in windows.items():
-        try:
-            slices[where] = tuple(record.window_slice(*pair) for pair in pairs)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-    _require_apart(record, slices, table)
-    for where, cuts in slices.items():
-        for cut in cuts:
+            stated[key] = validation.window
+    slices: dict[str, Slices] = {}
+    for key, pairs in stated.items():
+        where = f"validation.{key}.window" if key else f"{table}.train"
+        cuts: list[slice] = []
+        for start, stop in sorted((a, b) for a, b in pairs):
+            try:
+                cut = record.window_slice(start, stop)
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from None
+            for other in slices.get("", cuts):
+                if cut.start < other.stop and other.start < cut.stop:
+                    kind, *pair = ("held-out", other, cut) if key else ("training", cut, other)
+                    first, second = (
+                        " to ".join(
+                            record.clock(record.start + record.interval * edge)
+                            for edge in (window.start, window.stop)
+                        )
+                        for window in pair
+                    )
+                    raise InputError(
+                        f"training window {first} s: overlaps the {kind} window {second} s; move "
+                        f"one ({table}.train)"
+                    )
             if not record.has_reading[cut].any():
-                start, stop = record.time[cut][[0, -1]]
+                first, last = (record.clock(time) for time in record.time[cut][[0, -1]])
                 raise InputError(
-                    f"{where}: no readings from {record.clock(start)} to {record.clock(stop)} s; "
-                    f"choose another window, or see start, exclude and decimate in [{table}]"
+                    f"{where}: no readings from {first} to {last} s; choose another window, or see "
+                    f"start, exclude and decimate in [{table}]"
                 )
-    training, *held = slices.values()
-    return training, dict(zip(names, held, strict=True))
-
-
-def _require_apart(record: Record, slices: Mapping[str, Slices], table: str) -> None:
-    """Refuse training windows that overlap another one, or one that is held out."""
-    training, *held = slices.values()
-    pairs = [("training", later, earlier) for earlier, later in combinations(training, 2)]
-    pairs += [("held-out", *pair) for pair in product(training, (w for v in held for w in v))]
-    for kind, window, other in pairs:
-        if window.start < other.stop and other.start < window.stop:
-            first, second = (
-                " to ".join(
-                    record.clock(record.start + record.interval * edge)
-                    for edge in (cut.start, cut.stop)
-                )
-                for cut in (window, other)
-            )
-            raise InputError(
-                f"training window {first} s: overlaps the {kind} window {second} s; move one "
-                f"({table}.train)"
-            )
+            cuts.append(cut)
+        slices[key] = tuple(cuts)
+    return slices.pop(""), slices
 
 
 def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
