@@ -71,10 +71,6 @@ for command in (compensate, export, track, compare, design, config, models):
     cli.add_command(command)
 
 
-def _terminate(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
 def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
     """Ask to stop once more where the first request fell into a callback, which cannot raise."""
     if ignored.exc_type is KeyboardInterrupt:
@@ -82,10 +78,6 @@ def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
         threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
     else:
         sys.__unraisablehook__(ignored)
-
-
-def _one_line(message: Warning | str, *_: object, **__: object) -> str:
-    return f"bwbayes: {as_typed(str(message))}\n"
 
 
 def _failure(error: BaseException) -> tuple[str, int]:
@@ -124,9 +116,9 @@ def _failure(error: BaseException) -> tuple[str, int]:
 def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # A polite request to stop ends a run as Ctrl-C does.
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.unraisablehook = _interrupt_again
-    warnings.formatwarning = _one_line
+    warnings.formatwarning = lambda message, *_, **__: f"bwbayes: {as_typed(str(message))}\n"
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
     except (Exception, KeyboardInterrupt) as error:
