@@ -241,7 +241,8 @@ class Campaign(Product):
                 *[Banner("note", "Off the population", items=outliers)] * bool(outliers),
             ],
             blocks=[
-                *[Table("short", "Records to look at", columns, attention)] * bool(attention),
+                *[Table("short", "Records to look at", columns, attention, on="both")]
+                * bool(attention),
                 population,
                 *[picture] * bool(self._units),
                 Section("Records", [self._records_table()]),
