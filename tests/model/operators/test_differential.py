@@ -225,7 +225,7 @@ def test_beyond_the_constraints_a_path_gives_energy() -> None:
     assert supplied - np.diff((h**2 / (2 * (0.31 + alpha2 * path**2)))[[0, -1]])[0] < -1.0
 
 
-@pytest.mark.parametrize(("terms", "start"), zip(TERMS, (2.5, -6.0, 2.5), strict=True))
+@pytest.mark.parametrize(("terms", "start"), [*zip(TERMS, (2.5, -6.0, 2.5), strict=True)])
 @every_path
 def test_asymmetric_loops_agree_with_their_equation(path: str, terms: Values, start: float) -> None:
     voltage, model = paths()[path], {**PLAIN, **terms, "gamma": 0.005, "initial": start}
