@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
-from bwbayes.report.report import Table
 
 
 def noise(seed: int, size: int = 10) -> FloatArray:
@@ -139,19 +137,3 @@ def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
     comparison = recommend([lost])
     assert comparison.recommended is None
     assert "not converged" in str(comparison)
-
-
-def test_table_numbers_and_page_have_every_model() -> None:
-    comparison = recommend([model("plain", COMMON), model("rich", COMMON - 9)])
-    numbers = comparison.numbers()["models"]
-    assert isinstance(numbers, Mapping)
-    names = ["plain", "rich"]
-    assert list(numbers) == list(comparison.to_pandas().index) == names
-    models, differences = (
-        block for block in comparison.report().all_blocks() if isinstance(block, Table)
-    )
-    assert [row[0] for row in models.rows] == names
-    assert [row[0] for row in differences.rows] == ["rich"]
-    rich = comparison.to_pandas().loc["rich"]
-    assert rich["difference_value"] == pytest.approx(-90)
-    assert rich["parts_later training_log_score"] == pytest.approx(np.sum(COMMON) - 90)

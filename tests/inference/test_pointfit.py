@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit, fit, peaks
-from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.test_validation_end_to_end import made
-from tests.inference.problems import posterior_of, short_posterior
+from tests.inference.problems import short_posterior
 
 CASES = ("white", "discrepancy", "lag")
 
@@ -58,27 +55,6 @@ def test_the_covariance_is_that_of_the_curvature(fits: Fits, name: str) -> None:
             pp, pm, mp, mm = posterior.log_density(np.array(corners))
             hessian[i, j] = -(pp - pm - mp + mm) / (4 * step**2)
     np.testing.assert_allclose(np.eye(size), hessian, atol=0.15)
-
-
-class Impossible(WhiteNoise):
-    """A noise that no residual can have."""
-
-    def whiten(
-        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return innovations under an infinite determinant."""
-        white, log_determinant = super().whiten(theta, series, skipped)
-        return white, log_determinant + np.inf
-
-
-def test_without_a_finite_density_there_is_no_fit() -> None:
-    usual = short_posterior("white", 50)
-    posterior = posterior_of(
-        usual.only.voltage, usual.only.displacement, usual.only.actuator, "white", {"initial": 0.0}
-    )
-    posterior = posterior.altered(noise=Impossible())
-    with pytest.raises(InputError, match=r"^priors: no draw has a finite posterior density"):
-        fit(posterior, np.random.default_rng(9))
 
 
 @pytest.mark.parametrize(("number", "least"), [(97, 0.05), (106, 0.3)])
