@@ -101,7 +101,9 @@ def compared(record: Record, names: list[str], folder: Path) -> Comparison:
     config, records = config_for(record)
     models = models_of("; ".join(names), config.model)
     quiet = Console(quiet=True)
-    return compare_models(config, Path(), models, folder, quiet, in_memory=records, workers=1)
+    return compare_models(
+        config, Path(), models, folder, quiet, in_memory=records, files=False, workers=1
+    )
 
 
 def right(model: str, comparison: Comparison) -> bool:
