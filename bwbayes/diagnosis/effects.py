@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from itertools import accumulate
 
 import numpy as np
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.laplace import Effect, Simulate, climb
@@ -99,7 +100,11 @@ def step(scene: Scene) -> Iterator[Explanation]:
 
 
 def oscillation(scene: Scene) -> Iterator[Explanation]:
-    """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not."""
+    """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not.
+
+    A loop that is missed shows at harmonics of the drive, which rise and fall slowly with their
+    order: a line is stronger than any two of them on either side, and may lie on one.
+    """
     readings = scene.posterior.only.readings
     length = 4 * readings.samples
     values = np.zeros((2, readings.samples))
@@ -108,12 +113,10 @@ def oscillation(scene: Scene) -> Iterator[Explanation]:
     values[1, readings.rows] = drive - np.mean(drive)
     power = np.abs(np.fft.rfft(values * np.hanning(readings.samples), length)) ** 2
     frequency = np.fft.rfftfreq(length, scene.interval)
-    # Not where the drive itself moves the displacement, at harmonics that a loop makes of it too.
-    main = frequency[int(np.argmax(power[1]))]
-    order = frequency / max(main, frequency[1])
-    near = np.abs(order - np.rint(order)) * main < 6 / scene.duration
-    power[0, near | (frequency < 3 * main)] = 0.0
-    best = float(frequency[int(np.argmax(power[0]))])
+    main = int(np.argmax(power[1]))
+    strongest = scipy.ndimage.maximum_filter1d(power[0], 5 * main + 1)
+    lines = (power[0] == strongest) & (np.arange(frequency.size) >= 3 * main)
+    best = float(frequency[int(np.argmax(lines * power[0]))])
     if not best:
         return
     phase = 2 * np.pi * best * scene.time

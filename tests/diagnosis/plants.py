@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.record import Record
 from tests.stand import process
 
-__all__ = ["CAUSES", "Plant", "plant"]
+__all__ = ["CAUSES", "Bench", "Plant", "bench", "plant"]
 
 RATE, FINE = 200.0, 8
 
@@ -161,9 +161,17 @@ def at_actuator(kind: str, fine: FloatArray, rng: np.random.Generator) -> FloatA
 
 
 def moved_by(
-    kind: str, part: Plant, voltage: FloatArray, size: float, rng: np.random.Generator
+    kind: str,
+    part: Plant,
+    voltage: FloatArray,
+    size: float,
+    rng: np.random.Generator,
+    warming: int,
 ) -> FloatArray:
-    """Return the displacement in front of the sensor, at the fine steps; ``size`` is in parts."""
+    """Return the displacement in front of the sensor, at the fine steps.
+
+    ``size`` is in parts of the range; a gain that moves is steady after ``warming`` fine steps.
+    """
     driven = (plays if kind == "operator" else hysteresis)(part, voltage)
     size *= float(np.ptp(driven))
     scaled = voltage / np.max(np.abs(voltage))
@@ -183,7 +191,7 @@ def moved_by(
         case "backlash":
             return play(moved, abs(size) / 2)
         case "moving gain":
-            along = np.arange(moved.size) / moved.size
+            along = np.minimum(np.arange(moved.size) / warming, 1.0)
             return moved * (1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.1) * along)
     return moved
 
@@ -233,7 +241,54 @@ def plant(kind: str, seed: tuple[int, int], seconds: float = 10.0) -> Record:
     rng = np.random.default_rng(seed)
     part, fine = drawn(rng), drive(rng, seconds)
     size = float(rng.uniform(0.02, 0.06)) * float(rng.choice([-1, 1]))
-    moved = moved_by(kind, part, at_actuator(kind, fine, rng), size, rng)[::FINE]
+    moved = moved_by(kind, part, at_actuator(kind, fine, rng), size, rng, fine.size)[::FINE]
     voltage, time = fine[::FINE], np.arange(moved.size) / RATE
     readings = moved + part.offset + added(kind, moved, size, time, rng)
     return Record(voltage, readings + noise(kind, part, voltage, rng), 1 / RATE, origin=kind)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Two records of one plant, the second cut from a running drive, with an offset of its own.
+
+    ``driven`` are the voltages (samples,) that the actuator did get at the samples of each.
+    """
+
+    records: tuple[Record, Record]
+    driven: tuple[FloatArray, FloatArray]
+
+
+def bench(kind: str, seed: tuple[int, int], cured: str = "", seconds: float = 10.0) -> Bench:
+    """Measure a plant twice: as :func:`plant` does, and again along another drive.
+
+    A ``cured`` cause is absent from both, all else is the same. The other drive goes no faster and
+    no further than the first, so that what is planted has one size. What happens once does not
+    happen again.
+    """
+    rng, later = np.random.default_rng(seed), np.random.default_rng((*seed, 1))
+    part, first = drawn(rng), drive(rng, seconds)
+    size = float(rng.uniform(0.02, 0.06)) * float(rng.choice([-1, 1]))
+    kind = "good" if kind == cured else kind
+    second = drive(later, 42.0)
+    second *= 0.95 * min(
+        np.max(np.abs(each(first))) / np.max(np.abs(each(second))) for each in (np.array, np.diff)
+    )
+    joint = np.linspace(first[-1], second[0], round(RATE) * FINE)
+    whole = np.concatenate([first, joint, second])
+    driven = at_actuator(kind, whole, rng)
+    moved = moved_by(kind, part, driven, size, rng, first.size)[::FINE]
+    samples = round(seconds * RATE)
+    records, voltages = [], []
+    # From the middle of a swing on.
+    for rows, level, source in (
+        (slice(0, samples), part.offset, rng),
+        (slice(samples + round(2.3 * RATE), None), float(later.normal(0, 5)), later),
+    ):
+        voltage, clean = whole[::FINE][rows], moved[rows]
+        time = np.arange(clean.size) / RATE
+        fault = "good" if source is later and kind in ("transient", "drift", "step") else kind
+        readings = clean + level + added(fault, clean, size, time, source)
+        readings += noise(kind, part, voltage, source)
+        records.append(Record(voltage, readings, 1 / RATE, origin=kind))
+        voltages.append(driven[::FINE][rows])
+    return Bench((records[0], records[1]), (voltages[0], voltages[1]))
