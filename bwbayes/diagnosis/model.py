@@ -31,8 +31,9 @@ __all__ = [
     "tail_nats",
 ]
 
-# Operators that are tried: compiled ones, each of another family.
-OPERATORS = ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "duhem")
+# Operators that are tried: compiled ones, each of another family, and plays of any weights, which
+# follow loops that no formula has.
+OPERATORS = ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem")
 
 
 def nonlinearity(scene: Scene) -> Iterator[Explanation]:

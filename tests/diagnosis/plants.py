@@ -40,7 +40,7 @@ CAUSES: dict[str, set[str]] = {
     "creep": {"creep"},
     "resonance": {"second-order dynamics"},
     "hold": {"hold"},
-    "operator": {"operator prandtl-ishlinskii"},
+    "operator": {"operator prandtl-ishlinskii", "operator plays"},
 }
 
 

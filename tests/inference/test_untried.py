@@ -157,7 +157,10 @@ def test_a_model_that_creeps_stays_as_it_is() -> None:
 
 @pytest.mark.slow
 def test_slow_plans_are_covered_over_forty_plants() -> None:
-    """95 % displacement bands cover 88 to 99 % on the mean, and ordinary ones are as before."""
+    """95 % displacement bands cover 88 to 99 % on the mean, no plan is covered below 70 %.
+
+    Ordinary bands are as wide as before.
+    """
     covered: dict[str, list[float]] = {}
     wider = []
     for seed in range(40):
@@ -166,12 +169,16 @@ def test_slow_plans_are_covered_over_forty_plants() -> None:
             truth = plant(voltage, interval, strength, source)
             bands = extended(posterior, draws, Record(voltage, None, interval))
             covered.setdefault(name, []).append(coverage(bands, truth))
+            print(seed, name, f"{strength:.4f} {frequency:.1f} Hz", covered[name][-1], flush=True)
         plan = Record(sine(frequency, 70.0), None, INTERVAL)
         wider.append(
             width(extended(posterior, draws, plan)) / width(predicted(posterior, draws, plan))
         )
     means = {name: float(np.mean(values)) for name, values in covered.items()}
-    measured.keep("untried", {"coverage": means, "wider": float(np.mean(wider))})
+    worst = {name: min(values) for name, values in covered.items()}
+    below = int(np.sum(np.array([*covered.values()]) < 0.7))
+    figures = {"coverage": means, "worst": worst, "below 70 %": below}
+    measured.keep("untried", {**figures, "wider": float(np.mean(wider))})
     assert 0.88 <= np.mean(list(means.values())) <= 0.99
-    assert min(means.values()) >= 0.7
+    assert not below
     assert np.mean(wider) < 1.05
