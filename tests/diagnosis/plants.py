@@ -249,7 +249,7 @@ def plant(kind: str, seed: tuple[int, int], seconds: float = 10.0) -> Record:
 
 @dataclass(frozen=True)
 class Bench:
-    """Two records of one plant, the second cut from a running drive, with an offset of its own.
+    """Two records of one plant by one sensor, the second cut from a running drive.
 
     ``driven`` are the voltages (samples,) that the actuator did get at the samples of each.
     """
@@ -264,7 +264,8 @@ def bench(kind: str, seed: tuple[int, int], cured: str = "", seconds: float = 10
     A ``cured`` cause is absent from both, all else is the same. The other drive goes no faster and
     no further than the first, so that what is planted has one size. What happens once does not
     happen again. The discrepancy forgets within a fiftieth of the first record, so that this tells
-    its size, and the coverage of the second, of 200 such times, is no matter of luck.
+    its size, and the coverage of the second, of 200 such times, is no matter of luck; as an offset
+    of its own would be, from a lead-in of ten.
     """
     rng, later = (np.random.default_rng((*seed, number, *kind.encode())) for number in range(2))
     part, first = drawn(rng), drive(rng, seconds)
@@ -282,14 +283,14 @@ def bench(kind: str, seed: tuple[int, int], cured: str = "", seconds: float = 10
     samples = round(seconds * RATE)
     records, voltages = [], []
     # From the middle of a swing on.
-    for rows, level, source in (
-        (slice(0, samples), part.offset, rng),
-        (slice(samples + round(2.3 * RATE), None), float(later.normal(0, 5)), later),
+    for rows, source in (
+        (slice(0, samples), rng),
+        (slice(samples + round(2.3 * RATE), None), later),
     ):
         voltage, clean = whole[::FINE][rows], moved[rows]
         time = np.arange(clean.size) / RATE
         fault = "good" if source is later and kind in ("transient", "drift", "step") else kind
-        readings = clean + level + added(fault, clean, size, time, source)
+        readings = clean + part.offset + added(fault, clean, size, time, source)
         readings += noise(kind, part, voltage, source)
         records.append(Record(voltage, readings, 1 / RATE, origin=kind))
         voltages.append(driven[::FINE][rows])

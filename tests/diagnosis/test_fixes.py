@@ -3,7 +3,7 @@
 Each of the plants of :mod:`tests.diagnosis.plants` is fitted with the good model. Its likely cause
 is looked up, and what the fix says is done: lines of config are set, channels are shifted, or the
 plant is measured again without the cause, if it has that. Then the next record of the plant,
-another drive that is cut from a running one and has an offset of its own, is predicted.
+another drive that is cut from a running one, is predicted.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ file = "record.h5"
 from_rest = true
 [validation.next]
 file = "next.h5"
+own_offset = false
 """
 
 
