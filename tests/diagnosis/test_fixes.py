@@ -93,7 +93,9 @@ def followed(
         time = float(cause.fix.rsplit(" ", 1)[-1])
         window = [0.0, time] if time > 5 else [time, 10.0]
         changed = record.model_copy(update={"train": [window]})
-        return config.model_copy(update={"record": changed})
+        # The other side has another offset, and nobody knows which one the sensor has now.
+        later = config.validation["next"].model_copy(update={"own_offset": True, "lead_in": 5.0})
+        return config.model_copy(update={"record": changed, "validation": {"next": later}})
     if cause.kind == "sign":
         records = [replace(each, displacement=-reading(each)) for each in records]
     elif found := re.match(r"delay of (\S+) ms", cause.text):
