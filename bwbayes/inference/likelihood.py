@@ -77,8 +77,8 @@ class Likelihood:
     """The likelihood of one record.
 
     The readings are r = x(θ) + Σ ξᵢ fᵢ + noise, with independent ξᵢ ~ N(0, σᵢ²): fᵢ are the free
-    responses of the dynamics, σᵢ = gain times half the voltage's range; the record's own offset, if
-    it has one, comes first, with f = 1.
+    responses of the dynamics, σᵢ = gain times half the voltage's range, and of creep so much of it
+    as :meth:`Creep.reach` says; the record's own offset, if it has one, comes first, with f = 1.
 
     Parameters
     ----------
@@ -192,6 +192,8 @@ class Likelihood:
         column = self.actuator.columns(self.table.actuator(theta))
         gain = self.actuator.hysteresis.gain(column, self.actuator.range_of(self.voltage))
         sd = np.repeat((gain * self.half_range)[:, np.newaxis], self.unknowns, axis=1)
+        if (creep := self.actuator.creep) is not None and not self.from_rest:
+            sd[:, -len(creep.times) :] *= creep.reach(column)
         if self.offset_sd:
             sd[:, 0] = self.offset_sd
         return sd

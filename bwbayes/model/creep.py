@@ -106,6 +106,16 @@ class Creep:
         # zero: strengths are linear in the displacement, and so their posterior is nearly normal.
         return normal(0.0175 * decades, 0.01 * decades)
 
+    def reach(self, column: Values) -> FloatArray:
+        """Return how much of a drive each lag may have kept from before a record, (models, lags).
+
+        √(cᵢ² + c²) with a published strength c. Were it cᵢ alone, a strength next to zero would
+        stand for a known start: the posterior would have a narrow ridge there, and the start be
+        taken for a measurement of the strengths.
+        """
+        strengths = np.stack([column[name] for name in self.names], axis=1)
+        return np.hypot(strengths, self.strength.arguments["mean"])
+
     def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""
         if not self.growing:

@@ -119,10 +119,11 @@ class Taps(NamedTuple):
 
 @dataclass(frozen=True)
 class Sections:
-    """Recursions side by side: x = Σ gainᵢ Fᵢ[wᵢ], for a batch of models.
+    """Recursions side by side: x = Σ Fᵢ[gainᵢ wᵢ], for a batch of models.
 
     ``gains`` (models,) belong to the ``recursions``, of which each has a drive wᵢ of its own.
-    Unknown of the start is what is unknown of each recursion, in their order.
+    Unknown of the start is what is unknown of each recursion, in their order: what it still moves
+    by itself, um, whatever its gain.
     """
 
     recursions: tuple[Recursion, ...]
@@ -170,19 +171,16 @@ class Sections:
         parts = zip(self.recursions, self.gains, drives, states, strict=True)
         result: FloatArray | None = None
         for recursion, gain, drive, state in parts:
-            moved = recursion.run(drive, state)
             if np.any(gain != 1.0):
-                moved *= gain[:, np.newaxis]
+                np.multiply(drive, gain[:, np.newaxis], out=drive)
+            moved = recursion.run(drive, state)
             result = moved if result is None else np.add(result, moved, out=result)
         assert result is not None
         return result
 
     def free_responses(self, samples: int) -> FloatArray:
         """Displacement (models, unknowns, samples) after a unit of each, without a drive."""
-        parts = zip(self.recursions, self.gains, strict=True)
-        responses = [
-            gain[:, None, None] * recursion.free_responses(samples) for recursion, gain in parts
-        ]
+        responses = [recursion.free_responses(samples) for recursion in self.recursions]
         return np.concatenate(responses, axis=1)
 
 

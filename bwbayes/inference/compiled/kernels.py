@@ -25,7 +25,7 @@ from bwbayes.inference.compiled import filter as noise
 from bwbayes.inference.compiled.lanes import (
     A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FREE, KEPT, LANES, LOG,
     LOG_DETERMINANT, PAIRS, PARAMETERS, PROCESS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, SERIES,
-    STATE, STRENGTH, SUMS, VALUE, inner,
+    STATE, SUMS, VALUE, inner,
 )
 # fmt: on
 # isort: on
@@ -152,7 +152,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
             state[RESPONSE_2 + at] = state[FREE + (2 * k + 1) * LANES + i]
         for k in range(slow):
             at = (1 + offset + free + k) * LANES + i
-            state[RESPONSE + at] = state[STRENGTH + k * LANES + i]
+            state[RESPONSE + at] = 1.0
 
 
 @inner(error_model="numpy")

@@ -153,7 +153,7 @@ def _lag(
     for t in range(followed.size // LANES):
         row = t * LANES
         for i in range(LANES):
-            w = followed[row + i]
+            w = strength[i] * followed[row + i]
             x = now * w + lag[i]
             lag[i] = later * w + keep * x
-            drive[row + i] += strength[i] * x
+            drive[row + i] += x
