@@ -1,7 +1,7 @@
 """Pictures: of a run's loops, bands along time, parameters, chains and coverage, and of products.
 
 :func:`~bwbayes.report.figures.pictures.pictures` says what there is to see of a run, and
-:func:`picture_of` draws it as PNG. This package alone knows matplotlib and Pillow; it opens
+:func:`picture_of` draws it as PNG. This package alone knows matplotlib, Pillow and corner; it opens
 no window and touches no global figure. They are loaded when something is drawn: whoever leaves that
 to another process need not wait.
 """
@@ -34,6 +34,7 @@ def drawn(draw: Callable[..., Figure], *shown: Any) -> Figure:
 
 def prepare() -> None:
     """Load what is slow to load, before there is anything to draw."""
+    import corner  # noqa: F401, PLC0415
     from matplotlib.backends import backend_agg  # noqa: F401, PLC0415
 
     from bwbayes.report.figures import chain, interactive  # noqa: F401, PLC0415

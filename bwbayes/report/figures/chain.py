@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import scipy
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
@@ -24,64 +23,50 @@ def draw_corner(result: Result) -> Figure:
 
     The true values, where they are known, are lines.
     """
+    import corner  # noqa: PLC0415  # it loads all of arviz, which nobody else here needs
+
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
-    labels = [style.axis_label(parameter) for parameter in result.free]
     truths = [result.truth.get(parameter.name) for parameter in result.free]
     ranges = [_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)]
-    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
     # Inches: a panel has 1.25, the margin for the labels 1.3.
     side = 1.25 * free + 1.5
     figure = Figure(figsize=(side, side))
+    figure.subplots(free, free)
+    corner.corner(
+        flat,
+        fig=figure,
+        bins=20,
+        range=ranges,
+        labels=[style.axis_label(parameter) for parameter in result.free],
+        label_kwargs={"fontsize": 13},
+        levels=(0.5, 0.9),
+        color=style.COLORS[0],
+        smooth=0.8,
+        plot_density=False,
+        fill_contours=True,
+        data_kwargs={"alpha": 0.3, "ms": 1.2},
+        quiet=True,
+    )
     low, high = 1.3 / side, 1 - 0.2 / side
     figure.subplots_adjust(low, low, high, high, wspace=0.05, hspace=0.05)
-    grid = figure.add_gridspec(free, free)
-    for row, column in ((i, j) for i in range(free) for j in range(i + 1)):
-        panel = figure.add_subplot(grid[row, column])
-        panel.set_xlim(*ranges[column])
+    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
+    for panel, (row, column) in zip(figure.axes, np.ndindex(free, free), strict=True):
+        if row < column:
+            continue
+        panel.tick_params("x", labelsize=11, labelrotation=90)
+        panel.tick_params("y", labelsize=11, labelrotation=0)
         panel.xaxis.set_major_locator(ticks[column])
-        panel.tick_params("x", labelsize=11, labelrotation=90, labelbottom=row == free - 1)
-        if row == free - 1:
-            panel.set_xlabel(labels[column], fontsize=13)
-            panel.xaxis.set_label_coords(0.5, -0.75)
+        panel.xaxis.set_label_coords(0.5, -0.75)
         if (truth := truths[column]) is not None:
             panel.axvline(truth, color=style.TRUTH_COLOR)
-        if row == column:
-            panel.hist(
-                flat[:, row], bins=20, range=ranges[row], histtype="step", color=style.COLORS[0]
-            )
-            panel.set_yticks([])
-            continue
-        _draw_pair(panel, flat[:, column], flat[:, row], ranges[column], ranges[row])
-        panel.set_ylim(*ranges[row])
-        panel.yaxis.set_major_locator(ticks[row])
-        panel.tick_params("y", labelsize=11, labelleft=column == 0)
-        if column == 0:
-            panel.set_ylabel(labels[row], fontsize=13)
+        if row > column:
+            panel.yaxis.set_major_locator(ticks[row])
             panel.yaxis.set_label_coords(-0.75, 0.5)
-        if (truth := truths[row]) is not None:
-            panel.axhline(truth, color=style.TRUTH_COLOR)
+            if (truth := truths[row]) is not None:
+                panel.axhline(truth, color=style.TRUTH_COLOR)
     return figure
-
-
-def _draw_pair(panel: Axes, x: FloatArray, y: FloatArray, *ranges: tuple[float, float]) -> None:
-    """Draw contours that hold 50 and 90 % of draws (draws,), and the draws outside of them."""
-    counts, *edges = np.histogram2d(x, y, 20, ranges)
-    smooth = scipy.ndimage.gaussian_filter(counts, 0.8)
-    descending = np.sort(smooth, axis=None)[::-1]
-    held = np.searchsorted(np.cumsum(descending), np.array([0.9, 0.5]) * np.sum(smooth))
-    # Contours of the same height would be one.
-    levels = [*(descending[held] * (1 - 1e-6, 1)), descending[0] * (1 + 1e-6)]
-    cells = [np.clip(np.searchsorted(e, v) - 1, 0, 19) for e, v in zip(edges, (x, y), strict=True)]
-    outside = smooth[cells[0], cells[1]] < levels[0]
-    color = style.COLORS[0]
-    panel.plot(x[outside], y[outside], "o", color=color, ms=1.2, alpha=0.3, mew=0)
-    # Beyond the outermost bins there are none.
-    centers = [np.arange(-0.5, 21) * (e[1] - e[0]) + e[0] for e in edges]
-    heights = np.pad(smooth, 1).T
-    panel.contourf(*centers, heights, levels, colors=["#aacfe6", color])
-    panel.contour(*centers, heights, levels[:2], colors=[color], linewidths=1.0)
 
 
 def _inner_ticks(low: float, high: float) -> list[float]:
