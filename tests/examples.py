@@ -52,7 +52,7 @@ SHORTER = {
 # So are what a command does by default, and its options: pictures are blank, models and simulated
 # actuators few.
 DEFAULTS = {
-    "bwbayes.report.figures.pictures._draw": lambda *_: Figure(),
+    "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
     "bwbayes.report.outputs.picture_of": lambda _: picture_of(Figure),
     "bwbayes.app.commands.studies.USUAL_MODELS": "linear; bouc-wen",
 }
