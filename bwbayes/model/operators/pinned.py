@@ -250,7 +250,12 @@ def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
 
 @dataclass(frozen=True)
 class JilesAtherton(Pinned):
-    """Jiles-Atherton hysteresis: :class:`Pinned` with L(y) = coth y − 1/y, L′(0) = 1/3.
+    """Jiles-Atherton hysteresis: pinned walls with L(y) = coth y − 1/y, L′(0) = 1/3.
+
+        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
+        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
+
+    with s the voltage's direction, as in :class:`Pinned`.
 
     Notes
     -----
@@ -263,7 +268,12 @@ class JilesAtherton(Pinned):
 
 @dataclass(frozen=True)
 class DomainWall(Pinned):
-    """Domain wall hysteresis: :class:`Pinned` with L(y) = tanh y, L′(0) = 1.
+    """Domain wall hysteresis: pinned walls with L(y) = tanh y, L′(0) = 1.
+
+        P_an = P_s L((u + a P)/E₀),   P = c P_an + (1 − c) P_irr,
+        dP_irr/du = (P_an − P_irr) / (k s − a (P_an − P_irr)),
+
+    with s the voltage's direction, as in :class:`Pinned`.
 
     Notes
     -----
