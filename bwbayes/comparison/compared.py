@@ -33,7 +33,7 @@ __all__ = ["Comparison", "Difference"]
 COLUMNS: tuple[tuple[str, str, Target], ...] = (
     ("Free", "{free}", "both"),
     ("Log score", "{log_score:.1f}", "both"),
-    ("CRPS", "{held_out[crps_um]:.4f} µm", "page"),
+    ("CRPS", "{held_out[crps_um]:.3g} µm", "page"),
     ("NRMSE", "{held_out[nrmse]:.2%}", "both"),
     ("95% covers", "{held_out[coverage]:.1%} ± {held_out[coverage_error]:.1%}", "both"),
     ("95% width", "{held_out[width_um]:.3g} µm", "page"),

@@ -211,7 +211,7 @@ class Tracking(Product):
     def _errors(self) -> Table:
         rows = []
         for signal, frequency, at in self._cases:
-            errors = (f"{rms[at].mean():.2f}" for rms in self.rms)
+            errors = (f"{rms[at].mean():.3g}" for rms in self.rms)
             rows.append((f"{signal}, {frequency:g} Hz", *errors, f"{100 * self.best[at]:.0f}"))
         return Table(
             "errors",

@@ -34,7 +34,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.result import Result
 from bwbayes.report.tables import priors_table
-from bwbayes.report.words import covered, error_text, mark
+from bwbayes.report.words import covered, error_text, length_text, mark
 
 __all__ = ["prediction_report", "run_report"]
 
@@ -166,9 +166,9 @@ def _results(result: Result) -> list[Text]:
                 f"{title(bands)}, {_span(bands)}",
                 status,
                 covered(scores, "sensor", 95),
-                f"{scores.width_um[95]:.2f} µm",
+                length_text(scores.width_um[95]),
                 error_text(scores),
-                f"{scores.max_error_um:.2f} µm",
+                length_text(scores.max_error_um),
             )
         )
     if not texts:

@@ -20,7 +20,15 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.report import Table, TableColumn, Target
 from bwbayes.report.result import Result
-from bwbayes.report.words import covered, digits, error_text, mark, symbol, unit_text
+from bwbayes.report.words import (
+    covered,
+    digits,
+    error_text,
+    length_text,
+    mark,
+    symbol,
+    unit_text,
+)
 
 __all__ = [
     "flat_records",
@@ -199,8 +207,8 @@ def scores_table(
             TableColumn("Validation", text=status),
             TableColumn("NRMSE", on="page", text=lambda n: error_text(scores[n])),
             TableColumn("NRMSE", on="screen", text=lambda n: f"{100 * scores[n].nrmse:.2f}%"),
-            TableColumn("Max error", text=lambda n: f"{scores[n].max_error_um:.2f} µm"),
-            TableColumn("Width 95%", text=lambda n: f"{scores[n].width_um[95]:.2f} µm"),
+            TableColumn("Max error", text=lambda n: length_text(scores[n].max_error_um)),
+            TableColumn("Width 95%", text=lambda n: length_text(scores[n].width_um[95])),
             TableColumn(
                 f"Coverage of the {', '.join(levels)}% sensor bands", on="page", text=coverage
             ),
@@ -317,13 +325,13 @@ def parameter_words(parameter: Parameter) -> Markup:
 
 def _other_scores(scores: Scores) -> Iterator[tuple[str, str]]:
     """Yield titles and texts, the levels from the widest band."""
-    yield "CRPS", f"{scores.crps_um:.3f} µm"
+    yield "CRPS", length_text(scores.crps_um)
     for level in sorted(LEVELS, reverse=True):
         displacement = covered(scores, "displacement", level)
         yield f"{level} % displacement band covers displacement", displacement
         yield f"{level} % sensor band: worst second", f"{100 * scores.worst_second[level]:.1f} %"
-        yield f"{level} % sensor band: mean width", f"{scores.width_um[level]:.2f} µm"
-        yield f"{level} % sensor band: interval score", f"{scores.interval_score_um[level]:.2f} µm"
+        yield f"{level} % sensor band: mean width", length_text(scores.width_um[level])
+        yield f"{level} % sensor band: interval score", length_text(scores.interval_score_um[level])
 
 
 def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) -> Table:

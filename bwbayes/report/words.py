@@ -19,6 +19,7 @@ __all__ = [
     "digits",
     "error_text",
     "label_with_unit",
+    "length_text",
     "mark",
     "symbol",
     "unit_text",
@@ -79,6 +80,11 @@ def digits(value: float, sd: float) -> str:
         return f"{value:.{max(leading - exponent, 0)}e}"
     # Adding zero takes the sign from a negative zero.
     return f"{round(value, -exponent) + 0.0:.{max(-exponent, 0)}f}"
+
+
+def length_text(um: float) -> str:
+    """Write a length or an error, um, with three digits: of nanometers there are as many."""
+    return f"{digits(um, abs(um) / 10)} µm"
 
 
 def mark(status: str) -> Markup:
