@@ -8,8 +8,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.creep import Creep, creep_times
+from bwbayes.model.declaration import Values
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
@@ -117,3 +120,34 @@ def test_times_are_powers_of_ten_from_samples_to_records(
     interval: float, duration: float, times: list[float]
 ) -> None:
     assert times == pytest.approx(creep_times(interval, duration))
+
+
+def unevenness(likelihood: Likelihood, theta: FloatArray) -> float:
+    """Return how unlike a parabola the log density is along strengths about zero.
+
+    By how much its second difference varies, of the mean: 1, and it is twice as curved somewhere
+    as elsewhere, in the range of published strengths.
+    """
+    strengths = np.linspace(-0.004, 0.004, 9)
+    along = np.repeat(theta, strengths.size, axis=0)
+    for name in CREEP.names:
+        along = likelihood.table.replaced(along, name, strengths)
+    bends = np.diff(likelihood.log_density(along), 2)
+    return float(np.ptp(bends) / np.abs(np.mean(bends)))
+
+
+def own_strength(creep: Creep, column: Values) -> FloatArray:
+    return np.abs(np.stack([column[name] for name in creep.names], axis=1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_strength_next_to_zero_is_no_known_start(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a start as large as its own strength alone, the planted defect, there is a ridge."""
+    posterior = moving("white", "none", parts=PARTS["creep"])
+    likelihood = posterior.likelihood
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(seed), 1))
+    assert unevenness(likelihood, theta) < 0.5
+    monkeypatch.setattr(Creep, "reach", own_strength)
+    assert unevenness(likelihood, theta) > 1.0
