@@ -118,3 +118,15 @@ def test_finite_for_parameters_over_many_decades() -> None:
         ):
             assert np.isfinite(recursion.numerator).all()
             assert np.isfinite(recursion.denominator).all()
+
+
+@given(decay=st.floats(690.0, 760.0), hold=st.sampled_from(HOLDS))
+def test_what_decays_below_normal_numbers_is_nothing(decay: float, hold: Hold) -> None:
+    """A processor takes ten times as long with a number below 2e-308 that is not zero."""
+    smallest = np.finfo(float).tiny
+    lag = first_order_lag(np.array([INTERVAL / decay]), INTERVAL, hold)
+    # Poles whose product decays as fast: the last coefficient is exp(−b Δ / m).
+    stiff = oscillator((1e-3, 1e-3 * decay / INTERVAL, 1e5), hold)
+    for recursion in (lag, stiff):
+        for taps in (recursion.numerator, recursion.denominator, recursion.free):
+            assert ((taps == 0) | (np.abs(taps) >= smallest)).all()
