@@ -89,12 +89,12 @@ def __dir__() -> list[str]:
 
 
 def _room(name: str) -> str:
-    """Say where a name is imported from, if a module of the package offers it."""
+    """Say where a name is imported from, if a module of the package defines it."""
     if not name.startswith("_"):
         root = Path(__file__).parent
         for path in sorted(root.rglob("*.py")):
-            offered = re.search(r"^__all__ = \[[^]]*", path.read_text("utf-8"), re.MULTILINE)
-            if offered and f'"{name}"' in offered[0]:
+            defined = rf"^(?:(?:class|def) {re.escape(name)}\b|{re.escape(name)}(?::| =))"
+            if re.search(defined, path.read_text("utf-8"), re.MULTILINE):
                 module = ".".join(path.relative_to(root.parent).with_suffix("").parts)
                 return f"; it is imported from its room: from {module} import {name}"
     return ""

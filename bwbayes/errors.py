@@ -11,15 +11,6 @@ from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 from shlex import quote
 
-__all__ = [
-    "ColumnsError",
-    "InputError",
-    "InputWarning",
-    "NotConvergedError",
-    "one_line",
-    "suggestion",
-]
-
 # How alike two words must be, from 0 to 1, for one to be a misspelling of the other.
 ALIKE = 0.6
 

@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["LONGEST", "MOST_LINES", "brief", "head"]
-
 # A repr has at most so many lines and characters.
 MOST_LINES, LONGEST = 12, 1200
 

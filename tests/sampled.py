@@ -6,7 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.problem.records import generator
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.model.operator import Span

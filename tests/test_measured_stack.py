@@ -18,7 +18,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.prediction import Start, predict_record, thinned
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record, thinned
 from bwbayes.record import Record, read_record
 from bwbayes.sampling.chain import draws
 

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.config.config import RecordConfig, load
+from bwbayes.app.config.config import load
+from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, write_record

@@ -26,19 +26,6 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.shown import brief
 
-__all__ = [
-    "FAMILY_LEVEL",
-    "JUDGED_FROM",
-    "LIMIT",
-    "Calibration",
-    "Coverage",
-    "Uniformity",
-    "holm",
-    "judge",
-    "smooth_power",
-    "smooth_test",
-]
-
 # Probability of a false alarm from all tests of all statistics, half of it for either test.
 FAMILY_LEVEL = 0.01
 

@@ -15,14 +15,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import Noise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.state_space import Noise
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import Start, started
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record, Window
-
-__all__ = ["OtherRecord", "Simulated", "covered"]
 
 
 class Simulated(NamedTuple):

@@ -34,17 +34,6 @@ from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.shown import brief
 
-__all__ = [
-    "EXTRA",
-    "RANKED",
-    "Entry",
-    "Experiment",
-    "Replicate",
-    "as_done",
-    "replicate",
-    "replicates",
-]
-
 # Draws that a truth is ranked among.
 RANKED = 199
 

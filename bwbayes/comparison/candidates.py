@@ -20,8 +20,6 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
 
-__all__ = ["Candidate"]
-
 
 @dataclass(frozen=True)
 class Candidate:

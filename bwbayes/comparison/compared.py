@@ -27,8 +27,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import mark
 
-__all__ = ["Comparison", "Difference"]
-
 # The columns of the models' table: title, text with the numbers of a model, and where it is shown.
 COLUMNS: tuple[tuple[str, str, Target], ...] = (
     ("Free", "{free}", "both"),

@@ -25,8 +25,6 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
 
-__all__ = ["promises"]
-
 
 def promises(
     posterior: Posterior,

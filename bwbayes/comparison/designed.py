@@ -31,8 +31,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.shown import brief
 
-__all__ = ["Design", "Promise"]
-
 
 @dataclass(frozen=True)
 class Promise:

@@ -21,8 +21,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = ["Bridge", "Evidence", "bridge", "evidence", "log_prior_mass", "screening_evidence"]
-
 # Draws that the mixture is fitted to, and draws at the other end, at most.
 MAX_DRAWS = 20_000
 

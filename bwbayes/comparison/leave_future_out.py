@@ -27,8 +27,6 @@ from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 
-__all__ = ["BLOCKS", "FUTURE", "Part", "bands_part", "judged", "leave_future_out", "log_ratios"]
-
 # What the later half of the training readings is called.
 FUTURE = "later training"
 

@@ -20,8 +20,6 @@ import scipy
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison, Difference
 
-__all__ = ["difference", "recommend"]
-
 # Independent readings that a part must be worth to have a vote: as many blocks tell its error.
 MIN_WORTH = 5
 

@@ -18,8 +18,6 @@ from typing import Any
 
 from bwbayes.errors import InputError
 
-__all__ = ["c_functions", "to_ascii", "to_c_number"]
-
 # NumPy's names of functions that math.h calls otherwise.
 MATH_NAMES = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
 

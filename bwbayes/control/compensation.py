@@ -40,8 +40,6 @@ from bwbayes.prediction.initial_state import Start, Started, started
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 
-__all__ = ["compensate"]
-
 
 @dataclass(frozen=True)
 class _Plan:

@@ -34,8 +34,6 @@ from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.shown import brief
 
-__all__ = ["Exported", "exported"]
-
 
 @dataclass(frozen=True)
 class Exported:

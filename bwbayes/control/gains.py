@@ -27,9 +27,6 @@ from bwbayes.errors import InputError
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
 
-__all__ = ["Gains", "Margins", "Robustness", "design", "margins"]
-
-
 # Where loops are looked at, rad per sample.
 ANGLES: FloatArray = np.geomspace(1e-5, np.pi, 1500)
 

@@ -21,16 +21,6 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 
-__all__ = [
-    "CONTROLLERS",
-    "LoopNoise",
-    "LoopPlan",
-    "Stand",
-    "TrackingErrors",
-    "follow",
-    "plan_loops",
-]
-
 # Each with whether it looks at the readings.
 CONTROLLERS = {
     "no compensation": False,

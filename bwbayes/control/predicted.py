@@ -35,8 +35,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.shown import brief
 
-__all__ = ["Choice", "Compensation", "Errors", "Played", "planned"]
-
 Choice = Literal["mean", "expected"]
 
 

@@ -21,8 +21,6 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.record.waveforms import Triangle
 from bwbayes.shown import brief
 
-__all__ = ["SHAPES", "TRACKED", "Reference", "shaped", "tracking_signals"]
-
 # Fewer samples make no reference, and more than a file or a screen could hold no shape.
 SHORTEST, LONGEST = 10, 10**7
 

@@ -23,15 +23,6 @@ from bwbayes.model.operator import Span
 from bwbayes.model.step import Gone, HysteresisStep
 from bwbayes.shown import brief
 
-__all__ = [
-    "BISECTION_ROUNDS",
-    "NEWTON_ROUNDS",
-    "SampledModel",
-    "SteppedState",
-    "require_inverse",
-    "resolution",
-]
-
 # Rounds of the inverse at most: Newton's rule needs a few; if it fails, bisection goes on to the
 # last bit of a voltage.
 NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60

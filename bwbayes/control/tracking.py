@@ -39,8 +39,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.shown import brief
 
-__all__ = ["Tracking", "track"]
-
 # What dynamics that matter leave of a sine: half of its power.
 LEFT = math.sqrt(0.5)
 

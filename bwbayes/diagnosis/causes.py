@@ -22,8 +22,6 @@ from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.record.io.grid import clock
 
-__all__ = ["LEAD_IN_ALARM", "REVERSED_SIGN", "cause"]
-
 # A lead-in whose test says less than this does not fit.
 LEAD_IN_ALARM = 0.002
 

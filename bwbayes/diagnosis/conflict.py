@@ -19,8 +19,6 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Values
 from bwbayes.model.distributions import Distribution
 
-__all__ = ["around", "conflicts", "effective", "normal_scores"]
-
 # Draws that stand for a prior, or for a Gaussian posterior.
 DRAWS = 4000
 

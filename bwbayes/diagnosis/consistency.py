@@ -36,8 +36,6 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["Agreement", "agreements", "disagreements"]
-
 # Probability of a false alarm for a record.
 ALARM = 1e-3
 

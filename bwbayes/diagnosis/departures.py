@@ -19,8 +19,6 @@ from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
 
-__all__ = ["Standardized", "percent"]
-
 # False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
 # Above the first a failure may be luck, and below the second a success may be none.
 ALARM, DOUBT = 2e-4, 0.01

@@ -18,20 +18,6 @@ from bwbayes.diagnosis.record_checks import settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 
-__all__ = [
-    "add_shapes",
-    "backlash",
-    "delay",
-    "drift",
-    "moving_gain",
-    "oscillation",
-    "reversed_sign",
-    "saturation",
-    "slew_limit",
-    "step",
-    "transient",
-]
-
 # Prior sd of an addition to the displacement, as a fraction of its range.
 SIZE = 0.1
 

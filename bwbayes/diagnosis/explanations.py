@@ -16,8 +16,6 @@ from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
 
-__all__ = ["ADDITIONS", "CHANGES", "LIMIT", "TIED", "explain", "followed_causes", "likely_causes"]
-
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
 # good fit refuses at once; the others are for fits of which something is known to be wrong.
 ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (

@@ -17,8 +17,6 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import fastest, time_between_turns
 
-__all__ = ["beyond_training"]
-
 # Part of the time between turning points over which a speed is taken: a sine's peak speed is then
 # 0.4 % too low, and noise of 1 % of its range adds a tenth.
 PART = 0.1

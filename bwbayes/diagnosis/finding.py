@@ -9,8 +9,6 @@ import numpy as np
 
 from bwbayes.shown import brief
 
-__all__ = ["Finding", "joined"]
-
 
 @dataclass(frozen=True)
 class Finding:

@@ -33,16 +33,6 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.reversals import monotone_stretches, turning_points
 from bwbayes.shown import brief
 
-__all__ = [
-    "Combination",
-    "Learned",
-    "Taught",
-    "learned",
-    "spectrum",
-    "stretches_once",
-    "undetermined",
-]
-
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
 

@@ -18,12 +18,10 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.inference.noise import Noise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.reversals import rate
 from bwbayes.shown import brief
-
-__all__ = ["Innovations", "departures", "innovations"]
 
 # Probability of a false alarm of each of the tests, of which there are about ten.
 ALARM = 1e-4

@@ -23,8 +23,6 @@ from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 
-__all__ = ["NONE", "Effect", "LocalFit", "Simulate", "climb", "climb_each"]
-
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
 

@@ -17,8 +17,6 @@ from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
-__all__ = ["LoopFit", "fit_loop"]
-
 # Half widths of the plays, as fractions of half the voltage's range; the state at the start of
 # every other one is free.
 WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])

@@ -19,18 +19,6 @@ from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 
-__all__ = [
-    "creep",
-    "dynamics",
-    "growing_noise",
-    "heavy_tails",
-    "hold",
-    "nonlinearity",
-    "operator",
-    "smooth",
-    "tail_nats",
-]
-
 # Operators that are tried: compiled ones, each of another family, and plays of any weights, which
 # follow loops that no formula has.
 OPERATORS = ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem")

@@ -20,8 +20,6 @@ from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
 
-__all__ = ["STATISTICS", "Replicated", "Statistic", "replicated"]
-
 # What is looked at: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range of the readings", "um"),

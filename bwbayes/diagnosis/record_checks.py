@@ -26,8 +26,6 @@ from bwbayes.diagnosis.series_patterns import (
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
-__all__ = ["inspect", "isolated_outliers", "settle_fix"]
-
 # A decay that takes longer, as a fraction of the record, is a drift.
 LONG_DECAY = 0.13
 

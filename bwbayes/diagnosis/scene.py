@@ -19,8 +19,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.record.io.grid import clock
 
-__all__ = ["Explanation", "Reconfigure", "Scene"]
-
 # Readings that are looked at: an explanation takes some hundred passes over them, and what a model
 # misses shows in fewer.
 READINGS = 4_000

@@ -14,8 +14,6 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["Stuck", "clipped", "find_gross_outliers", "held", "repeated", "scatter", "spikes"]
-
 # Samples in the median that a spike is held against: two beside each other are a spike still.
 NEIGHBORS = 5
 

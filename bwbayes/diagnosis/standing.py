@@ -12,8 +12,6 @@ from typing import Any, Self
 
 from bwbayes.diagnosis.validation import STATUSES, Verdict
 
-__all__ = ["Standing"]
-
 
 @dataclass(frozen=True)
 class Standing:

@@ -31,8 +31,6 @@ from bwbayes.prediction.bands import Bands, titled
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief
 
-__all__ = ["STATUSES", "Background", "Verdict", "assess"]
-
 
 @dataclass(frozen=True)
 class Background:

@@ -22,8 +22,6 @@ from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.reversals import time_between_turns
 
-__all__ = ["default_priors", "joined", "ranges_of"]
-
 
 def ranges_of(
     voltage: FloatArray,

@@ -13,8 +13,6 @@ from typing import Literal
 
 from bwbayes.errors import InputError
 
-__all__ = ["Engine", "EngineChoice", "choose"]
-
 Engine = Literal["numpy", "numba"]
 EngineChoice = Literal["auto", "numpy", "numba"]
 

@@ -18,14 +18,11 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.state_space import LOG_TWO_PI
+from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.shown import brief
-
-__all__ = ["Likelihood", "LinearStart", "Score", "batches"]
 
 
 def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:

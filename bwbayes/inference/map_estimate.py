@@ -23,8 +23,6 @@ from bwbayes.shown import brief
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-__all__ = ["PointFit", "distinct", "fit", "peaks", "valleys"]
-
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
 

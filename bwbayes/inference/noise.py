@@ -17,8 +17,6 @@ from bwbayes.model.declaration import Declaration, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import made
 
-__all__ = ["NOISES", "DiscrepancyNoise", "Noise", "SmoothNoise", "WhiteNoise", "noise_model"]
-
 SENSOR_SD = Declaration(
     "sensor_sd",
     "um",

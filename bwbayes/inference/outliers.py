@@ -25,8 +25,6 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 
-__all__ = ["LIMIT", "outliers", "surprise"]
-
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0
 

@@ -15,12 +15,10 @@ from typing import NamedTuple
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.noise import Noise
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Scope
 from bwbayes.shown import brief
-
-__all__ = ["Column", "ParameterTable"]
 
 
 class Column(NamedTuple):

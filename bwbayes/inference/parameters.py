@@ -24,8 +24,6 @@ from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution, Scored
 from bwbayes.shown import brief
 
-__all__ = ["COORDINATES", "Constraint", "JointPrior", "Parameter"]
-
 # The version of the map from parameters to coordinates: a chain of another one means other draws.
 COORDINATES = 1
 

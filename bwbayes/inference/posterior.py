@@ -20,15 +20,13 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, batches
-from bwbayes.inference.noise import Noise
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
-
-__all__ = ["Dataset", "Posterior", "RecordView"]
 
 
 @dataclass(frozen=True)

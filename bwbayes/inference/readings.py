@@ -16,8 +16,6 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.shown import brief
 
-__all__ = ["Readings"]
-
 
 @dataclass(frozen=True)
 class Readings:

@@ -28,8 +28,6 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration
 
-__all__ = ["LOG_TWO_PI", "Filtered", "Noise"]
-
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
 # Of the two states, (models, series) each, and three elements of their covariance, (models,).

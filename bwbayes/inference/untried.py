@@ -31,8 +31,6 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.operator import Span
 from bwbayes.model.reversals import time_between_turns
 
-__all__ = ["with_creep"]
-
 # Strengths a decade of time apart are alike: creep goes with the logarithm of the time.
 ALIKE = 0.9
 

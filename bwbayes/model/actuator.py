@@ -31,9 +31,6 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
 from bwbayes.shown import brief
 
-__all__ = ["Actuator", "State"]
-
-
 OFFSET = Declaration(
     "offset",
     "um",

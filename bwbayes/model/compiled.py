@@ -33,8 +33,6 @@ from bwbayes.model.elementwise import anywhere, gone, look_up, select
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["INNER", "FormulaType", "compiled", "everett", "move"]
-
 # What is called at each sample allocates nothing: to count who holds an array would take longer
 # than all of the arithmetic. It becomes a part of its caller's loop, or there would be no vectors.
 INNER: Mapping[str, Any] = {

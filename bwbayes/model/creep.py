@@ -23,8 +23,6 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag
 from bwbayes.model.operator import UNIT, Span
 
-__all__ = ["MOST_TIMES", "Creep", "creep_times"]
-
 # Times that a model may have.
 MOST_TIMES = 8
 

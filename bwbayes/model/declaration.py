@@ -22,20 +22,6 @@ from bwbayes.errors import InputError
 from bwbayes.model.distributions import Distribution
 from bwbayes.shown import brief
 
-__all__ = [
-    "Context",
-    "Declaration",
-    "Ranges",
-    "Scope",
-    "Values",
-    "check",
-    "lognormal",
-    "normal",
-    "positive",
-    "refuse",
-    "rounded",
-]
-
 Values = Mapping[str, FloatArray]
 """Columns (models,) of parameters by name."""
 

@@ -23,8 +23,6 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 
-__all__ = ["Distribution", "Scored"]
-
 FAMILIAR = {
     "normal": ("mean", "sd"),
     "lognormal": ("median", "sigma"),

@@ -16,8 +16,6 @@ from bwbayes.model.declaration import Context, Declaration, Values, check, logno
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
 
-__all__ = ["Filter", "Lag", "NoDynamics", "SecondOrder"]
-
 # Of T: drives are mostly slow for the actuator. Wide, because its lag does not follow the drive.
 LAG, LAG_SIGMA = 0.005, 2.3
 

@@ -19,8 +19,6 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal
 from bwbayes.model.operator import UNIT, Span
 
-__all__ = ["PolynomialGain"]
-
 
 class Term(NamedTuple):
     """A power of the voltage: which, its label, and the prior's sd as a part of Y."""

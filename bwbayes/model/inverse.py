@@ -38,8 +38,6 @@ from bwbayes.model.linear import Recursion
 from bwbayes.model.operator import UNIT
 from bwbayes.model.reversals import monotone_stretches
 
-__all__ = ["inverse"]
-
 Curve = Callable[[FloatArray], FloatArray]
 
 # Samples that are searched for together; operators that integrate follow as many.

@@ -14,8 +14,6 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 
-__all__ = ["Limits"]
-
 
 @dataclass(frozen=True)
 class Limits:

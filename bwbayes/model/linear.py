@@ -23,18 +23,6 @@ from numpy.typing import NDArray
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 
-__all__ = [
-    "HOLD_NAMES",
-    "Hold",
-    "Recursion",
-    "Sections",
-    "Taps",
-    "first_order_lag",
-    "no_dynamics",
-    "parse_hold",
-    "second_order",
-]
-
 Hold = Literal["first", "zero"]
 
 # What a command's hold is called outside of the package.

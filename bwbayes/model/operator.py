@@ -18,8 +18,6 @@ from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, check
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["UNIT", "Operator", "Span", "narrower"]
-
 
 class Span(NamedTuple):
     """The least and the largest voltage that earlier drives may have had, V."""

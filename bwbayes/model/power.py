@@ -21,8 +21,6 @@ from bwbayes.model.elementwise import anywhere, look_up, select
 from bwbayes.model.operator import Span
 from bwbayes.model.step import OneStateStep
 
-__all__ = ["PowerStep"]
-
 # Where the tables of the two curves begin among the numbers of a step, and the rows of a table: the
 # time at which each cell begins, how long it lasts, and the coefficients of its polynomial.
 TABLE, ROWS = 7, 10

@@ -25,8 +25,6 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 
-__all__ = ["DYNAMICS", "HYSTERESIS", "OPTIONS", "choose", "made"]
-
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
     "bouc-wen-asymmetric": BoucWenAsymmetric,

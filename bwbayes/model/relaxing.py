@@ -26,11 +26,6 @@ from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.operator import Span
 from bwbayes.model.step import OneStateStep
 
-__all__ = [
-    "BENT", "SHORT", "RelaxingStep", "bent", "phi_functions", "relax", "relaxed",
-    "series", "third",
-]  # fmt: skip
-
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
 

@@ -15,16 +15,6 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 
-__all__ = [
-    "PIECE",
-    "Stretch",
-    "fastest",
-    "monotone_stretches",
-    "rate",
-    "time_between_turns",
-    "turning_points",
-]
-
 # Part of the range by which the voltage must come back for a turn to count. A sensor's noise and a
 # DAC's steps are well below it; the smallest loops of a decaying drive do not matter for a scale.
 RETURN = 0.05

@@ -26,8 +26,6 @@ from bwbayes.shown import brief
 if TYPE_CHECKING:
     from bwbayes.model.operator import Span
 
-__all__ = ["Gone", "HysteresisStep", "OneStateStep"]
-
 
 class Gone(NamedTuple):
     """What is once a voltage has gone there: w (models,), um, dw/du (models,), and the memory."""

@@ -16,8 +16,6 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["Hyperprior", "NormalLikelihoods", "Spreads", "left_out", "spreads"]
-
 # Values of the spread: at u/(1 − u) of their scale, for even u.
 CELLS = 400
 

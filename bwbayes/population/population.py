@@ -33,15 +33,6 @@ from bwbayes.population.specimen import Specimen, likelihoods, shared
 from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
 
-__all__ = [
-    "FEWEST",
-    "Population",
-    "PopulationParameter",
-    "SpecimenEstimate",
-    "next_specimen",
-    "population",
-]
-
 # Specimens below which nothing is said of a spread.
 FEWEST = 3
 

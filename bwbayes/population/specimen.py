@@ -20,8 +20,6 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.population.normal import NormalLikelihoods
 
-__all__ = ["Specimen", "likelihoods", "shared", "specimen_of"]
-
 # Draws of a specimen that are kept.
 DRAWS = 1000
 

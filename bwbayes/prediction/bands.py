@@ -18,8 +18,6 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.shown import brief
 
-__all__ = ["KINDS", "LEVELS", "Bands", "Kind", "LeadIn", "titled"]
-
 Kind = Literal["parameter", "displacement", "sensor"]
 KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
 

@@ -18,9 +18,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.inference.noise import Noise
-
-__all__ = ["Carried", "carried"]
+from bwbayes.inference.state_space import Noise
 
 
 @dataclass(frozen=True)

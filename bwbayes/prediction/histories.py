@@ -20,8 +20,6 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import narrower
 
-__all__ = ["Histories", "States", "choose_histories", "uniform"]
-
 # Draws that are asked about each of many histories.
 FEW = 50
 

@@ -30,8 +30,6 @@ from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 
-__all__ = ["Start", "Started", "fitted", "going_on", "started"]
-
 
 @dataclass(frozen=True)
 class Start:

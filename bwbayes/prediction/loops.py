@@ -20,21 +20,6 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.shown import brief
 
-__all__ = [
-    "MEASURES",
-    "Curve",
-    "Estimate",
-    "Loop",
-    "Loops",
-    "Traced",
-    "at_level",
-    "crossings",
-    "initial_curve",
-    "measure_loops",
-    "measures",
-    "steady_loop",
-]
-
 # Voltages along a branch: an odd number, so that a symmetric drive passes zero at one of them.
 POINTS = 201
 

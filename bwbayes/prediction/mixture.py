@@ -18,8 +18,6 @@ import scipy
 
 from bwbayes.arrays import FloatArray, Floating
 
-__all__ = ["VALUES", "crps", "log_density", "quantile", "ranked_values", "stratified_scores"]
-
 # Values of the mixture at a sample, at least: one of each of as many draws as predictions take, so
 # that a quantile is as sure as the draws themselves make it.
 VALUES = 1000

@@ -28,8 +28,6 @@ from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import Start, Started, fitted, going_on, started
 from bwbayes.record.record import Record, Window
 
-__all__ = ["DRAWS", "Start", "forecast", "predict_record", "predict_windows", "thinned"]
-
 # Posterior draws in the mixture.
 DRAWS = 1000
 

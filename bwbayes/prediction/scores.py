@@ -17,8 +17,6 @@ from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.shown import brief
 
-__all__ = ["Scores", "score"]
-
 
 @dataclass(frozen=True)
 class Scores:

@@ -22,15 +22,6 @@ from bwbayes.prediction.loops import Curve, Estimate
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 
-__all__ = [
-    "STEP_MEASURES",
-    "Step",
-    "StepResponse",
-    "measure_step",
-    "measure_steps",
-    "step_of",
-]
-
 # Time after a step from which creep is counted, s, as data sheets do.
 CREEP_FROM = 0.1
 

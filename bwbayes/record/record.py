@@ -24,8 +24,6 @@ from bwbayes.record.io.grid import VoltageIs, clock, record_fields, require_volt
 from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.shown import brief
 
-__all__ = ["Record", "Window"]
-
 Window = tuple[float, float]
 """A stretch of time in s: start <= time < stop."""
 

@@ -30,8 +30,6 @@ from bwbayes.record.true_values import true_values
 from bwbayes.record.waveforms import Waveform
 from bwbayes.shown import brief
 
-__all__ = ["Amplifier", "LaserSensor", "RingBender", "VirtualTestStand", "creep"]
-
 # Of the discrepancy process; like the others it is part of the stand and not adjustable.
 PROCESS_SD = 1.5  # um
 PROCESS_TIME = 0.5  # s

@@ -19,8 +19,6 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 
-__all__ = ["true_values"]
-
 # The ring bender driven at 1 Hz by 100 V.
 RING_BENDER = Ranges(100.0, 62.0, 0.0, 0.5, 0.0, 1e-3, 16.0)
 

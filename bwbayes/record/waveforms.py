@@ -20,17 +20,6 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 
-__all__ = [
-    "Carrier",
-    "Decay",
-    "Sine",
-    "Staircase",
-    "Triangle",
-    "Waveform",
-    "signal",
-    "signal_names",
-]
-
 
 def _require(where: str, value: float, kind: Literal["finite", "positive", "not negative"]) -> None:
     """Refuse a number that is not finite, or has the wrong sign."""

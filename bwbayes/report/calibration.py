@@ -11,8 +11,6 @@ from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
 from bwbayes.report.words import symbol, unit_text
 
-__all__ = ["calibration_report"]
-
 # What is ranked besides parameters: its name, and its unit.
 EXTRA_WORDS = {
     "log_likelihood": ("log likelihood", "-"),

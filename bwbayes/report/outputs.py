@@ -24,15 +24,6 @@ from bwbayes.report.page import render
 from bwbayes.report.report import Picture, Report
 from bwbayes.report.result import Result
 
-__all__ = [
-    "posterior_tree",
-    "refuse_existing",
-    "save",
-    "write_bands",
-    "write_posterior",
-    "write_summary",
-]
-
 
 @contextmanager
 def _draft(path: Path) -> Iterator[Path]:

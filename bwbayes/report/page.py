@@ -22,8 +22,6 @@ from markupsafe import Markup, escape
 
 from bwbayes.report.report import Report, Table
 
-__all__ = ["PagePlots", "Script", "csv_link", "fragment", "render"]
-
 # What a cell with a number begins with, or what stands for a number that is not known.
 NUMBER = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
 

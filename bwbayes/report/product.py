@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from bwbayes.record.record import Record
     from bwbayes.report.report import Report
 
-__all__ = ["Product", "Shown"]
-
 
 class Shown:
     """What shows itself by its report: its head as a repr, all of it in print and a notebook."""

@@ -17,26 +17,6 @@ from bwbayes.diagnosis.standing import Standing
 if TYPE_CHECKING:
     from matplotlib import figure
 
-__all__ = [
-    "Banner",
-    "Block",
-    "Facts",
-    "Figure",
-    "Glossary",
-    "Kind",
-    "Picture",
-    "Report",
-    "Section",
-    "SideBySide",
-    "Table",
-    "TableColumn",
-    "Target",
-    "Text",
-    "kind_of",
-    "remarks_banner",
-    "standing_banner",
-]
-
 # A figure of matplotlib, which is loaded when something is drawn.
 type Figure = "figure.Figure"  # quoted, for those who evaluate it
 

@@ -28,8 +28,6 @@ from bwbayes.prediction.steps import StepResponse
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.shown import brief
 
-__all__ = ["Result", "summary"]
-
 
 @dataclass(frozen=True)
 class Result:

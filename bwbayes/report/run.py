@@ -36,8 +36,6 @@ from bwbayes.report.result import Result
 from bwbayes.report.tables import priors_table
 from bwbayes.report.words import covered, error_text, length_text, mark
 
-__all__ = ["prediction_report", "run_report"]
-
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     """Return what a run says.

@@ -12,8 +12,6 @@ from rich.table import Table as Grid
 
 from bwbayes.report.report import Banner, Facts, Report, Table, Text
 
-__all__ = ["as_text", "show"]
-
 COLORS = {"good": "green", "note": "yellow", "bad": "red"}
 
 

@@ -30,23 +30,6 @@ from bwbayes.report.words import (
     unit_text,
 )
 
-__all__ = [
-    "flat_records",
-    "learned_table",
-    "loops_table",
-    "moves_table",
-    "name_columns",
-    "other_scores_table",
-    "parameter_words",
-    "parameters_table",
-    "priors_table",
-    "replicated_tables",
-    "sampling_table",
-    "scores_table",
-    "steps_table",
-]
-
-
 Summary = Mapping[str, Any]
 
 UNKNOWN = "–"

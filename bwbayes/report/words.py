@@ -13,18 +13,6 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.report import Kind
 
-__all__ = [
-    "STATUS_KINDS",
-    "covered",
-    "digits",
-    "error_text",
-    "label_with_unit",
-    "length_text",
-    "mark",
-    "symbol",
-    "unit_text",
-]
-
 # The kind of banner that goes with how a validation, or a record of a campaign, ended; else "bad".
 STATUS_KINDS: Mapping[str, Kind] = {
     "passed": "good",

@@ -21,19 +21,6 @@ from bwbayes.shown import brief
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-__all__ = [
-    "MOVES",
-    "PHASES",
-    "Block",
-    "Chain",
-    "EnsembleState",
-    "Phase",
-    "constrain_steps",
-    "draws",
-    "log_densities",
-    "thinning",
-]
-
 # Draws of all walkers that are judged and reported at most; of more, every second or fourth step
 # is used, and so on. Chains get that long because their steps tell little that is new.
 MOST_DRAWS = 2**19

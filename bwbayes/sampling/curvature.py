@@ -16,8 +16,6 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 
-__all__ = ["QuadraticMap", "subsample"]
-
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
 

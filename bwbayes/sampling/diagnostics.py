@@ -26,22 +26,6 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.shown import brief
 
-__all__ = [
-    "LARGEST_PARETO_K",
-    "LENGTH",
-    "Check",
-    "Outcome",
-    "as_chains",
-    "autocorrelation_time",
-    "check",
-    "effective_draws",
-    "nested_rhat",
-    "pareto_k",
-    "smoothed_weights",
-    "stuck",
-    "times",
-]
-
 LARGEST_RHAT = 1.01
 
 # Of walkers that mix it is 1.01 after 50 autocorrelation times: √(1 + 1/50).

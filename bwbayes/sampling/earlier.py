@@ -21,8 +21,6 @@ from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = ["read_earlier"]
-
 
 def read_earlier(path: Path) -> dict[str, dict[str, Any]]:
     """Read a chain as the arrays of each file of :mod:`bwbayes.sampling.storage`, by name.

@@ -26,8 +26,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, EnsembleState
 from bwbayes.sampling.moves import AmongPlaces, Weighted
 
-__all__ = ["advance", "start"]
-
 
 def start(
     posterior: Posterior,

@@ -17,14 +17,6 @@ from emcee import moves
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = [
-    "AmongPlaces",
-    "SnookerMove",
-    "Weighted",
-    "pilot_moves",
-    "sampling_moves",
-]
-
 Weighted = list[tuple[moves.Move, float]]
 
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 from bwbayes.errors import InputError
 
-__all__ = ["SamplingPlan", "best_places", "best_together"]
-
 
 @dataclass(frozen=True)
 class SamplingPlan:

@@ -21,8 +21,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
-__all__ = ["StudentMixture"]
-
 # Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
 CUTS = (0.5, 0.85)
 PARTS = len(CUTS) + 1

@@ -53,12 +53,6 @@ from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = [
-    "Watcher",
-    "first_chain",
-    "sample",
-]
-
 # Blocks of the first round of the tuning, and part of the proposed places that walkers must take.
 TUNING_BLOCKS = 2
 TAKEN = 0.5

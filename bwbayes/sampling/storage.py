@@ -32,8 +32,6 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = ["ChainFile"]
-
 FORMAT = 3
 
 Arrays = Mapping[str, Any]

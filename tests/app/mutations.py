@@ -22,8 +22,6 @@ import scipy.io
 
 from bwbayes.record import read_record, write_record
 
-__all__ = ["CONFIGS", "GOOD", "KINDS", "QUICK", "Case", "case", "good_arrays", "made", "stored"]
-
 Generator = np.random.Generator
 
 ROWS = [f"{i / 100:.2f},{5 * math.sin(i):.4f},{2 * math.cos(1.3 * i):.4f}" for i in range(40)]

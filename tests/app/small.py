@@ -20,19 +20,6 @@ from bwbayes.app.config.config import Config, parse
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import start
 
-__all__ = [
-    "TEXT",
-    "assert_same_end",
-    "begun",
-    "command",
-    "config",
-    "finished",
-    "lowest_ess",
-    "numbers",
-    "quiet",
-    "typed",
-]
-
 TEXT = """\
 seed = 3
 

@@ -10,8 +10,6 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
 
-__all__ = ["CONFIG", "POPULATION", "record", "specimens", "truths"]
-
 # Medians and relative spreads of the population that specimens are drawn from.
 POPULATION = {"d": (0.7, 0.05), "alpha": (0.3575, 0.08)}
 

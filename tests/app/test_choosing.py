@@ -11,7 +11,8 @@ import pytest
 from rich.console import Console
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise
 from bwbayes.app.running.run import resume, start
 from bwbayes.inference import map_estimate as pointfit

@@ -30,7 +30,8 @@ import pytest
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs import check as app_check
-from bwbayes.app.problem.problem import generator, resolve
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit

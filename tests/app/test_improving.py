@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 import bwbayes as bw
-from bwbayes.app.config.config import Config, RecordConfig
+from bwbayes.app.config.config import Config
+from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.running.explaining import improve_model
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import write_record

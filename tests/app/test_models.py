@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from bwbayes.app.config.config import ModelConfig
 from bwbayes.app.config.keywords import models_of
+from bwbayes.app.config.settings import ModelConfig
 from bwbayes.errors import InputError
 
 BASE = ModelConfig(gain=["cubic"], creep=True, dynamics="none", hold="first", passive=False)

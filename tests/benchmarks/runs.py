@@ -27,7 +27,8 @@ from emcee.moves import StretchMove
 
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import executor
 from bwbayes.calibration.replicates import replicate
 from bwbayes.inference import map_estimate

@@ -21,7 +21,7 @@ from bwbayes.calibration.replicates import (
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.prediction.prediction import Start
+from bwbayes.prediction.initial_state import Start
 from bwbayes.record.record import Record
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.problems import posterior_of, short_posterior

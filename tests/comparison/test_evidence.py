@@ -15,8 +15,10 @@ import pytest
 from scipy import integrate, stats
 from scipy.signal import lfilter
 
-from bwbayes.app.config.config import RecordConfig, load
-from bwbayes.app.problem.problem import generator, resolve
+from bwbayes.app.config.config import load
+from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior

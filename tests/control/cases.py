@@ -18,8 +18,6 @@ from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 
-__all__ = ["ACTUATORS", "HOLDS", "SPAN", "actuator", "drive", "theta"]
-
 SPAN = Span(-100.0, 100.0)
 HOLDS: tuple[Hold, ...] = ("first", "zero")
 

@@ -15,7 +15,8 @@ import numpy as np
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Fit
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
@@ -34,23 +35,6 @@ from bwbayes.record.waveforms import signal
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.measured import keep
-
-__all__ = [
-    "CONFIG",
-    "LIMITS",
-    "about",
-    "compensated",
-    "discrepancy",
-    "drawn",
-    "fit_of",
-    "inside",
-    "measured_voltage",
-    "off",
-    "problem",
-    "promised",
-    "rms",
-    "study",
-]
 
 CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
 LIMITS = Limits(-100.0, 100.0)

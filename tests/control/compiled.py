@@ -12,8 +12,6 @@ from numpy.ctypeslib import ndpointer
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import Exported
 
-__all__ = ["Compiled"]
-
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
 # One call for each sample, as in a controller.

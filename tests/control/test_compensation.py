@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.predicted import Compensation

@@ -15,8 +15,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.record import Record
 from tests.stand import process
 
-__all__ = ["CAUSES", "Bench", "Plant", "bench", "plant"]
-
 RATE, FINE = 200.0, 8
 
 # What is planted, and what it may be called.

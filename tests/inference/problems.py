@@ -20,19 +20,6 @@ from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES, context, declared, joint, parameter
 
-__all__ = [
-    "INTERVAL",
-    "TRUE_NOISE",
-    "decaying_sine",
-    "joint_prior",
-    "posterior_of",
-    "posterior_of_record",
-    "ring_bender",
-    "short_posterior",
-    "single",
-    "truth",
-]
-
 INTERVAL = 0.01
 
 TRUE_NOISE = {"sensor_sd": 0.3, "discrepancy_sd": 0.8, "discrepancy_time": 0.2}

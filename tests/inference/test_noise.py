@@ -18,9 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.noise import DiscrepancyNoise, Noise, SmoothNoise
+from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.state_space import Noise
 from bwbayes.prediction.discrepancy_state import carried
 from tests.inference.problems import INTERVAL, short_posterior
 

@@ -20,7 +20,8 @@ from bwbayes.inference.untried import with_creep
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.prediction import Start, predict_record
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests import measured
 from tests.inference.problems import posterior_of

@@ -20,25 +20,14 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.prediction.bands import KINDS, Bands, Kind
-from bwbayes.prediction.prediction import Start, predict_record
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from bwbayes.record.true_values import true_values
 from tests.inference.problems import posterior_of
 from tests.prediction.runs import covered as inside
 from tests.stand import process
-
-__all__ = [
-    "Case",
-    "Cut",
-    "alarms",
-    "covered",
-    "errors_off",
-    "posterior_of_case",
-    "record_of",
-    "studied",
-    "widening",
-]
 
 Cut = Literal["any", "turn", "speed", "knocked"]
 

@@ -27,16 +27,6 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = [
-    "Judged",
-    "covered",
-    "judge",
-    "posterior_draws",
-    "problem_of",
-    "weighted_draws",
-]
-
-
 # Draws of each round, to which the mixture of the next one is fitted; draws of the last; those that
 # stay. Three rounds find a tail that is several times as long as the point fit's sd says.
 PILOT, ROUNDS, DRAWS, KEPT = 2000, 4, 8000, 250

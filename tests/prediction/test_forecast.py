@@ -12,7 +12,8 @@ from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.prediction import Start, forecast, predict_record, predict_windows
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, TRUE_NOISE, decaying_sine, short_posterior, truth
 

@@ -13,8 +13,7 @@ import pytest
 
 from bwbayes.model.operator import Span
 from bwbayes.prediction.histories import choose_histories
-from bwbayes.prediction.initial_state import started
-from bwbayes.prediction.prediction import Start
+from bwbayes.prediction.initial_state import Start, started
 from bwbayes.record.record import Record
 from tests.prediction.moving import RATE, Case, posterior_of_case
 

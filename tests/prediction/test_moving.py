@@ -34,8 +34,7 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.prediction.bands import LEVELS, Bands
-from bwbayes.prediction.initial_state import started
-from bwbayes.prediction.prediction import Start
+from bwbayes.prediction.initial_state import Start, started
 from tests.measured import keep
 from tests.prediction.moving import (
     RATE,

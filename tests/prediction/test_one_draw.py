@@ -18,7 +18,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
-from bwbayes.prediction.prediction import Start, predict_record, predict_windows
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
 

@@ -13,7 +13,8 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.prediction.prediction import Start, predict_record, predict_windows
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of
 from tests.stand import process

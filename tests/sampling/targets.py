@@ -24,17 +24,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.proposals import StudentMixture
 
-__all__ = [
-    "ALARM",
-    "TARGETS",
-    "Known",
-    "Target",
-    "gaussian",
-    "student",
-    "target",
-    "worst_score",
-]
-
 REPLICATES = 12
 ALARM = 7.0
 

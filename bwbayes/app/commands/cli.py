@@ -25,8 +25,6 @@ from bwbayes.app.commands.products import compensate, design, export, predict, t
 from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
 from bwbayes.errors import ColumnsError, InputError, NotConvergedError, one_line
 
-__all__ = ["main"]
-
 
 @click.command()
 @click.argument("key", required=False)

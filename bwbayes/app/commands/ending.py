@@ -24,19 +24,6 @@ if TYPE_CHECKING:
     from bwbayes.diagnosis.standing import Standing
     from bwbayes.report.report import Report
 
-__all__ = [
-    "BAD_INPUT",
-    "INTERRUPTED",
-    "NOT_CONVERGED",
-    "as_typed",
-    "finish",
-    "present",
-    "require_new_or_resumed",
-    "resumable",
-    "show_report",
-]
-
-
 BAD_INPUT = 2
 NOT_CONVERGED = 4
 INTERRUPTED = 130

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from bwbayes.app.config.proposal import ConfigProposal
     from bwbayes.app.problem.problem import Problem
 
-__all__ = ["check", "init", "report", "resume", "run"]
-
 
 @click.command()
 @click.argument("record", type=FILE)

@@ -19,17 +19,6 @@ import click
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.errors import InputError
 
-__all__ = [
-    "FILE",
-    "WithParts",
-    "folder_argument",
-    "naming_options",
-    "options_of",
-    "overwrite_option",
-    "quiet_option",
-    "seed_option",
-]
-
 type AnyCommand = Callable[..., Any]
 
 FILE = click.Path(path_type=Path)

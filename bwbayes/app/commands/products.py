@@ -20,8 +20,6 @@ from bwbayes.app.commands.options import (
 )
 from bwbayes.errors import ColumnsError, InputError
 
-__all__ = ["compensate", "design", "export", "predict", "track"]
-
 
 def _saved(
     job: Callable[..., Any],

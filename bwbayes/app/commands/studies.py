@@ -19,8 +19,6 @@ from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_opti
 from bwbayes.app.config.limits import USUAL_MODELS
 from bwbayes.errors import InputError
 
-__all__ = ["calibrate", "campaign", "compare", "simulate"]
-
 
 @click.command()
 @click.argument("out", type=FILE)

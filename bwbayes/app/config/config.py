@@ -19,32 +19,15 @@ from pydantic import Discriminator, Field, Tag, ValidationError, field_validator
 from bwbayes.app.config.keys import ConfigTable, key, one_line
 from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.app.config.settings import (
-    ActuatorConfig,
     ModelConfig,
     Name,
     ParameterConfig,
     RecordConfig,
     SamplingConfig,
-    SignalConfig,
     StandConfig,
     ValidationConfig,
 )
 from bwbayes.errors import InputError, suggestion
-
-__all__ = [
-    "ActuatorConfig",
-    "Config",
-    "ModelConfig",
-    "ParameterConfig",
-    "RecordConfig",
-    "SignalConfig",
-    "ValidationConfig",
-    "checked",
-    "dump",
-    "is_config",
-    "load",
-    "parse",
-]
 
 LARGEST_FILE = 1_000_000  # bytes
 

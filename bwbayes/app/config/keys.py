@@ -18,8 +18,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from bwbayes.errors import suggestion
 from bwbayes.shown import brief
 
-__all__ = ["ANY", "ConfigTable", "Key", "Positive", "Texts", "key", "keys", "one_line", "synonyms"]
-
 # What stands for the name that a user gives to one of several tables of a kind.
 ANY = "NAME"
 

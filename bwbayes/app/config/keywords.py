@@ -30,8 +30,6 @@ from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
 from bwbayes.record.record import Record
 
-__all__ = ["config_of", "models_of", "slug"]
-
 
 def config_of(
     record: Record | str | Path | Sequence[Any] | Mapping[str, Any],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["LARGEST_SEED", "USUAL_MODELS"]
-
 # What files hold as a whole number.
 LARGEST_SEED = 2**63 - 1
 

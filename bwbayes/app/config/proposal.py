@@ -31,8 +31,6 @@ from bwbayes.record.io.columns import ColumnTable, Naming
 from bwbayes.record.io.formats import read_table
 from bwbayes.record.io.grid import decimals_of, record_fields
 
-__all__ = ["ConfigProposal", "propose"]
-
 
 @dataclass(frozen=True)
 class ConfigProposal:

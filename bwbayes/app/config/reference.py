@@ -26,8 +26,6 @@ from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
 from bwbayes.record.waveforms import signal_names
 
-__all__ = ["config_reference", "parts_reference"]
-
 # The paper's ring bender on its identification signal: +-100 V at 1 Hz, +-62 um.
 RING_BENDER = Ranges(
     voltage=100.0, displacement=62.0, middle=0.0, time=0.5, interval=1e-3, duration=16.0

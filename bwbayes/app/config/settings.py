@@ -14,18 +14,6 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 from bwbayes.app.config.keys import ConfigTable, Positive, Texts, key
 from bwbayes.inference.engine import EngineChoice
 
-__all__ = [
-    "ActuatorConfig",
-    "ModelConfig",
-    "Name",
-    "ParameterConfig",
-    "RecordConfig",
-    "SamplingConfig",
-    "SignalConfig",
-    "StandConfig",
-    "ValidationConfig",
-]
-
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
 NotNegative = Annotated[float, Field(ge=0)]

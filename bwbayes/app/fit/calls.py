@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from bwbayes.comparison.compared import Comparison
     from bwbayes.record import Record
 
-__all__ = ["campaign", "compare", "fit", "open_run", "resume"]
-
 
 def fit(
     record: Record | str | Path | Sequence[Any] | Mapping[str, Any],

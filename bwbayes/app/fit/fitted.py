@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from bwbayes.report.result import Result
     from bwbayes.sampling.diagnostics import Outcome
 
-__all__ = ["Fit", "converged", "finished"]
-
 
 class _JobOf:
     """A job as the method of a fit, as ``at_work`` makes it, loaded when it is asked for.

@@ -23,8 +23,6 @@ from bwbayes.report.report import Figure
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["Plots"]
-
 
 class Plots:
     """The figures of a fit.

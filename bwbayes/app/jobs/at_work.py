@@ -26,16 +26,6 @@ if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.problem.problem import Problem
 
-__all__ = [
-    "Scratch",
-    "at_work",
-    "command_limits",
-    "console_of",
-    "folder_or_scratch",
-    "limits_of",
-    "warn",
-]
-
 
 def at_work[**P, R](
     job: Callable[Concatenate[Fit, P], R],

@@ -22,7 +22,8 @@ from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import batch
@@ -33,8 +34,6 @@ from bwbayes.calibration.replicates import RANKED, Entry, Experiment, replicate
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.outputs import save
-
-__all__ = ["experiment", "resume", "start"]
 
 
 class _Request(BaseModel):

@@ -24,7 +24,8 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, checked, dump, load, parse
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.campaign_folder import (
     ENDED,
@@ -44,8 +45,6 @@ from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.population import FEWEST, Population, population
 from bwbayes.population.specimen import Specimen, specimen_of
 from bwbayes.report.outputs import save, write_summary
-
-__all__ = ["config_text", "resume", "start"]
 
 
 def config_text(path: Path) -> str:

@@ -12,7 +12,8 @@ from pathlib import Path
 from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.inference import map_estimate as pointfit
@@ -27,8 +28,6 @@ from bwbayes.report.report import (
     remarks_banner,
 )
 from bwbayes.report.tables import priors_table
-
-__all__ = ["check"]
 
 
 def check(config: Config, folder: Path, out: Path) -> Report:

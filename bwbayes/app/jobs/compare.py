@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, ModelConfig, dump
+from bwbayes.app.config.config import Config, dump
 from bwbayes.app.config.keywords import slug
+from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.parameters import actuator_of, in_words
-from bwbayes.app.problem.problem import Problem, generator, resolve
-from bwbayes.app.problem.records import training_records
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions, scoring
 from bwbayes.app.running.run import begin, draw, resume
@@ -45,8 +46,6 @@ from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.prediction.scores import score
 from bwbayes.record import Record
 from bwbayes.sampling.chain import draws, log_densities
-
-__all__ = ["compare", "compare_models", "fits_of"]
 
 
 def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:

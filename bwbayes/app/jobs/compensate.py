@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bwbayes.app.jobs.at_work import command_limits
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
@@ -29,8 +29,6 @@ from bwbayes.record.io.formats import read_reference
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["compensate"]
 
 
 def compensate(

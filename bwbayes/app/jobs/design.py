@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import ValidationError
 
-from bwbayes.app.config.config import SignalConfig
 from bwbayes.app.config.keys import one_line
+from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.jobs.at_work import limits_of
-from bwbayes.app.problem.problem import Problem, generator, sampled_waveform
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
 from bwbayes.comparison.designed import Design
@@ -39,8 +40,6 @@ from bwbayes.record.waveforms import (
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["candidates_of", "design", "liveliest"]
 
 
 def design(

@@ -22,8 +22,6 @@ from bwbayes.report.outputs import refuse_existing
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
 
-__all__ = ["FILES", "at_rate", "export"]
-
 FILES = ("model.json", "actuator.c")
 
 

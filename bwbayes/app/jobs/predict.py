@@ -15,7 +15,7 @@ from bwbayes.app.running.predictions import (
 )
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
-from bwbayes.prediction.prediction import Start
+from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
@@ -23,8 +23,6 @@ from bwbayes.report.outputs import write_bands, write_summary
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["predict", "prediction_notes", "write_prediction"]
 
 
 def predict(

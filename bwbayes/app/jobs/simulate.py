@@ -7,15 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.problem.records import generator
 from bwbayes.errors import InputError
 from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform
 from bwbayes.record.waveforms import signal as named
 from bwbayes.report.outputs import refuse_existing
-
-__all__ = ["simulate"]
 
 
 def simulate(

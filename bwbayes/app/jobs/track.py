@@ -13,7 +13,7 @@ import numpy as np
 
 from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.app.jobs.export import at_rate
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.problem.records import generator
 from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking
@@ -23,8 +23,6 @@ from bwbayes.prediction.prediction import thinned
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["track"]
 
 
 def track(

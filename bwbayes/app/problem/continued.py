@@ -20,8 +20,6 @@ from bwbayes.app.problem.records import whole
 from bwbayes.errors import InputError, suggestion
 from bwbayes.record import Record
 
-__all__ = ["joined"]
-
 
 def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[str, Record]]:
     """Join records that continue another to it; return the config that says the same of the whole.

@@ -13,7 +13,8 @@ from itertools import chain
 
 import numpy as np
 
-from bwbayes.app.config.config import ALONE, ActuatorConfig, Config, ModelConfig, ParameterConfig
+from bwbayes.app.config.config import ALONE, Config
+from bwbayes.app.config.settings import ActuatorConfig, ModelConfig, ParameterConfig
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import joined, ranges_of
@@ -32,21 +33,6 @@ from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, made
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Waveform
-
-__all__ = [
-    "actuator_of",
-    "as_config",
-    "contexts_of",
-    "every_declaration",
-    "explicit_model",
-    "in_words",
-    "parameters_of",
-    "place_of",
-    "planned",
-    "readings_of",
-    "recoverable",
-    "stand_of",
-]
 
 
 def parameters_of(

@@ -18,7 +18,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.config.config import ALONE, Config, ParameterConfig, RecordConfig
+from bwbayes.app.config.config import ALONE, Config
+from bwbayes.app.config.settings import ParameterConfig, RecordConfig
 from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.parameters import (
     actuator_of,
@@ -35,7 +36,6 @@ from bwbayes.app.problem.records import (
     Validation,
     findings_of,
     generator,
-    sampled_waveform,
     set_aside,
     training_records,
     unlike,
@@ -59,8 +59,6 @@ from bwbayes.model.registry import OPTIONS
 from bwbayes.record import Record
 from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
 from bwbayes.shown import brief
-
-__all__ = ["Problem", "generator", "resolve", "sampled_waveform"]
 
 
 @dataclass(frozen=True)

@@ -9,38 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.app.config.config import (
-    ALONE,
-    Config,
-    RecordConfig,
-    SignalConfig,
-    ValidationConfig,
-)
+from bwbayes.app.config.config import ALONE, Config
+from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationConfig
 from bwbayes.app.problem.parameters import place_of, planned, stand_of
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
-from bwbayes.prediction.prediction import Start
+from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.formats import require_readable
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
-
-__all__ = [
-    "Slices",
-    "Validation",
-    "findings_of",
-    "generator",
-    "sampled_waveform",
-    "set_aside",
-    "training_records",
-    "unlike",
-    "validations_of",
-    "whole",
-    "windows_of",
-]
-
 
 type Slices = tuple[slice, ...]
 

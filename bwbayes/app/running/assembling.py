@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.cache import load, save, state_of
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.app.running.figure_worker import Artist
@@ -32,8 +33,6 @@ from bwbayes.report.result import Result
 from bwbayes.sampling.chain import PHASES, draws, log_densities
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
-
-__all__ = ["assemble", "load_result", "save_result"]
 
 
 def assemble(

@@ -24,8 +24,6 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.sampling.storage import ChainFile
 
-__all__ = ["load", "save", "state_of"]
-
 PACKAGE = "bwbayes."
 
 

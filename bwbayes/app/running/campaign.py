@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from bwbayes.app.problem.problem import generator
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
@@ -42,8 +42,6 @@ from bwbayes.shown import brief
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
-
-__all__ = ["Campaign", "Row"]
 
 # How a record ended, in the order in which they matter, and the exit status of each.
 STATUSES = {

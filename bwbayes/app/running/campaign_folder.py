@@ -21,8 +21,6 @@ from bwbayes.app.running.folder import FileOf, Folder
 from bwbayes.errors import InputError
 from bwbayes.record.io.formats import SUFFIXES
 
-__all__ = ["ENDED", "CampaignFolder", "Origin", "digest", "ended", "records_in"]
-
 # What a run's folder has once it came to its end.
 ENDED = "ended.json"
 

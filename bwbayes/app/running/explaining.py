@@ -19,7 +19,8 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.laplace import climb
@@ -29,8 +30,6 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
-
-__all__ = ["chosen_noise", "explained", "improve_model", "lines"]
 
 
 def explained(

@@ -23,8 +23,6 @@ from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import PagePlots
 from bwbayes.report.result import Result
 
-__all__ = ["Artist", "artist_of"]
-
 
 class Artist:
     """Draws in another process what is known already; without one all at the end, in this one."""

@@ -22,8 +22,6 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 
-__all__ = ["fingerprint", "require_own", "version_remarks", "versions"]
-
 # Keys of a config that a chain does not depend on; of tables, everything in them. The record is
 # compared by its readings, not by its file's name.
 FREE_TO_CHANGE = re.compile(

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
     from bwbayes.diagnosis.standing import Standing
 
-__all__ = ["CalibrationFolder", "FileOf", "Folder", "RunFolder"]
-
 
 class FileOf:
     """A file that a folder has, or may have, as an attribute: its path."""

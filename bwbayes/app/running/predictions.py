@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem, generator
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
@@ -26,13 +27,8 @@ from bwbayes.inference.untried import with_creep
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.prediction.prediction import (
-    Start,
-    forecast,
-    predict_record,
-    predict_windows,
-    thinned,
-)
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import forecast, predict_record, predict_windows, thinned
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
@@ -40,16 +36,6 @@ from bwbayes.report.figures import drawn
 from bwbayes.report.product import Shown
 from bwbayes.report.report import Figure, Report
 from bwbayes.report.run import prediction_report
-
-__all__ = [
-    "Prediction",
-    "judged",
-    "predict_after",
-    "predict_another",
-    "predictions",
-    "scoring",
-    "training_record",
-]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

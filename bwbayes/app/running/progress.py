@@ -23,8 +23,6 @@ from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
 
-__all__ = ["CountProgress", "Progress", "StepProgress", "batch"]
-
 
 class _Line:
     """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere."""

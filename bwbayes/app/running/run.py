@@ -20,7 +20,8 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit, finished
-from bwbayes.app.problem.problem import Problem, generator, resolve
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.records import generator
 from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.explaining import chosen_noise
 from bwbayes.app.running.figure_worker import Artist, artist_of
@@ -37,8 +38,6 @@ from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
-
-__all__ = ["begin", "draw", "redraw", "resume", "start", "write_files"]
 
 
 def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:

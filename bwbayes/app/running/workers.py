@@ -37,9 +37,6 @@ from threadpoolctl import threadpool_limits
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 
-__all__ = ["KINDS", "ByValue", "executor", "one_thread", "processes", "side_by_side"]
-
-
 # What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
 KINDS = ("local", "threads", "processes", "dask")
 

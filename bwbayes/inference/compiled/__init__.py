@@ -17,7 +17,7 @@ from bwbayes.inference.compiled import kernels, lanes, whitening
 from bwbayes.inference.compiled.motion import physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.inference.noise import Noise
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
 
 __all__ = ["products", "whiten"]

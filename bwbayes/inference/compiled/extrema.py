@@ -15,8 +15,6 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import everett
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
-__all__ = ["along_branches", "rows"]
-
 # Rows: a model's number in the plan, w₀, w of the last sample, the direction, how many extrema
 # there are; then the voltages of these, and the displacements there.
 FIXED = 5

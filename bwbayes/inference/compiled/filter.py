@@ -28,8 +28,6 @@ from bwbayes.inference.compiled.lanes import (
 # fmt: on
 # isort: on
 
-__all__ = ["follow", "gain", "gather", "innovate", "is_settled", "is_tracked"]
-
 # A covariance that changes by less of itself over a reading has settled.
 SETTLED = 2e-15
 

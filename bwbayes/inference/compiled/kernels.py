@@ -32,8 +32,6 @@ from bwbayes.inference.compiled.lanes import (
 from bwbayes.inference.compiled.motion import PIECE, displace
 from bwbayes.inference.compiled.stages import Kind, drive_of
 
-__all__ = ["sums"]
-
 # Fewer until the filter has settled and forgotten the start, which is looked at after each piece.
 SHORT_PIECE = 32
 

@@ -21,8 +21,6 @@ from bwbayes.inference.compiled.lanes import (
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 
-__all__ = ["PIECE", "displace", "physics", "shared"]
-
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
 

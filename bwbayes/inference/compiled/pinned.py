@@ -20,8 +20,6 @@ from bwbayes.model.operators.scalar_memory import StateMemory
 from bwbayes.model.operators.walls import KNOTS, LINES
 from bwbayes.model.reversals import monotone_stretches
 
-__all__ = ["drive"]
-
 at_rest, moves_from = compiled(formulas.at_rest), compiled(formulas.moves_from)
 first_step, integrate = compiled(formulas.first_step), compiled(formulas.integrate)
 irreversible = compiled(formulas.irreversible)

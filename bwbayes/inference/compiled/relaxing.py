@@ -15,8 +15,6 @@ from bwbayes.model import relaxing as formulas
 from bwbayes.model.compiled import compiled
 from bwbayes.model.relaxing import BENT, SHORT, RelaxingStep
 
-__all__ = ["planned", "relaxing", "rows"]
-
 relax, bent = compiled(formulas.relax), compiled(formulas.bent)
 series, third = compiled(formulas.series), compiled(formulas.third)
 relaxed = compiled(formulas.relaxed)

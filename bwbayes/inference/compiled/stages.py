@@ -27,8 +27,6 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["DRIVES", "Stage", "drive_of", "given", "prepared"]
-
 Kind = HysteresisStep | RemembersExtrema | None
 
 

@@ -17,8 +17,6 @@ from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
 
-__all__ = ["Walk", "walk"]
-
 
 class Walk:
     """Models on their way along a voltage; see :func:`walk`.

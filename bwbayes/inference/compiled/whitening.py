@@ -23,8 +23,6 @@ from bwbayes.inference.compiled.lanes import (
 from bwbayes.inference.compiled.filter import gain, innovate
 from bwbayes.inference.compiled.motion import PIECE
 
-__all__ = ["whitened"]
-
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def whitened(

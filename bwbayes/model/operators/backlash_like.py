@@ -22,8 +22,6 @@ from bwbayes.model.operators.scalar_memory import (
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["BacklashLike"]
-
 
 @dataclass(frozen=True)
 class BacklashLike(OneState):

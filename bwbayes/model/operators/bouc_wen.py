@@ -44,8 +44,6 @@ from bwbayes.model.power import PowerStep
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["BoucWen", "ceiling", "hysteresis"]
-
 SHAPE = ("alpha", "beta", "gamma", "exponent")
 
 

@@ -30,8 +30,6 @@ from bwbayes.model.operators.scalar_memory import (
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["SIGNS", "BoucWenAsymmetric", "rates"]
-
 # What each term depends on, in the order in which their bounds follow from each other.
 TERMS = {
     "b4": "the voltage's direction",

@@ -32,8 +32,6 @@ from bwbayes.model.operators.scalar_memory import (
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["Duhem"]
-
 # Bounds that other parameters put on one may be rounded.
 SLACK = 1e-12
 

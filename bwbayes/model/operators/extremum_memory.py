@@ -23,8 +23,6 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span, narrower
 from bwbayes.model.reversals import PIECE, monotone_stretches
 
-__all__ = ["INITIAL", "Branch", "Extremum", "Memory", "RemembersExtrema"]
-
 INITIAL = Declaration(
     name="initial",
     unit="-",

@@ -20,8 +20,6 @@ from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 from bwbayes.model.operators.preisach import DENSITY
 
-__all__ = ["KrasnoselskiiPokrovskii"]
-
 # Ramps are at most this many times wider than the density's bell: wider ones are all alike, with
 # the ramp for a bell.
 WIDEST = 10.0

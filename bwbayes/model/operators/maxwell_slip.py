@@ -17,8 +17,6 @@ from bwbayes.model.declaration import Declaration, Values, positive, refuse
 from bwbayes.model.operators.extremum_memory import INITIAL
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 
-__all__ = ["MaxwellSlip"]
-
 ELEMENT = "alpha_"
 
 # The slope just after a turn may be below zero by rounding, in units of d.

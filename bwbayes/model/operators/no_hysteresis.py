@@ -17,8 +17,6 @@ from bwbayes.model.operators.scalar_memory import OneState, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-__all__ = ["NoHysteresis"]
-
 
 @dataclass(frozen=True)
 class NoHysteresis(OneState):

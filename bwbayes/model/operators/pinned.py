@@ -37,8 +37,6 @@ from bwbayes.model.operators.walls import (
 )
 from bwbayes.model.reversals import monotone_stretches
 
-__all__ = ["DomainWall", "JilesAtherton", "Pinned"]
-
 # Samples that one stretch is followed for: a number that does not depend on the batch.
 LONGEST = 2048
 

@@ -21,14 +21,6 @@ from bwbayes.model.operator import Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.step import HysteresisStep
 
-__all__ = [
-    "SLOPE",
-    "Plays",
-    "PlaysStep",
-    "PrandtlIshlinskii",
-]
-
-
 SLOPE = positive(
     "d",
     "um/V",

@@ -19,8 +19,6 @@ from bwbayes.model.elementwise import gone
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 
-__all__ = ["DENSITY", "Preisach"]
-
 # Beyond this 2 u / u_s no relays are left: tanh is one to machine precision.
 SATURATED = 40.0
 

@@ -25,8 +25,6 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 
-__all__ = ["BETWEEN", "COUPLINGS", "DRIFTS", "END", "PLACES", "SHIFT", "STAGES", "WEIGHTS"]
-
 STAGES = 8
 
 

@@ -19,17 +19,6 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.step import OneStateStep
 
-__all__ = [
-    "HIGHEST_CEILING",
-    "OneState",
-    "StateMemory",
-    "alpha",
-    "beta",
-    "d",
-    "gamma",
-    "initial",
-]
-
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
 

@@ -29,11 +29,6 @@ from bwbayes.model.operators.rosenbrock import (
     WEIGHTS,
 )
 
-__all__ = [
-    "KNOTS", "LINES", "Walls", "at_rest", "curve", "field_at", "first_step", "integrate",
-    "interpolate", "irreversible", "moves_from",
-]  # fmt: skip
-
 # Steps that are remembered at a time, and what of each: where it begins, V, how long it is, the
 # displacement there, how much it changes, and the bend in between, um.
 KNOTS, LINES = 128, 7

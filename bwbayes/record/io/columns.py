@@ -22,8 +22,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 from bwbayes.record.io.series import Series, Source
 
-__all__ = ["QUANTITIES", "ColumnTable", "FileColumn", "Naming", "power_of", "select", "unit_in"]
-
 QUANTITIES = ("time", "voltage", "displacement")
 
 # Units: a prefix's power of ten and a base unit, and the power that leads from it to s, V or um.

@@ -26,15 +26,6 @@ from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.record.io.series import Source, array_source, damaged
 from bwbayes.record.record import Record
 
-__all__ = [
-    "SUFFIXES",
-    "read_record",
-    "read_reference",
-    "read_table",
-    "require_readable",
-    "write_record",
-]
-
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
 # What a folder of records is searched for.

@@ -20,15 +20,6 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.series import MAXIMUM_SAMPLES
 
-__all__ = [
-    "VoltageIs",
-    "clock",
-    "decimals_of",
-    "record_fields",
-    "reference_fields",
-    "require_voltage_is",
-]
-
 VoltageIs = Literal["command", "output"]
 """What a voltage column is: the command that a DAC holds, or the amplifier's output."""
 

@@ -22,8 +22,6 @@ import numpy as np
 from bwbayes.record.io.series import NOTES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
-__all__ = ["read_hdf5", "record_arrays", "write_hdf5"]
-
 
 def read_hdf5(path: Path) -> Source:
     """Return the series of numbers in an HDF5 file, whatever error it raises if it is damaged."""

@@ -15,8 +15,6 @@ from typing import Any
 from bwbayes.errors import InputError
 from bwbayes.record.io.series import Series, Source, in_seconds
 
-__all__ = ["is_lvm", "plain_lvm", "read_tdms"]
-
 
 def is_lvm(text: str) -> bool:
     """Tell whether a text is a LabVIEW measurement."""

@@ -27,8 +27,6 @@ from bwbayes.record.io.hdf5 import record_arrays
 from bwbayes.record.io.series import MAXIMUM_SAMPLES, NOTES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
-__all__ = ["MatVersion", "read_mat", "write_mat"]
-
 MatVersion = Literal["5", "7.3"]
 
 # Types of elements that hold numbers or text, and of others; classes of arrays.

@@ -18,19 +18,6 @@ from numpy.typing import NDArray
 
 from bwbayes.errors import InputError
 
-__all__ = [
-    "MAXIMUM_SAMPLES",
-    "NOTES",
-    "Series",
-    "Source",
-    "array_source",
-    "damaged",
-    "frame_source",
-    "in_seconds",
-    "note",
-    "vectors",
-]
-
 MAXIMUM_SAMPLES = 10**8
 # What a file may say beside its numbers.
 NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")

@@ -31,8 +31,6 @@ from bwbayes.record.io.labview import is_lvm, plain_lvm
 from bwbayes.record.io.series import Series, Source, in_seconds
 from bwbayes.record.record import Record
 
-__all__ = ["read_text", "write_text"]
-
 _NUMBER = re.compile(
     r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)([eEdD][+-]?\d+)?"
     r"|[+-]?nan|[+-]?inf",

@@ -13,8 +13,6 @@ from bwbayes.report.calibration import EXTRA_WORDS
 from bwbayes.report.figures import style
 from bwbayes.report.words import label_with_unit
 
-__all__ = ["draw_coverage", "draw_ecdf", "draw_histograms"]
-
 
 def draw_histograms(calibration: Calibration, bins: int = 20) -> Figure:
     """Draw how the ranks of each statistic are spread, over what is expected.

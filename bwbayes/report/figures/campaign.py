@@ -12,8 +12,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
 from bwbayes.report.words import label_with_unit
 
-__all__ = ["draw_parameters"]
-
 
 def draw_parameters(
     records: Mapping[str, Mapping[str, Mapping[str, Any]]], new: Mapping[str, FloatArray]

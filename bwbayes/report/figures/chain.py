@@ -13,8 +13,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
 from bwbayes.report.result import Result
 
-__all__ = ["draw_corner", "draw_ranks", "draw_trace"]
-
 RANK_BINS = 20
 
 

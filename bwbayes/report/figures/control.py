@@ -20,16 +20,6 @@ from matplotlib.ticker import (
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
 
-__all__ = [
-    "draw_command",
-    "draw_error",
-    "draw_loops",
-    "draw_promises",
-    "draw_signal",
-    "draw_tracking",
-]
-
-
 COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.MEAN_COLOR}
 
 

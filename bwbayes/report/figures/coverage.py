@@ -11,8 +11,6 @@ from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures import style
 
-__all__ = ["draw_coverage"]
-
 
 def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) -> Figure:
     """Draw the coverage of the 50, 90 and 95 % bands, and the histogram of the PIT.

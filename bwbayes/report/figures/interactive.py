@@ -29,8 +29,6 @@ from bwbayes.report.figures.series import LOOP_KINDS, path, polygons
 from bwbayes.report.page import PagePlots, Script
 from bwbayes.report.result import Result
 
-__all__ = ["draw", "made", "scripts"]
-
 FONT_SIZE = "13px"
 
 

@@ -11,8 +11,6 @@ from bwbayes.prediction.loops import Loops
 from bwbayes.prediction.steps import CREEP_FROM, StepResponse
 from bwbayes.report.figures import style
 
-__all__ = ["draw_loops", "draw_steps"]
-
 BAND = "95 % parameters"
 
 

@@ -9,8 +9,6 @@ from typing import Any
 from bwbayes.report.report import Figure, Picture
 from bwbayes.report.result import Result
 
-__all__ = ["Pictures", "draw_kind", "pictures"]
-
 type Pictures = dict[str, Picture]
 
 

@@ -14,8 +14,6 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.record import Record
 from bwbayes.report.figures import style
 
-__all__ = ["record_drawings"]
-
 
 def record_drawings(
     record: Record, training: Sequence[slice] = (), findings: Sequence[Finding] = ()

@@ -14,8 +14,6 @@ from bwbayes.diagnosis.consistency import Agreement
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.report.figures import style
 
-__all__ = ["draw_agreement", "draw_innovations", "draw_spectrum"]
-
 
 def draw_innovations(innovations: Innovations) -> Figure:
     """Draw autocorrelation, quantiles, size along time, and size along the drive."""

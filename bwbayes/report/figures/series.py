@@ -15,9 +15,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.figures import style
 
-__all__ = ["LOOP_KINDS", "draw_bands", "draw_loop", "path", "polygons"]
-
-
 # A series with fewer samples than this shows dots and the truth, a longer one only pixels.
 DOTS = 2000
 

@@ -22,36 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "BAND_COLORS",
-    "BAND_NAMES",
-    "CHANCE_COLOR",
-    "COLORS",
-    "EDGE_COLOR",
-    "EXPECTED_COLOR",
-    "LEAD_IN_COLOR",
-    "MEAN_COLOR",
-    "MEASURED_COLOR",
-    "STYLE",
-    "TRUTH_COLOR",
-    "ZOOM_COLOR",
-    "Look",
-    "axis_label",
-    "choose",
-    "draw_band",
-    "draw_ribbons",
-    "envelope",
-    "new_figure",
-    "panel_grid",
-    "plain",
-    "segments",
-    "share_legend",
-    "starts",
-    "time_label",
-    "title",
-    "zigzag",
-]
-
 # How something looks: keywords of what draws it.
 type Look = dict[str, Any]
 

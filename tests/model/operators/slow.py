@@ -15,24 +15,6 @@ from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
 
-__all__ = [
-    "RANGES",
-    "SPAN",
-    "Model",
-    "Rows",
-    "assert_close",
-    "by_extrema",
-    "by_integration",
-    "by_plays",
-    "drawn",
-    "path",
-    "paths",
-    "random_walk",
-    "rows",
-    "run",
-    "walk",
-]  # fmt: skip
-
 RANGES = Ranges(voltage=50.0, displacement=20.0, middle=5.0, time=0.5, bias=10.0)
 SPAN = Span(-100.0, 100.0)
 
