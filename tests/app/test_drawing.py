@@ -33,8 +33,6 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
         artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
         artist.draw(dataclasses.replace(run, scores={}))
         drawn = artist.pictures(run, tmp_path / "apart")
-        plots = artist.plots(run)
-    assert interactive.made(run) == plots
     here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
     save_pictures(here, tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
@@ -47,13 +45,12 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died, and nothing was begun."""
     artist, run = Artist(Broken()), example.run(converged=False)
     drawn = artist.pictures(run, tmp_path)
-    assert artist.plots(run) == ({}, [])
+    assert interactive.made(run) == ({}, [])
     assert ["trace", "ranks"] == list(drawn)
     assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
 
 
-def test_pictures_and_plots_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
+def test_pictures_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
     artist, run = Artist(Broken()), example.run()
     artist.draw(run)
     assert list(pictures(run)) == list(artist.pictures(run, tmp_path))
-    assert interactive.made(run) == artist.plots(run)

@@ -9,18 +9,16 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from functools import partial
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from bwbayes.app.running.workers import processes
 from bwbayes.report.figures import picture_of, prepare, save_pictures
 from bwbayes.report.figures.pictures import pictures
-from bwbayes.report.page import PagePlots
+from bwbayes.report.report import Picture
 from bwbayes.report.result import Result
 
 
@@ -29,7 +27,7 @@ class Artist:
 
     def __init__(self, pool: Executor | None = None) -> None:
         self.pool = pool
-        self.begun: dict[str, Future[Any]] = {}
+        self.begun: dict[str, Future[bytes]] = {}
         if pool is not None:
             pool.submit(prepare)
 
@@ -37,35 +35,22 @@ class Artist:
         """Begin with all that can be seen of a result, but for what was begun before."""
         if self.pool is None:
             return
-        calls: dict[str, Callable[[], Any]] = {
-            name: partial(picture_of, picture.draw) for name, picture in pictures(result).items()
-        }
-        if result.bands:
-            calls["plots"] = partial(_plots_of, result)
-        for name, call in calls.items():
+        for name, picture in pictures(result).items():
             if name not in self.begun:
-                self.begun[name] = self.pool.submit(call)
+                self.begun[name] = self.pool.submit(picture_of, picture.draw)
 
     def pictures(self, result: Result, folder: Path) -> dict[str, bytes]:
         """Wait until all are drawn, write them to the folder, and return PNG by name."""
         self.draw(result)
-        images: dict[str, bytes] = {
-            name: self._made(name, partial(picture_of, picture.draw))
-            for name, picture in pictures(result).items()
-        }
+        images = {name: self._drawn(name, shown) for name, shown in pictures(result).items()}
         save_pictures(images, folder)
         return images
 
-    def plots(self, result: Result) -> PagePlots:
-        """Wait until the plots to zoom and hover are made, and return them."""
-        plots: PagePlots = self._made("plots", partial(_plots_of, result))
-        return plots
-
-    def _made(self, name: str, call: Callable[[], Any]) -> Any:
-        try:
-            return self.begun[name].result() if name in self.begun else call()
-        except BrokenProcessPool:  # nothing is lost that this process cannot draw
-            return call()
+    def _drawn(self, name: str, picture: Picture) -> bytes:
+        if name in self.begun:
+            with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
+                return self.begun[name].result()
+        return picture_of(picture.draw)
 
 
 @contextmanager
@@ -78,9 +63,3 @@ def artist_of(workers: int | None, *, apart: bool) -> Iterator[Artist]:
     copied = sys.platform == "linux" and threading.active_count() == 1
     with processes(1, "fork" if copied else "spawn") as pool:
         yield Artist(pool)
-
-
-def _plots_of(result: Result) -> PagePlots:
-    from bwbayes.report.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
-
-    return interactive.made(result)

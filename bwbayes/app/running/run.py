@@ -218,6 +218,8 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
 
 def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done."""
+    from bwbayes.report.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
+
     fit = fit.knowing(folder=folder)
     result, numbers, bands = fit.result, fit.numbers, folder.path / "bands.csv"
     figures = folder.path / "figures"
@@ -227,8 +229,9 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     bands.unlink(missing_ok=True)
     if result.bands:
         write_bands(bands, result.bands)
-    pictures, plots = artist.pictures(result, figures), artist.plots(result)
     save_result(folder.result, fit.problem, fit.chain, result)
+    # Those to zoom and hover are made here, while others are drawn.
+    plots, pictures = interactive.made(result), artist.pictures(result, figures)
     page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

@@ -37,7 +37,7 @@ def prepare() -> None:
     import corner  # noqa: F401, PLC0415
     from matplotlib.backends import backend_agg  # noqa: F401, PLC0415
 
-    from bwbayes.report.figures import chain, interactive  # noqa: F401, PLC0415
+    from bwbayes.report.figures import chain  # noqa: F401, PLC0415
 
 
 def picture_of(draw: Callable[[], Figure]) -> bytes:
