@@ -74,7 +74,8 @@ def whiten(
     and the readings (readings,) missing before each.
     """
     step, process, sensor, second, gaps, steps = _filtering(noise, theta, skipped)
-    rows = np.ascontiguousarray(step.T)
+    # Each layout of an array would be compiled by itself.
+    rows, series = np.ascontiguousarray(step.T), np.ascontiguousarray(series)
     return whitening.whitened(rows, process, sensor, second, gaps, steps, series)
 
 
