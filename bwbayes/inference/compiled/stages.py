@@ -72,7 +72,8 @@ DRIVES: Mapping[
 def given(equilibrium: FloatArray, drive: FloatArray) -> Stage:
     """Take a known drive (models, samples), um, whose first sample was ``equilibrium``."""
     group = np.stack([np.arange(equilibrium.size), equilibrium], axis=1)
-    return Stage(None, equilibrium, group, drive)
+    # All that follows would be compiled once more for another layout.
+    return Stage(None, equilibrium, group, np.ascontiguousarray(drive))
 
 
 @njit(nogil=True, cache=True)

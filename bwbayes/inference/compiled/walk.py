@@ -47,7 +47,7 @@ class Walk:
             piece = slice(begin, end)
             voltage, curve, begin, end = voltage[piece], curve[piece], 0, last - self.now
             growth = growth[piece]
-            plan = self.drive(voltage)
+            plan = np.ascontiguousarray(self.drive(voltage))
         _walk(
             self.stage.kind, self.own, plan, curve, lags, growth, self.state, voltage, begin, end,
             displacement,
