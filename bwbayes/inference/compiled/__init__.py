@@ -52,10 +52,12 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
         for row, name in enumerate(lanes.PARAMETERS):
             if name in named:
                 models[:, row] = named[name]
-        sums[:, rows] = kernels.sums(
-            *record, models[rows], steps[:, rows], second, stage.kind, stage.group, stage.plan,
-            *together, *unknowns,
+        over_gaps = np.ascontiguousarray(lanes.in_lanes(steps[:, rows]).swapaxes(0, 1))
+        result = kernels.sums(
+            *record, lanes.in_lanes(models[rows]), over_gaps, second,
+            stage.kind, lanes.in_lanes(stage.group), stage.plan, *together, *unknowns,
         )  # fmt: skip
+        sums[:, rows] = result[:, : len(stage.group)]
     size = 1 + offset + free
     pairs = np.empty((len(theta), size, size))
     for i in range(size):

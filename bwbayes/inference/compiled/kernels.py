@@ -162,72 +162,11 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
             state[RESPONSE + at] = 1.0
 
 
-@inner(error_model="numpy")
-def _group(
-    second: bool | None,
-    kind: Kind,
-    group: FloatArray,
-    plan: FloatArray,
-    curve: FloatArray,
-    lags: FloatArray,
-    growth: FloatArray,
-    state: FloatArray,
-    voltage: FloatArray,
-    displacement: FloatArray,
-    gaps: IntArray,
-    steps: FloatArray,
-    offset: int,
-    free: int,
-    slow: int,
-    result: FloatArray,
-) -> None:
-    """Walk one group of models through the record; ``result`` (SUMS, LANES)."""
-    _begin(state, offset, free, slow)
-    drive = _aligned(PIECE * LANES)
-    work = np.empty((3 + SERIES, PIECE * LANES))
-    # Responses that stay: the offset, and those of the creep that are heard still.
-    decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
-    staying, pending = 0, 0
-    # Not a literal, which numba would compile all that follows for a second time.
-    now, steady = int(np.int64(0)), False
-    while now < voltage.size:
-        last = min(now + (PIECE if steady else SHORT_PIECE), voltage.size)
-        complete = steady and gaps[now] == 0
-        if complete:
-            # As far as every sample has a reading.
-            end = now
-            while end < last and gaps[end] == 0:
-                end += 1
-            last = end
-        drive_of(kind, group, plan, voltage, now, last, drive)
-        displace(state, curve, lags, growth, now, last, drive)
-        readings = displacement[now:last]
-        if complete:
-            noise.follow(state, second, readings, drive, decays[:staying], series[:staying])
-            pending += last - now
-        else:
-            noise.gather(state, pending)
-            pending = 0
-            responses = lags[:slow]
-            _one_by_one(
-                state, second, readings, gaps[now:last], steps, drive, responses, offset, free,
-                work,
-            )  # fmt: skip
-            steady = noise.is_settled(state)
-            for k in range(1 + offset, 1 + offset + free):
-                steady = not _is_heard(state, k) and steady
-            staying = offset
-            for k in range(slow):
-                if _is_heard(state, 1 + offset + free + k):
-                    decays[staying], series[staying] = lags[k, 2], 1 + offset + free + k
-                    staying += 1
-            steady = steady and noise.is_tracked(state, second, decays[:staying], series[:staying])
-        now = last
-    noise.gather(state, pending)
-    for i in range(LANES):
-        for pair in range(PAIRS):
-            result[pair, i] = state[PRODUCTS + pair * LANES + i]
-        result[LOG_DETERMINANT, i] = state[LOG + i]
+@inner()
+def _copy(values: FloatArray, row: FloatArray) -> None:
+    """Write values to the beginning of a row: a slice's shape would be checked, by much code."""
+    for i in range(values.size):
+        row[i] = values[i]
 
 
 @inner()
@@ -247,7 +186,7 @@ def sums(
     steps: FloatArray,
     second: bool | None,
     kind: Kind,
-    group: FloatArray,
+    groups: FloatArray,
     plan: FloatArray,
     curve: FloatArray,
     lags: FloatArray,
@@ -256,7 +195,7 @@ def sums(
     free: int,
     slow: int,
 ) -> FloatArray:
-    """Return what the noise's density needs, (SUMS, models).
+    """Return what the noise's density needs, (SUMS, lanes of all groups).
 
     First Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of series:
     the residual (um), the offset's response if ``offset`` is one, ``free`` free responses of the
@@ -270,36 +209,66 @@ def sums(
         (samples,) which of the gaps is just before a reading: −1 where there is no reading, 0 if
         none is, else its number.
     models, steps
-        (models, parameters), the columns as in ``PARAMETERS``, and (gaps, models, rows) of the
-        filter's step over each gap, as from ``KEPT`` on.
+        (groups, lanes times parameters), in the order of ``PARAMETERS``, and (groups, gaps, lanes
+        times rows) of the filter's step over each gap, as from ``KEPT`` on.
     second
         None unless the noise has two states.
-    kind, group, plan
-        The stage that makes the drive, what each model is in it (models, rows), and what it knows
-        of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
+    kind, groups, plan
+        The stage that makes the drive, what models are in it (groups, lanes times rows), and what
+        it knows of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     curve, lags, growth
         What gain and creep know, as in :mod:`bwbayes.inference.compiled.motion`.
     """
-    count = models.shape[0]
-    result, results = np.empty((SUMS, count)), np.empty((SUMS, LANES))
-    state, lane_group = _aligned(STATE), _aligned(group.shape[1] * LANES)
-    lane_steps = np.empty((steps.shape[0], steps.shape[2] * LANES))
-    for first in range(0, count, LANES):
+    result, state = np.empty((SUMS, len(models) * LANES)), _aligned(STATE)
+    group, drive = _aligned(groups.shape[1]), _aligned(PIECE * LANES)
+    work = np.empty((3 + SERIES, PIECE * LANES))
+    # Responses that stay: the offset, and those of the creep that are heard still.
+    decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
+    for number in range(len(models)):
+        _copy(models[number], state)
+        _copy(groups[number], group)
+        _begin(state, offset, free, slow)
+        staying, pending = 0, 0
+        # Not a literal, which numba would compile all that follows for a second time.
+        now, steady = int(np.int64(0)), False
+        while now < voltage.size:
+            last = min(now + (PIECE if steady else SHORT_PIECE), voltage.size)
+            complete = steady and gaps[now] == 0
+            if complete:
+                # As far as every sample has a reading.
+                end = now
+                while end < last and gaps[end] == 0:
+                    end += 1
+                last = end
+            drive_of(kind, group, plan, voltage, now, last, drive)
+            displace(state, curve, lags, growth, now, last, drive)
+            readings = displacement[now:last]
+            if complete:
+                noise.follow(state, second, readings, drive, decays[:staying], series[:staying])
+                pending += last - now
+            else:
+                noise.gather(state, pending)
+                pending = 0
+                _one_by_one(
+                    state, second, readings, gaps[now:last], steps[number], drive, lags[:slow],
+                    offset, free, work,
+                )  # fmt: skip
+                steady = noise.is_settled(state)
+                for k in range(1 + offset, 1 + offset + free):
+                    steady = not _is_heard(state, k) and steady
+                staying = offset
+                for k in range(slow):
+                    if _is_heard(state, 1 + offset + free + k):
+                        decays[staying], series[staying] = lags[k, 2], 1 + offset + free + k
+                        staying += 1
+                steady = steady and noise.is_tracked(
+                    state, second, decays[:staying], series[:staying]
+                )
+            now = last
+        noise.gather(state, pending)
         for i in range(LANES):
-            # Lanes to spare repeat the last model.
-            model = min(first + i, count - 1)
-            for row in range(models.shape[1]):
-                state[row * LANES + i] = models[model, row]
-            for row in range(group.shape[1]):
-                lane_group[row * LANES + i] = group[model, row]
-            for row in range(steps.shape[2]):
-                for gap in range(steps.shape[0]):
-                    lane_steps[gap, row * LANES + i] = steps[gap, model, row]
-        _group(
-            second, kind, lane_group, plan, curve, lags, growth, state, voltage, displacement,
-            gaps, lane_steps, offset, free, slow, results,
-        )  # fmt: skip
-        for row in range(SUMS):
-            for i in range(min(LANES, count - first)):
-                result[row, first + i] = results[row, i]
+            lane = number * LANES + i
+            for pair in range(PAIRS):
+                result[pair, lane] = state[PRODUCTS + pair * LANES + i]
+            result[LOG_DETERMINANT, lane] = state[LOG + i]
     return result

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import njit
 
+from bwbayes.arrays import FloatArray
 from bwbayes.model.creep import MOST_TIMES
 
 
@@ -65,3 +67,15 @@ PAIRS = SERIES * (SERIES + 1) // 2
 LOG_DETERMINANT = PAIRS
 SUMS = PAIRS + 1
 STATE = PRODUCTS + LANES * PAIRS
+
+
+def in_lanes(models: FloatArray) -> FloatArray:
+    """Put models (..., models, rows) side by side, (..., groups, rows times lanes).
+
+    Lanes to spare repeat the last model.
+    """
+    *others, count, rows = models.shape
+    groups = -(-count // LANES)
+    at = np.minimum(np.arange(groups * LANES), count - 1)
+    lanes = models[..., at, :].reshape(*others, groups, LANES, rows).swapaxes(-1, -2)
+    return lanes.reshape(*others, groups, rows * LANES)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, X2
+from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, X2, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
@@ -34,8 +34,7 @@ class Walk:
     ) -> None:
         self.stage, self.known, self.state, self.voltage = stage, known, state, voltage
         self.drive = drive
-        groups = np.reshape(stage.group[_lanes(len(stage.group))], (len(state), LANES, -1))
-        self.own = np.ascontiguousarray(groups.swapaxes(1, 2)).reshape(len(state), -1)
+        self.own = in_lanes(stage.group)
         self.now = 0
 
     def to(self, last: int) -> FloatArray:
@@ -88,24 +87,19 @@ def walk(
         stage = prepared(operator, column, voltage, memory)
     if stage is None:
         return None
-    at = _lanes(len(theta))
-    state = np.zeros((at.size // LANES, STATE))
-    for name, values in physics(actuator, column, stage.rest, voltage).items():
-        row = LANES * PARAMETERS.index(name)
-        state[:, row : row + LANES] = values[at].reshape(-1, LANES)
+    rows = {
+        PARAMETERS.index(name): values
+        for name, values in physics(actuator, column, stage.rest, voltage).items()
+    }
     moving, *crept = actuator.sections(column).begin(unrest)
-    rows = dict(zip((X1, X2), moving.T, strict=False))
-    rows |= {LAG + LANES * k: lag[:, 0] for k, lag in enumerate(crept)}
+    rows |= dict(zip((X1 // LANES, X2 // LANES), moving.T, strict=False))
+    rows |= {LAG // LANES + k: lag[:, 0] for k, lag in enumerate(crept)}
+    models = np.zeros((len(theta), STATE // LANES))
     for row, values in rows.items():
-        state[:, row : row + LANES] = values[at].reshape(-1, LANES)
+        models[:, row] = values
     # Not to be written to, whatever it was: of one type, for which one walk is compiled.
     known = np.broadcast_to(voltage, voltage.shape)
-    return Walk(stage, shared(actuator, voltage), state, known, drive)
-
-
-def _lanes(models: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return the model of each lane; lanes to spare repeat the last one."""
-    return np.minimum(np.arange(-(-models // LANES) * LANES), models - 1)
+    return Walk(stage, shared(actuator, voltage), in_lanes(models), known, drive)
 
 
 @njit(nogil=True, cache=True)
