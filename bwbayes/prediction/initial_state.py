@@ -224,9 +224,24 @@ def started(
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
+    elif len(likelihoods) > 1:
+        between = _between(likelihoods, whole.table.actuator(np.median(theta, axis=0)[np.newaxis]))
+        likelihoods = tuple(replace(each, offset_sd=between) for each in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator)
     informed = _informed(histories, start_theta, record, window, generator)
     return going_on(informed, whole, theta, generator) if start.after else informed
+
+
+def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
+    """Return how far, um, a state may lie between those of two histories that come next.
+
+    What a drive does not reach stays as it was left, and is a part of the offset: half of what one
+    history leaves there more than the one before, root-mean-square, of a ``model`` (1, parameters).
+    """
+    first = likelihoods[0]
+    voltage = first.voltage[: first.readings.samples]
+    paths = [each.simulate(model, voltage)[0, first.readings.rows] for each in likelihoods]
+    return float(np.sqrt(np.mean(np.diff(np.mean(paths, axis=1)) ** 2)) / 2)
 
 
 def going_on(

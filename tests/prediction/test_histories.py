@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from bwbayes.model.operator import Span
+from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import choose_histories
 from bwbayes.prediction.initial_state import Start, started
+from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests.prediction.moving import RATE, Case, posterior_of_case
 
@@ -103,3 +105,40 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
     assert 0.04 < np.min(expected)
     assert np.max(expected) < 0.95
+
+
+def level_error(seed: int) -> tuple[float, float]:
+    """Predict a record that goes less far than the irregular drive before it, by one offset.
+
+    Return the mean error of its displacement after the lead-in, in sds that the bands have for what
+    all of it has in common, and the part of the readings in the 95 % sensor band.
+    """
+    rng = np.random.default_rng(seed)
+    second = round(RATE)
+    swing = np.sin(2 * np.pi * np.arange(18 * second) / RATE)
+    sizes = np.concatenate([rng.uniform(0.3, 1.0, 12), np.full(6, rng.uniform(0.4, 0.7))])
+    voltage = 95 * np.repeat(sizes, second) * swing
+    theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
+    moved = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
+    voltage, moved = voltage[12 * second :], moved[12 * second :]
+    record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), 1 / RATE)
+    start = Start(own_offset=False, lead_in=0.6)
+    bands = predict_record(POSTERIOR, np.empty((100, 0)), record, start, rng)
+    error = np.mean((moved - bands.mean)[bands.scored_from :])
+    assert record.displacement is not None
+    covered = bands.covers("sensor", 95, record.displacement)
+    return float(error / bands.common_sd), float(np.mean(covered))
+
+
+def test_states_between_two_histories_widen_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twelve records after any drive; without that, the planted defect, none is right.
+
+    By chance the root-mean-square of twelve errors exceeds 1.6 sds in one test of 500.
+    """
+    errors, covered = np.transpose([level_error(seed) for seed in range(12)])
+    assert np.sqrt(np.mean(errors**2)) < 1.6
+    assert 0.93 < np.mean(covered) < 0.99
+    monkeypatch.setattr(initial_state, "_between", lambda *_: 0.0)
+    errors, covered = np.transpose([level_error(seed) for seed in range(4)])
+    assert np.sqrt(np.mean(errors**2)) > 5
+    assert np.mean(covered) < 0.9
