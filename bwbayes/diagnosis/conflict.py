@@ -174,7 +174,8 @@ def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
     fix = f"move parameters.{parameter.name}.{side}"
     if bound not in (parameter.lower, parameter.upper):
         fix = f"widen its prior {parameter.prior}, which ends there"
-    return Finding(parameter.name, f"lies on its {side} bound {bound:.4g} {parameter.unit}", fix)
+    text = f"lies on its {side} bound {bound:.4g} {parameter.unit}"
+    return Finding(parameter.name, text.rstrip(), fix)
 
 
 def _line(name: str, distribution: Distribution) -> str:

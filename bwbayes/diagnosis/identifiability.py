@@ -41,18 +41,22 @@ STEP = 1e-5
 
 
 def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
-    """Yield combinations of loop parameters that the record does not determine.
+    """Yield the combinations of loop parameters that the record determines least, two at most.
 
-    Each says how much of the prior's sd is left at a point fit, and what to measure.
+    Each leaves more of the prior's sd at a point fit than a third, and says how much and what to
+    measure; the second says how many more there are.
     """
     names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
     if not names:
         return
     parts, directions = spectrum(posterior, point)
-    for i in np.flatnonzero(parts > LEFT_OPEN):
+    count = int(np.count_nonzero(parts > LEFT_OPEN))
+    for i in range(min(count, 2)):
         text = f"{combined(directions[:, i], names)}: {percent(parts[i])} of the prior's SD remains"
-        if i + 1 < parts.size:
+        if i == count - 1 < parts.size - 1:
             text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
+        elif i == 1:
+            text += f", and more than {percent(LEFT_OPEN)} of {count - 2} other combinations"
         yield Finding("not identifiable", text, _advice(posterior, point))
 
 
@@ -165,10 +169,11 @@ def combined(direction: FloatArray, names: Sequence[str]) -> str:
     """Name a direction (names,) in words, the largest component first.
 
     ``alpha with beta`` means that both may grow together, ``alpha against beta`` that one grows
-    while the other falls; components below a fifth of the largest are left out.
+    while the other falls; components below a fifth of the largest are left out, and all after four.
     """
     shares = direction / direction[np.argmax(np.abs(direction))]
-    first, *others = [i for i in np.argsort(-np.abs(shares), kind="stable") if abs(shares[i]) > 0.2]
+    order = np.argsort(-np.abs(shares), kind="stable")[:4]
+    first, *others = [i for i in order if abs(shares[i]) > 0.2]
     return " ".join(
         [names[first], *(f"{'with' if shares[i] > 0 else 'against'} {names[i]}" for i in others)]
     )
