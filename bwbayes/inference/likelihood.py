@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
@@ -121,11 +121,11 @@ class Likelihood:
         return values
 
     @cached_property
-    def skipped(self) -> FloatArray:
-        """Readings missing just before each sample's (samples,); −1 where there is no reading."""
-        skipped = np.full(self.readings.samples, -1.0)
-        skipped[self.readings.rows] = self.readings.skipped
-        return skipped
+    def gaps(self) -> IntArray:
+        """Which of the readings' gaps is just before each sample's (samples,); −1 without one."""
+        gaps = np.full(self.readings.samples, -1)
+        gaps[self.readings.rows] = self.readings.gaps[1]
+        return gaps
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """Log density (models,) of the readings at θ (models, parameters)."""
@@ -275,7 +275,7 @@ class Likelihood:
         if self.engine == "numba" and self.noise.states:
             from bwbayes.inference import compiled  # noqa: PLC0415  # as for the products
 
-            return compiled.whiten(self.spaced, noise, series, self.readings.skipped)
+            return compiled.whiten(self.spaced, noise, series, self.readings.gaps)
         return self.spaced.whiten(noise, series, self.readings.skipped)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +59,12 @@ class Readings:
         stride = int(gaps.min()) if gaps.size else 1
         skipped = np.concatenate([[0.0], (gaps - stride) / stride])
         return cls(rows, displacement[rows], stride, skipped)
+
+    @cached_property
+    def gaps(self) -> tuple[FloatArray, IntArray]:
+        """Numbers of missing readings (kinds,), 0 first, and which is before each (readings,)."""
+        numbers, which = np.unique(np.append(self.skipped, 0.0), return_inverse=True)
+        return numbers, which[:-1]
 
     @property
     def samples(self) -> int:

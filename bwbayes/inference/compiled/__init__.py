@@ -28,13 +28,15 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
 
     At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
     """
-    actuator, noise, skipped = likelihood.actuator, likelihood.spaced, likelihood.skipped
+    actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
     voltage = likelihood.voltage[: likelihood.readings.samples]
     offset = int(likelihood.offset_sd > 0)
     free = likelihood.unknowns - offset
     column = likelihood.table.columns(theta)
     parameters = likelihood.table.noise(theta)
-    step, process, sensor, second, gaps, steps = _filtering(noise, parameters, skipped)
+    step, process, sensor, second, steps = _filtering(
+        noise, parameters, likelihood.readings.gaps[0]
+    )
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
@@ -63,39 +65,36 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     for i in range(size):
         for j in range(i + 1):
             pairs[:, i, j] = pairs[:, j, i] = sums[i * (i + 1) // 2 + j]
-    typical = np.count_nonzero(skipped >= 0) * np.log(step[3] + sensor)
+    typical = likelihood.readings.rows.size * np.log(step[3] + sensor)
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
 def whiten(
-    noise: Noise, theta: FloatArray, series: FloatArray, skipped: FloatArray
+    noise: Noise, theta: FloatArray, series: FloatArray, gaps: tuple[FloatArray, IntArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return what :meth:`~bwbayes.inference.state_space.Noise.whiten` does, of a noise with states.
 
-    Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um,
-    and the readings (readings,) missing before each.
+    Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um;
+    and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
     """
-    step, process, sensor, second, gaps, steps = _filtering(noise, theta, skipped)
+    step, process, sensor, second, steps = _filtering(noise, theta, gaps[0])
     # Each layout of an array would be compiled by itself.
     rows, series = np.ascontiguousarray(step.T), np.ascontiguousarray(series)
-    return whitening.whitened(rows, process, sensor, second, gaps, steps, series)
+    return whitening.whitened(rows, process, sensor, second, gaps[1], steps, series)
 
 
 def _filtering(
-    noise: Noise, theta: FloatArray, skipped: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, bool | None, IntArray, FloatArray]:
+    noise: Noise, theta: FloatArray, missing: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, bool | None, FloatArray]:
     """Return the filter's usual step (rows, models), variances of discrepancy and sensor (models,).
 
-    Then whether there is a second state, what is None being left out when it is compiled; which of
-    the gaps is just before each reading, 0 for none and −1 where there is no reading; and the step
-    over each gap (gaps, models, rows).
+    Then whether there is a second state, what is None being left out when it is compiled, and the
+    step over each gap (gaps, models, rows) but the first, which misses none.
     """
-    missing, gaps = np.unique(np.append(skipped, (-1.0, 0.0)), return_inverse=True)
     process, sensor = (sd**2 for sd in noise.marginal_sd(theta))
-    steps = np.array([noise.step(theta, number).T for number in missing[2:].tolist()])
+    steps = np.array([noise.step(theta, number).T for number in missing[1:].tolist()])
     steps = steps.reshape(-1, len(theta), lanes.STEP)
-    second = True if noise.states > 1 else None
-    return noise.step(theta), process, sensor, second, gaps[:-2] - 1, steps
+    return noise.step(theta), process, sensor, True if noise.states > 1 else None, steps
 
 
 def _staged(
