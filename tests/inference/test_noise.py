@@ -21,6 +21,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
 from bwbayes.prediction.discrepancy_state import carried
 from tests.inference.problems import INTERVAL, short_posterior
@@ -64,8 +65,9 @@ def whitened(
     """Whiten series with each engine that there is."""
     yield noise.whiten(theta, series, skipped)
     if importlib.util.find_spec("numba"):
+        readings = Readings(np.empty(0, dtype=np.int64), np.empty(0), 1, skipped)
         yield importlib.import_module("bwbayes.inference.compiled").whiten(
-            noise, theta, series, skipped
+            noise, theta, series, readings.gaps
         )
 
 
