@@ -204,6 +204,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         ":1: what is the sampling rate, Hz (no column can be the time)? There",
     ),
     "empty file": ("", ": the file is empty"),
+    "one long line": ('{"time": [' + "0.125, " * 30_000 + "0]}", ": a line of 210013 characters;"),
     "header alone": (HEADER, ": no columns of numbers in it"),
     "few samples": (lines(*LINES[:6]), ": too short, samples: 5"),
     "cut in a field": (GOOD[:-3], ":31: the last line is cut off"),

@@ -68,6 +68,8 @@ def read_text(path: Path) -> Source:
     lines = text.split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
+    if (longest := max(map(len, lines))) > csv.field_size_limit():
+        raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     layout = _layout(path, lines)
     names, units, header = _header(path, lines, layout)
     above = lines[: layout.first if header is None else header]
