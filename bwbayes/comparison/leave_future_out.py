@@ -112,14 +112,14 @@ def leave_future_out(
                 continue
             path = _path(posterior, training, {record: windows}, later)
             training = {dataset.name: dataset.training for dataset in path[-1].datasets}
-            part = _scored(path, {0: flat}, later, rng)
+            score = _scored(path, {0: flat}, later, rng)
             # What is left of the draws at the far end is worth too few: that end is sampled too.
-            if part.effective < 100:
+            if score.effective < 100:
                 longer = _fitted(path[-1], plan, flat, rng, executor)
                 if longer is not None:
-                    part = _scored(path, {0: flat, BLOCKS: longer}, later, rng)
+                    score = _scored(path, {0: flat, BLOCKS: longer}, later, rng)
                     flat = longer
-            parts[name] = part
+            parts[name] = score
     return parts
 
 

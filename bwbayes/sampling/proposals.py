@@ -104,10 +104,10 @@ class StudentMixture:
 
     def arrays(self) -> dict[str, Any]:
         """Return what it is made of, by name, to be written to a file."""
-        own = {name: value for name, value in vars(self).items() if name in _ARRAYS}
+        arrays = {name: value for name, value in vars(self).items() if name in _ARRAYS}
         if self.bend is None:
-            return own
-        return own | {f"bend_{f.name}": getattr(self.bend, f.name) for f in fields(self.bend)}
+            return arrays
+        return arrays | {f"bend_{f.name}": getattr(self.bend, f.name) for f in fields(self.bend)}
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, Any]) -> StudentMixture | None:

@@ -188,8 +188,8 @@ def windows_of(
     training: dict[str, Slices] = {}
     held_out: dict[str, Slices] = {}
     for name, record in records.items():
-        training[name], own = _windows_of(config, name, record)
-        held_out |= own
+        training[name], windows = _windows_of(config, name, record)
+        held_out |= windows
     for name, other in combinations(records, 2):
         overlap = any(
             a.start < b.stop and b.start < a.stop for a in training[name] for b in training[other]

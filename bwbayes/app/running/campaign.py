@@ -142,7 +142,7 @@ class Campaign(Product):
         """
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        own = ("mean", "sd", "lower_95", "upper_95")
+        quantities = ("mean", "sd", "lower_95", "upper_95")
         lines = [
             {
                 "record": row.name,
@@ -155,8 +155,8 @@ class Campaign(Product):
                     f"{name}_{key}_{unit}": self._estimates(row).get(name, {}).get(key)
                     for name, unit in self._units.items()
                     for key in (
-                        *own,
-                        *(f"shrunk_{edge}" for edge in own[2:] if name in self._spreads),
+                        *quantities,
+                        *(f"shrunk_{edge}" for edge in quantities[2:] if name in self._spreads),
                     )
                 },
             }
@@ -353,8 +353,8 @@ class Campaign(Product):
 
 
 def _own_interval(name: str, row: Row) -> str:
-    own = row.parameters.get(name)
-    return "" if own is None else _range(own["lower_95"], own["upper_95"])
+    estimate = row.parameters.get(name)
+    return "" if estimate is None else _range(estimate["lower_95"], estimate["upper_95"])
 
 
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:

@@ -34,7 +34,7 @@ class Walk:
     ) -> None:
         self.stage, self.known, self.state, self.voltage = stage, known, state, voltage
         self.drive = drive
-        self.own = in_lanes(stage.group)
+        self.groups = in_lanes(stage.group)
         self.now = 0
 
     def to(self, last: int) -> FloatArray:
@@ -48,8 +48,8 @@ class Walk:
             growth = growth[piece]
             plan = np.ascontiguousarray(self.drive(voltage))
         _walk(
-            self.stage.kind, self.own, plan, curve, lags, growth, self.state, voltage, begin, end,
-            displacement,
+            self.stage.kind, self.groups, plan, curve, lags, growth, self.state, voltage, begin,
+            end, displacement,
         )  # fmt: skip
         self.now = last
         return displacement

@@ -22,7 +22,11 @@ def draw_parameters(
     draws of a specimen not measured yet. Gray alone and blue with the population for a prior, the
     population's median and where 95 % of specimens not measured yet lie. Outliers are red.
     """
-    units = {name: own["unit"] for estimates in records.values() for name, own in estimates.items()}
+    units = {
+        name: estimate["unit"]
+        for estimates in records.values()
+        for name, estimate in estimates.items()
+    }
     figure, panels = style.panel_grid(len(units), 3, 2.6, "record")
     for panel, (name, unit) in zip(panels, units.items(), strict=True):
         if name in new:
@@ -30,17 +34,18 @@ def draw_parameters(
             panel.axhspan(low, high, color=style.BAND_COLORS["sensor"], zorder=0)
             panel.axhline(median, color=style.COLORS[0], lw=0.8, zorder=1)
         for x, estimates in enumerate(records.values(), start=1):
-            own = estimates.get(name)
-            if own is None:
+            estimate = estimates.get(name)
+            if estimate is None:
                 continue
-            panel.vlines(x, own["lower_95"], own["upper_95"], color=style.LEAD_IN_COLOR, lw=0.8)
-            if "shrunk_median" in own:
-                color = style.COLORS[1] if own["outlier"] else style.COLORS[0]
-                edges = own["shrunk_lower_95"], own["shrunk_upper_95"]
+            edges = estimate["lower_95"], estimate["upper_95"]
+            panel.vlines(x, *edges, color=style.LEAD_IN_COLOR, lw=0.8)
+            if "shrunk_median" in estimate:
+                color = style.COLORS[1] if estimate["outlier"] else style.COLORS[0]
+                edges = estimate["shrunk_lower_95"], estimate["shrunk_upper_95"]
                 panel.vlines(x + 0.25, *edges, color=color, lw=1.4)
-                panel.plot(x + 0.25, own["shrunk_median"], "o", color=color, ms=2.5)
+                panel.plot(x + 0.25, estimate["shrunk_median"], "o", color=color, ms=2.5)
             else:
-                panel.plot(x, own["median"], ".", color=style.LEAD_IN_COLOR, ms=3)
+                panel.plot(x, estimate["median"], ".", color=style.LEAD_IN_COLOR, ms=3)
         label = style.plain(label_with_unit(name, unit))
         panel.set(ylabel=label, xlim=(0, len(records) + 1))
         # The names of more records would overlap.
