@@ -75,7 +75,9 @@ def in_lanes(models: FloatArray) -> FloatArray:
     Lanes to spare repeat the last model.
     """
     *others, count, rows = models.shape
-    groups = -(-count // LANES)
-    at = np.minimum(np.arange(groups * LANES), count - 1)
-    lanes = models[..., at, :].reshape(*others, groups, LANES, rows).swapaxes(-1, -2)
+    if spare := -count % LANES:
+        last = np.repeat(models[..., -1:, :], spare, axis=-2)
+        models = np.concatenate([models, last], axis=-2)
+    groups = (count + spare) // LANES
+    lanes = models.reshape(*others, groups, LANES, rows).swapaxes(-1, -2)
     return lanes.reshape(*others, groups, rows * LANES)
