@@ -225,7 +225,9 @@ def started(
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
     elif len(likelihoods) > 1:
-        between = _between(likelihoods, whole.table.actuator(np.median(theta, axis=0)[np.newaxis]))
+        # The mean is in the domain, which is convex; a median of each parameter need not be.
+        typical = whole.table.actuator(np.mean(theta, axis=0)[np.newaxis])
+        between = _between(likelihoods, typical)
         likelihoods = tuple(replace(each, offset_sd=between) for each in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator)
     informed = _informed(histories, start_theta, record, window, generator)

@@ -142,3 +142,19 @@ def test_states_between_two_histories_widen_bands(monkeypatch: pytest.MonkeyPatc
     errors, covered = np.transpose([level_error(seed) for seed in range(4)])
     assert np.sqrt(np.mean(errors**2)) > 5
     assert np.mean(covered) < 0.9
+
+
+def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
+    """Each α but one is large in every draw: the sum of their medians would be beyond d."""
+    posterior = posterior_of_case(Case(hysteresis="maxwell-slip", discrepancy=0.05))
+    theta = posterior.prior.theta(np.empty((3, 0)))
+    names = posterior.prior.names
+    elements = [column for column, name in enumerate(names) if name.startswith("alpha")]
+    for draw, column in enumerate(elements[:3]):
+        theta[draw, column] *= 0.4
+        theta[draw, names.index("d")] = np.sum(theta[draw, elements])
+    voltage = 60 * np.sin(2 * np.pi * np.arange(int(4 * RATE)) / RATE)
+    start = Start(own_offset=False, lead_in=0.6)
+    record = Record(voltage, 0.5 * voltage, 1 / RATE)
+    begun = started(posterior, theta, record, start, np.random.default_rng(1))
+    assert (begun.offset_sd > 0).all()
