@@ -58,7 +58,7 @@ TAKEN = 0.5
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing. A proposal is fitted again to so many more at least.
-FIRST_CHECK = 3
+FIRST_CHECK = 2
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
