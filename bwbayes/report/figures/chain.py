@@ -21,49 +21,58 @@ def draw_corner(result: Result) -> Figure:
 
     The true values, where they are known, are lines.
     """
-    import corner  # noqa: PLC0415  # it loads all of arviz, which nobody else here needs
+    import corner  # noqa: PLC0415  # it loads all of arviz, which no other picture needs
 
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
     truths = [result.truth.get(parameter.name) for parameter in result.free]
     ranges = [_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)]
+    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
+    labels = [style.axis_label(parameter) for parameter in result.free]
     # Inches: a panel has 1.25, the margin for the labels 1.3.
     side = 1.25 * free + 1.5
     figure = Figure(figsize=(side, side))
-    figure.subplots(free, free)
-    corner.corner(
-        flat,
-        fig=figure,
-        bins=20,
-        range=ranges,
-        labels=[style.axis_label(parameter) for parameter in result.free],
-        label_kwargs={"fontsize": 13},
-        levels=(0.5, 0.9),
-        color=style.COLORS[0],
-        smooth=0.8,
-        plot_density=False,
-        fill_contours=True,
-        data_kwargs={"alpha": 0.3, "ms": 1.2},
-        quiet=True,
-    )
     low, high = 1.3 / side, 1 - 0.2 / side
-    figure.subplots_adjust(low, low, high, high, wspace=0.05, hspace=0.05)
-    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
-    for panel, (row, column) in zip(figure.axes, np.ndindex(free, free), strict=True):
-        if row < column:
-            continue
-        panel.tick_params("x", labelsize=11, labelrotation=90)
-        panel.tick_params("y", labelsize=11, labelrotation=0)
-        panel.xaxis.set_major_locator(ticks[column])
-        panel.xaxis.set_label_coords(0.5, -0.75)
+    grid = figure.add_gridspec(
+        free, free, left=low, bottom=low, right=high, top=high, wspace=0.05, hspace=0.05
+    )
+    for row, column in ((i, j) for i in range(free) for j in range(i + 1)):
+        panel = figure.add_subplot(grid[row, column])
+        panel.grid(visible=False)
+        is_lowest, is_first = row == free - 1, column == 0 < row
+        panel.tick_params("x", labelbottom=is_lowest, labelsize=11, labelrotation=90)
+        panel.tick_params("y", labelleft=is_first, labelsize=11)
+        if is_lowest:
+            panel.set_xlabel(labels[column], fontsize=13)
+            panel.xaxis.set_label_coords(0.5, -0.75)
+        if is_first:
+            panel.set_ylabel(labels[row], fontsize=13)
+            panel.yaxis.set_label_coords(-0.75, 0.5)
         if (truth := truths[column]) is not None:
             panel.axvline(truth, color=style.TRUTH_COLOR)
-        if row > column:
-            panel.yaxis.set_major_locator(ticks[row])
-            panel.yaxis.set_label_coords(-0.75, 0.5)
-            if (truth := truths[row]) is not None:
-                panel.axhline(truth, color=style.TRUTH_COLOR)
+        if row == column:
+            panel.hist(flat[:, row], 20, range=ranges[row], histtype="step", color=style.COLORS[0])
+            panel.set(xlim=ranges[row], yticks=[])
+            panel.xaxis.set_major_locator(ticks[row])
+            continue
+        corner.hist2d(
+            flat[:, column],
+            flat[:, row],
+            ax=panel,
+            range=[ranges[column], ranges[row]],
+            levels=(0.5, 0.9),
+            color=style.COLORS[0],
+            smooth=0.8,
+            plot_density=False,
+            fill_contours=True,
+            data_kwargs={"alpha": 0.3, "ms": 1.2},
+            quiet=True,
+        )
+        panel.xaxis.set_major_locator(ticks[column])
+        panel.yaxis.set_major_locator(ticks[row])
+        if (truth := truths[row]) is not None:
+            panel.axhline(truth, color=style.TRUTH_COLOR)
     return figure
 
 
