@@ -14,7 +14,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
-from bwbayes.report.figures import drawn, interactive
+from bwbayes.report.figures import drawn, plots_of
 from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import render
 from bwbayes.report.result import Result, summary
@@ -138,7 +138,7 @@ def page(
 ) -> str:
     """Return the page of a run, by default with its own numbers, and of those pictures."""
     report = run_report(run, summary(run) if numbers is None else numbers)
-    return render(report, pictures or {}, interactive.made(run))
+    return render(report, pictures or {}, plots_of(run))
 
 
 def figures(run: Result) -> dict[str, Figure]:

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from bwbayes.app.running.figure_worker import Artist, artist_of
-from bwbayes.report.figures import interactive, picture_of, save_pictures
+from bwbayes.report.figures import picture_of, plots_of, save_pictures
 from bwbayes.report.figures.pictures import pictures
+from bwbayes.report.page import NO_PLOTS
 from tests.app import example
 
 
@@ -27,15 +28,16 @@ class Broken(Executor):
 
 def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
     run = example.run()
-    with artist_of(2, apart=True) as artist:
+    with artist_of(2) as artist:
         if artist.pool is None:
             pytest.skip("this machine has one core")
         artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
         artist.draw(dataclasses.replace(run, scores={}))
-        drawn = artist.pictures(run, tmp_path / "apart")
+        drawn, plots = artist.drawn(run, tmp_path / "apart")
     here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
     save_pictures(here, tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
+    assert plots_of(run).drawn == plots.drawn
     assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
         path.name: path.read_bytes() for path in (tmp_path / "apart").iterdir()
     }
@@ -44,8 +46,8 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died, and nothing was begun."""
     artist, run = Artist(Broken()), example.run(converged=False)
-    drawn = artist.pictures(run, tmp_path)
-    assert interactive.made(run) == ({}, [])
+    drawn, plots = artist.drawn(run, tmp_path)
+    assert plots == NO_PLOTS
     assert ["trace", "ranks"] == list(drawn)
     assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
 
@@ -53,4 +55,4 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
 def test_pictures_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
     artist, run = Artist(Broken()), example.run()
     artist.draw(run)
-    assert list(pictures(run)) == list(artist.pictures(run, tmp_path))
+    assert list(pictures(run)) == list(artist.drawn(run, tmp_path)[0])

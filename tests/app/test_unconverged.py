@@ -94,7 +94,7 @@ def test_larger_budget_converges_to_what_it_would_have_been(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("bwbayes.app.running.figure_worker.pictures", lambda _: {})
+    monkeypatch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
     shutil.copytree(cut_short[0].path, tmp_path / "small")
     made = RunFolder.open(tmp_path / "small")
     result = resume(made, small.quiet(), workers=1, steps=20_000)

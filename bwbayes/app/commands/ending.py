@@ -87,7 +87,6 @@ def finish(
         fit = resume(
             folder,
             Console(stderr=True, quiet=quiet),
-            background=True,
             show=show,
             answer=lambda fit: None if quiet else show_report(fit.report()),
             **options,

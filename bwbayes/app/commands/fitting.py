@@ -19,6 +19,7 @@ from bwbayes.app.commands.options import (
     quiet_option,
     seed_option,
 )
+from bwbayes.app.running.figure_worker import artist_of
 from bwbayes.errors import ColumnsError, InputError
 
 if TYPE_CHECKING:
@@ -93,28 +94,31 @@ def run(
 
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
-    from bwbayes.app.running.explaining import improve_model
-    from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.run import start
-    from bwbayes.report.report import Report, remarks_banner
-    from bwbayes.report.tables import priors_table
+    # First of all: it loads what draws while this process loads what samples.
+    with artist_of(workers) as artist:
+        from bwbayes.app.running.explaining import improve_model
+        from bwbayes.app.running.folder import RunFolder
+        from bwbayes.app.running.run import start
+        from bwbayes.report.report import Report, remarks_banner
+        from bwbayes.report.tables import priors_table
 
-    chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
-    chosen = chosen.renamed(config.stem, seed)
-    path = out or Path("results") / config.stem
-    if improve:
-        RunFolder.require_free(path, overwrite)
-        chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
-    folder = start(chosen, config.parent, path, overwrite=overwrite)
+        chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
+        chosen = chosen.renamed(config.stem, seed)
+        path = out or Path("results") / config.stem
+        if improve:
+            RunFolder.require_free(path, overwrite)
+            chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
+        folder = start(chosen, config.parent, path, overwrite=overwrite)
 
-    def show(problem: Problem) -> None:
-        # Of a record alone the remarks are shown already.
-        banners = [] if is_proposal else remarks_banner(problem.remarks)
-        priors = priors_table(problem.posterior.prior)
-        if not quiet:
-            show_report(Report(title="priors", banners=banners, blocks=[priors]))
+        def show(problem: Problem) -> None:
+            # Of a record alone the remarks are shown already.
+            banners = [] if is_proposal else remarks_banner(problem.remarks)
+            priors = priors_table(problem.posterior.prior)
+            if not quiet:
+                show_report(Report(title="priors", banners=banners, blocks=[priors]))
 
-    return finish(folder.path, quiet=quiet, workers=workers, backend=executor, show=show)
+        options = {"workers": workers, "backend": executor, "artist": artist}
+        return finish(folder.path, quiet=quiet, show=show, **options)
 
 
 @click.command()
@@ -126,7 +130,8 @@ def resume(folder: Path, quiet: bool, executor: str | None, **options: Any) -> i
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    return finish(folder, quiet=quiet, backend=executor, **options)
+    with artist_of(options["workers"]) as artist:
+        return finish(folder, quiet=quiet, backend=executor, artist=artist, **options)
 
 
 @click.command()

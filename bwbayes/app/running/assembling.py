@@ -73,7 +73,6 @@ def assemble(
         name: innovations.innovations(alone, theta[0], records[name].start)
         for name, alone, theta in posterior.each(best)
     }
-    departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
     compared = agreement.agreements(
         posterior,
         chain.point,
@@ -81,7 +80,21 @@ def assemble(
         {name: record.start for name, record in records.items()},
     )
     background = Background.of(posterior, flat)
-    failed = any(v.holds is False for v in judged(problem, bands, background, {}).values())
+    unexplained = judged(problem, bands, background, {})
+    result = replace(
+        result,
+        scores={
+            band.name: score(band, scoring(seed, band), background.extent)
+            for band in bands
+            if band.name in unexplained
+        },
+        innovations=series,
+        loops=measure_loops(posterior, chosen),
+        agreement=compared,
+    )
+    artist.draw(result)
+    departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
+    failed = any(verdict.holds is False for verdict in unexplained.values())
     modes = np.concatenate([posterior.prior.unconstrain(best), chain.point.optima])
     explanations = {
         name: explained(
@@ -105,15 +118,7 @@ def assemble(
     source = generator(seed, "checks")
     return replace(
         result,
-        scores={
-            band.name: score(band, scoring(seed, band), background.extent)
-            for band in bands
-            if band.name in verdicts
-        },
         verdicts=verdicts,
-        innovations=series,
-        loops=measure_loops(posterior, chosen),
-        agreement=compared,
         explanations=explanations,
         learned=learned(posterior.prior, result.draws, result.log_density, source),
         replicated={

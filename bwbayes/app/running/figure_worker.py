@@ -1,7 +1,8 @@
-"""Draw a run's pictures, if possible in a process beside this one, which predicts and writes.
+"""Draw what a page shows, if possible in a process beside this one, which predicts and writes.
 
-There each picture is begun as soon as what it shows is known: the draws before predictions are
-made, the bands before they are judged. The pictures are the same as drawn in one process.
+That process loads what draws while this one loads what samples, and begins with each picture as
+soon as what it shows is known: the draws before predictions are made, the bands before they are
+judged. The pictures are the same as drawn in one process.
 """
 
 from __future__ import annotations
@@ -9,57 +10,91 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from bwbayes.app.running.workers import processes
-from bwbayes.report.figures import picture_of, prepare, save_pictures
-from bwbayes.report.figures.pictures import pictures
-from bwbayes.report.report import Picture
-from bwbayes.report.result import Result
+
+# All else is loaded where it is used: an artist begins before anything is loaded.
+if TYPE_CHECKING:
+    from bwbayes.report.page import PagePlots
+    from bwbayes.report.result import Result
+
+# The name under which plots to zoom and hover are drawn; no picture is called so.
+PLOTS = ""
 
 
 class Artist:
-    """Draws in another process what is known already; without one all at the end, in this one."""
+    """Draws in another process what is known already, and at the end in this one what is left."""
 
     def __init__(self, pool: Executor | None = None) -> None:
         self.pool = pool
-        self.begun: dict[str, Future[bytes]] = {}
+        self.begun: dict[str, Future[Any]] = {}
         if pool is not None:
-            pool.submit(prepare)
+            pool.submit(_prepare)
 
     def draw(self, result: Result) -> None:
         """Begin with all that can be seen of a result, but for what was begun before."""
         if self.pool is None:
             return
-        for name, picture in pictures(result).items():
+        for name, work in _works(result).items():
             if name not in self.begun:
-                self.begun[name] = self.pool.submit(picture_of, picture.draw)
+                self.begun[name] = self.pool.submit(work)
 
-    def pictures(self, result: Result, folder: Path) -> dict[str, bytes]:
-        """Wait until all are drawn, write them to the folder, and return PNG by name."""
+    def drawn(self, result: Result, folder: Path) -> tuple[dict[str, bytes], PagePlots]:
+        """Wait until all is drawn; write pictures, PNG by name, to a folder; return all."""
+        from bwbayes.report.figures import save_pictures  # noqa: PLC0415
+        from bwbayes.report.page import NO_PLOTS  # noqa: PLC0415
+
         self.draw(result)
-        images = {name: self._drawn(name, shown) for name, shown in pictures(result).items()}
+        works = _works(result)
+        # From the last to the first: whatever is not begun by then is drawn here.
+        drawn = {name: self._drawn(name, works[name]) for name in reversed(works)}
+        images = {name: drawn[name] for name in works}
+        plots = images.pop(PLOTS, NO_PLOTS)
         save_pictures(images, folder)
-        return images
+        return images, plots
 
-    def _drawn(self, name: str, picture: Picture) -> bytes:
-        if name in self.begun:
+    def _drawn(self, name: str, work: Callable[[], Any]) -> Any:
+        if name in self.begun and not self.begun[name].cancel():
             with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
                 return self.begun[name].result()
-        return picture_of(picture.draw)
+        return work()
+
+
+def _prepare() -> None:
+    """Load what draws, and what its work is made of."""
+    from bwbayes.report import result  # noqa: F401, PLC0415
+    from bwbayes.report.figures import prepare  # noqa: PLC0415
+
+    prepare()
+
+
+def _works(result: Result) -> dict[str, Callable[[], Any]]:
+    """Return what draws each picture of a result and, once its bands are known, the plots."""
+    from bwbayes.report.figures import picture_of, plots_of  # noqa: PLC0415
+    from bwbayes.report.figures.pictures import pictures  # noqa: PLC0415
+
+    works: dict[str, Callable[[], Any]] = {}
+    if result.bands:
+        works[PLOTS] = partial(plots_of, result)
+    for name, picture in pictures(result).items():
+        works[name] = partial(picture_of, picture.draw)
+    return works
 
 
 @contextmanager
-def artist_of(workers: int | None, *, apart: bool) -> Iterator[Artist]:
-    """Give who draws, in a process ``apart`` if that is asked for and several workers may work."""
-    if not apart or 1 in (workers, os.cpu_count()):
+def artist_of(workers: int | None) -> Iterator[Artist]:
+    """Give who draws, in a process of its own if several workers may work."""
+    if 1 in (workers, os.cpu_count()):
         yield Artist()
         return
-    # What is loaded here need not be loaded there, where a process may be copied while it runs.
+    # A process may be copied while it runs.
     copied = sys.platform == "linux" and threading.active_count() == 1
     with processes(1, "fork" if copied else "spawn") as pool:
         yield Artist(pool)

@@ -24,7 +24,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.explaining import chosen_noise
-from bwbayes.app.running.figure_worker import Artist, artist_of
+from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
@@ -77,7 +77,7 @@ def resume(
     engine: Engine | None = None,
     files: bool = True,
     backend: str | Executor | None = None,
-    background: bool = False,
+    artist: Artist | None = None,
     show: Callable[[Problem], None] | None = None,
     answer: Callable[[Fit], None] | None = None,
 ) -> Fit:
@@ -86,15 +86,15 @@ def resume(
     ``workers`` and ``backend`` are as of :func:`~bwbayes.app.running.workers.executor`; the result
     does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or engine;
     another engine has the same posterior, but from here on not the same bits. ``files`` are what a
-    run leaves besides its config, records and chain; in the ``background`` they are drawn by a
-    process of its own. ``show`` and ``answer`` are called with the problem before anything is done
-    with it, and with the fit before its files are written.
+    run leaves besides its config, records and chain; the ``artist``, if any, draws them. ``show``
+    and ``answer`` are called with the problem before anything is done with it, and with the fit
+    before its files are written.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     start_time = time.monotonic()
-    # First of all: it goes on from this process as it is now.
-    with artist_of(workers, apart=background and files) as artist, folder.locked(), one_thread():
+    artist = artist or Artist()
+    with folder.locked(), one_thread():
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
         if targets:
@@ -218,8 +218,6 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
 
 def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done."""
-    from bwbayes.report.figures import interactive  # noqa: PLC0415  # only here it needs bokeh
-
     fit = fit.knowing(folder=folder)
     result, numbers, bands = fit.result, fit.numbers, folder.path / "bands.csv"
     figures = folder.path / "figures"
@@ -230,8 +228,7 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     if result.bands:
         write_bands(bands, result.bands)
     save_result(folder.result, fit.problem, fit.chain, result)
-    # Those to zoom and hover are made here, while others are drawn.
-    plots, pictures = interactive.made(result), artist.pictures(result, figures)
+    pictures, plots = artist.drawn(result, figures)
     page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

@@ -1,9 +1,9 @@
 """Pictures: of a run's loops, bands along time, parameters, chains and coverage, and of products.
 
 :func:`~bwbayes.report.figures.pictures.pictures` says what there is to see of a run, and
-:func:`picture_of` draws it as PNG. This package alone knows matplotlib, Pillow and corner; it opens
-no window and touches no global figure. They are loaded when something is drawn: whoever leaves that
-to another process need not wait.
+:func:`picture_of` draws it as PNG. This package alone knows matplotlib, Bokeh, Pillow and corner;
+it opens no window and touches no global figure. They are loaded when something is drawn: whoever
+leaves that to another process need not wait.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ from bwbayes.report.figures.style import STYLE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["drawn", "picture_of", "prepare", "save_pictures"]
+    from bwbayes.report.page import PagePlots
+    from bwbayes.report.result import Result
+
+__all__ = ["drawn", "picture_of", "plots_of", "prepare", "save_pictures"]
 
 
 def drawn(draw: Callable[..., Figure], *shown: Any) -> Figure:
@@ -37,7 +40,16 @@ def prepare() -> None:
     import corner  # noqa: F401, PLC0415
     from matplotlib.backends import backend_agg  # noqa: F401, PLC0415
 
-    from bwbayes.report.figures import chain  # noqa: F401, PLC0415
+    from bwbayes.report.figures import chain, interactive  # noqa: F401, PLC0415
+
+
+def plots_of(result: Result) -> PagePlots:
+    """Return a run's plots to zoom and hover, and the scripts that draw them, if there are any."""
+    from bwbayes.report.figures import interactive  # noqa: PLC0415
+    from bwbayes.report.page import NO_PLOTS, PagePlots  # noqa: PLC0415
+
+    plots = interactive.draw(result) if result.outcome.converged else {}
+    return PagePlots(plots, interactive.scripts()) if plots else NO_PLOTS
 
 
 def picture_of(draw: Callable[[], Figure]) -> bytes:

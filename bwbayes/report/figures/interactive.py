@@ -26,16 +26,10 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import style
 from bwbayes.report.figures.series import LOOP_KINDS, path, polygons
-from bwbayes.report.page import PagePlots, Script
+from bwbayes.report.page import Script
 from bwbayes.report.result import Result
 
 FONT_SIZE = "13px"
-
-
-def made(result: Result) -> PagePlots:
-    """Return a run's plots and, if there are any, the scripts that draw them."""
-    plots = draw(result) if result.outcome.converged else {}
-    return PagePlots(plots, scripts() if plots else [])
 
 
 def scripts() -> list[Script]:
