@@ -80,12 +80,20 @@ HARMLESS = {
     "case": GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
     "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
     "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
+    "comments below": (GOOD + "\n% 30 samples\n# end").encode(),
 }
 
 
 @pytest.mark.parametrize("content", HARMLESS.values(), ids=HARMLESS)
 def test_harmless_differences_change_nothing(tmp_path: Path, content: bytes) -> None:
     assert read(tmp_path, GOOD).sha256 == read(tmp_path, content).sha256
+
+
+def test_thousands_in_quotes_may_be_marked_by_the_separator(tmp_path: Path) -> None:
+    cells = (row.split(",") for row in ROWS)
+    rows = [f'{t},{u},"{1e3 * float(x):,.1f}"' for t, u, x in cells]
+    record = read(tmp_path, lines(HEADER.replace("_um", "_nm"), *rows))
+    assert pytest.approx(record.displacement, rel=1e-12) == read(tmp_path, GOOD).displacement
 
 
 def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path: Path) -> None:

@@ -66,8 +66,11 @@ def read_text(path: Path) -> Source:
     if is_lvm(text):
         text, interval = plain_lvm(path, text)
     lines = text.split("\n")
-    while lines and not lines[-1].strip():
+    # What programs write below the numbers is no sample, and shows that the last one is whole.
+    is_whole = False
+    while len(lines) > 1 and (not lines[-1].strip() or lines[-1].startswith(("#", "%"))):
         lines.pop()
+        is_whole = True
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     layout = _layout(path, lines)
@@ -84,7 +87,7 @@ def read_text(path: Path) -> Source:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     body = lines[layout.first :]
-    if not text.endswith("\n") and _is_cut(body, layout.separator):
+    if not is_whole and _is_cut(body, layout.separator):
         raise InputError(f"{path}:{len(lines)}: the last line is cut off; remove it")
     _check_fields(path, body, layout, len(names))
     frame, decimal = _parsed(path, body, layout)
@@ -254,9 +257,9 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
     frames = []
     for decimal in ".," if "," in text and layout.separator != "," else ".":
         mark = "." if decimal == "," else ","
-        has_thousands = mark != layout.separator and re.search(
-            rf"\d\{mark}\d{{3}}\{decimal}\d", text
-        )
+        # In quotes they may be those that separate columns as well.
+        begin = '"-?' if mark == layout.separator else ""
+        has_thousands = re.search(rf"{begin}\d+\{mark}\d{{3}}\{decimal}\d", text)
         try:
             frame = pd.read_csv(
                 StringIO(text),
