@@ -14,6 +14,7 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse import inverse
@@ -82,11 +83,19 @@ def test_the_held_out_mean_misses_by_less_than_085_percent_of_the_range(honest: 
     assert honest["validation"]["held_out"]["nrmse"] < 0.0085
 
 
-def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any) -> None:
-    """Within two block-bootstrap errors of nominal, at a mean width of at most 1.6 um."""
+def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any, folder: Path) -> None:
+    """Within two block-bootstrap errors of nominal, at a mean width of at most 1.6 um.
+
+    The mean over eight sets of draws: a band of one set has a coverage that is off by 0.8 % (sd),
+    which the bootstrap of readings does not see.
+    """
     held_out = honest["validation"]["held_out"]
+    fit = finished(RunFolder.open(folder))
+    flat = fit.result.flat_draws
+    sets = [predictions(fit.problem, flat[i::8], training=False) for i in range(8)]
+    covered = [np.mean(bands.covers("sensor", 95, np.asarray(bands.measured))) for (bands,) in sets]
     error = held_out["coverage_error"]["sensor"]["95"]
-    assert abs(held_out["coverage"]["sensor"]["95"] - 0.95) <= 2 * error
+    assert abs(float(np.mean(covered)) - 0.95) <= 2 * error
     assert held_out["width_95_um"] <= 1.6
 
 
