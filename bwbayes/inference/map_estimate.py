@@ -111,7 +111,7 @@ def _places(
     for steps in (False, True):
         least_squares = _LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
-        optima += _valleys(least_squares, [least_squares.optimum(start) for start in starts])
+        optima += _valleys(least_squares, least_squares.optima(starts))
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
     # A place that least squares allows may still have no density: the noise is another one there.
@@ -147,10 +147,10 @@ def _with_noise(
     return winner
 
 
-def _valleys(least_squares: _LeastSquares, places: list[FloatArray]) -> list[FloatArray]:
+def _valleys(least_squares: _LeastSquares, places: FloatArray) -> list[FloatArray]:
     """Keep one place for each distinct optimum of least squares, the best first."""
     same = 1e-2  # optima whose sums of squares and coordinates agree to this part are one
-    costs = least_squares.costs(np.stack(places))
+    costs = least_squares.costs(places)
     distinct: list[int] = []
     for i in np.argsort(costs, kind="stable").tolist():
         separate = [
@@ -214,49 +214,70 @@ class _LeastSquares:
         """Sum of squares (models,)."""
         return np.sum(self.residuals(coordinates) ** 2, axis=1)
 
-    def optimum(self, start: FloatArray) -> FloatArray:
-        """Return the coordinates (free,) of the optimum that ``start`` leads to."""
+    def optima(self, starts: FloatArray) -> FloatArray:
+        """Return the coordinates (starts, free) of the optima that starts (starts, free) lead to.
+
+        By Levenberg and Marquardt's steps, all starts side by side: to simulate a record for many
+        models takes hardly longer than for one. Lengths are in spreads; the damping follows how
+        much of the expected descent a step brings.
+
+        Notes
+        -----
+        K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems,
+        Technical University of Denmark (2004), algorithm 3.16.
+        """
+        optima = np.tile(self.center, (len(starts), 1))
         if not self.physical.any():
-            return self.center
+            return optima[:1]
+        optima[:, self.physical] = starts[:, self.physical]
+        residual, slopes = self._linearized(optima)
+        costs = np.sum(residual**2, axis=1)
+        curvature = slopes @ np.swapaxes(slopes, 1, 2)
+        damping = 1e-3 * np.max(np.diagonal(curvature, axis1=1, axis2=2), axis=1)
+        growth = np.full(len(starts), 2.0)
+        moving = np.flatnonzero(np.isfinite(costs))
+        unit, length = np.eye(slopes.shape[1]), self.spread[self.physical]
+        for _ in range(60):
+            if not moving.size:
+                break
+            gradient = slopes[moving] @ residual[moving, :, np.newaxis]
+            damped = curvature[moving] + damping[moving, np.newaxis, np.newaxis] * unit
+            step = -np.linalg.solve(damped, gradient)[:, :, 0]
+            trial = optima[moving]
+            trial[:, self.physical] += step * length
+            tried, tried_slopes = self._linearized(trial)
+            cost = np.sum(tried**2, axis=1)
+            descent = costs[moving] - cost
+            descends = descent > 0  # not where the place is impossible
+            settled = np.linalg.norm(step, axis=1) < 1e-8
+            settled |= descends & (descent < 1e-8 * costs[moving])
+            worse, better, step = moving[~descends], moving[descends], step[descends]
+            damping[worse] *= growth[worse]
+            growth[worse] *= 2.0
+            expected = np.sum(
+                step * (damping[better, np.newaxis] * step - gradient[descends, :, 0]), axis=1
+            )
+            gain = descent[descends] / expected
+            damping[better] *= np.maximum(1 / 3, 1 - (2 * gain - 1) ** 3)
+            growth[better] = 2.0
+            optima[better], residual[better] = trial[descends], tried[descends]
+            slopes[better], costs[better] = tried_slopes[descends], cost[descends]
+            curvature[better] = slopes[better] @ np.swapaxes(slopes[better], 1, 2)
+            moving = moving[~settled]
+        return optima[np.isfinite(costs)]
 
-        def full(values: FloatArray) -> FloatArray:
-            everywhere = np.tile(self.center, (np.atleast_2d(values).shape[0], 1))
-            everywhere[:, self.physical] = values
-            return everywhere
-
-        steps = 1e-5 * self.spread[self.physical]
-        star = np.concatenate([np.zeros((1, steps.size)), np.diag(steps), -np.diag(steps)])
-        last: list[FloatArray] = []
-
-        def residuals(values: FloatArray) -> FloatArray:
-            # With what the slopes need, in one call: they are asked for at most of these places.
-            here, plus, minus = np.split(self.residuals(full(values + star)), [1, 1 + steps.size])
-            last[:] = here[0], values.copy(), _slopes(here, plus, minus, steps[:, np.newaxis]).T
-            return last[0]
-
-        def jacobian(values: FloatArray) -> FloatArray:
-            if not np.array_equal(values, last[1]):
-                residuals(values)
-            return last[2]
-
-        solution = scipy.optimize.least_squares(
-            residuals,
-            start[self.physical],
-            jac=jacobian,
-            x_scale=self.spread[self.physical],
-            max_nfev=60,
-        )
-        return np.asarray(full(solution.x)[0])
-
-
-def _slopes(here: FloatArray, plus: FloatArray, minus: FloatArray, steps: FloatArray) -> FloatArray:
-    """Slopes (parameters, residuals) from a step either way, or from one if the other has none."""
-    sides = np.stack([plus - minus, plus - here, here - minus])
-    sides /= np.stack([2 * steps, steps, steps])
-    finite = np.isfinite(sides[:, :, :1])
-    first = np.argmax(finite, axis=0)[np.newaxis]
-    slopes: FloatArray = np.take_along_axis(sides, first, axis=0)[0]
-    return np.where(finite.any(axis=0), slopes, 0.0)
+    def _linearized(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (places, rows) and their slopes (places, physical, rows), per spread."""
+        steps = 1e-5 * np.diag(self.spread)[self.physical]
+        star = np.concatenate([np.zeros((1, self.spread.size)), steps, -steps])
+        models = (places[:, np.newaxis] + star).reshape(-1, self.spread.size)
+        values = self.residuals(models).reshape(len(places), len(star), -1)
+        here, plus, minus = np.split(values, [1, 1 + len(steps)], axis=1)
+        # Where one side is impossible, the slope is that of the other; of neither none is known.
+        sides = np.stack([plus - minus, 2 * (plus - here), 2 * (here - minus)])
+        finite = np.isfinite(sides[..., :1])
+        slopes = np.take_along_axis(sides, np.argmax(finite, axis=0)[np.newaxis], axis=0)[0] / 2e-5
+        return here[:, 0], np.where(finite.any(axis=0), slopes, 0.0)
 
 
 @dataclass(frozen=True)
