@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
 
-# An optimum less probable than the best by this much, nats, is not a place to start from: it holds
-# nothing of the posterior, and an ensemble that starts in it stays for hundreds of steps.
-HOPELESS = 30.0
-
 
 @dataclass(frozen=True)
 class PointFit:
@@ -65,7 +61,9 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
             modes.append(mode)
     modes.sort(key=lambda mode: -mode.log_density)
     best = modes[0]
-    worth = [m.position for m in modes if m.log_density > best.log_density - HOPELESS]
+    # One by 30 nats less probable holds nothing of the posterior, and an ensemble that starts there
+    # stays for hundreds of steps.
+    worth = [m.position for m in modes if m.log_density > best.log_density - 30.0]
     optima = distinct(worth, best.covariance)
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 

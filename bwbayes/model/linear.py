@@ -33,9 +33,6 @@ ComplexArray = NDArray[np.complex128]
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
 
-# A filter's coefficient below this is nothing beside those that are about one.
-NOTHING = 1e-200
-
 
 def parse_hold(name: str) -> Hold:
     """Return the hold called "zoh" (zero-order) or "foh" (first-order).
@@ -70,10 +67,10 @@ class Recursion:
     free: FloatArray
 
     def __post_init__(self) -> None:
-        # What decays within a sample to less than any normal number is nothing: a processor takes
-        # ten times as long with such numbers.
+        # What decays within a sample to nearly less than any normal number is nothing: a processor
+        # takes ten times as long with such numbers.
         for taps in (self.numerator, self.denominator, self.free):
-            taps[np.abs(taps) < NOTHING] = 0.0
+            taps[np.abs(taps) < 1e-200] = 0.0
 
     @property
     def unknowns(self) -> int:

@@ -16,9 +16,6 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 
-# Values of the spread: at u/(1 − u) of their scale, for even u.
-CELLS = 400
-
 
 @dataclass(frozen=True)
 class Hyperprior:
@@ -116,7 +113,8 @@ def spreads(likelihoods: NormalLikelihoods, prior: Hyperprior) -> Spreads:
     errors = (
         np.median(likelihoods.precision[informative] ** -0.5) if informative.any() else prior.scale
     )
-    u = np.linspace(0, 1, CELLS + 1)
+    # Values of the spread: at u/(1 − u) of their scale, for even u.
+    u = np.linspace(0, 1, 401)
     center = (u[1:] + u[:-1]) / 2
     size = min(extent + errors, prior.scale)
     with np.errstate(divide="ignore"):

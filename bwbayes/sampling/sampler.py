@@ -53,9 +53,6 @@ from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 
-# Part of the proposed places that walkers must take, or the tuning goes on.
-TAKEN = 0.5
-
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing. A proposal is fitted again to so many more at least.
 FIRST_CHECK = 2
@@ -168,13 +165,14 @@ class _Sampling:
     def _tune(self) -> None:
         """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
 
-        The first is one block. At most 16, or 64 where walkers hardly take any place. A run that
-        goes on within a round fits again to what that round had begun with.
+        The first is one block; others follow until walkers take half of the places, at most 16
+        blocks in all, or 64 where walkers hardly take any place. A run that goes on within a round
+        fits again to what that round had begun with.
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
         begin, end, rate = 0, 1, 0.0
-        while rate < TAKEN and end <= (16 if rate > 0.25 else 64):
+        while rate < 0.5 and end <= (16 if rate > 0.25 else 64):
             if chain.blocks("tuning") < end:
                 chain.freeze("tuning", proposal)
             while chain.blocks("tuning") < end:

@@ -24,8 +24,6 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.sampling.storage import ChainFile
 
-PACKAGE = "bwbayes."
-
 
 def state_of(problem: Problem, chain: ChainFile) -> str:
     """Return a digest of all that a result depends on."""
@@ -103,7 +101,7 @@ def _object_of(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     if "class" not in value:
         return items
     module, _, name = value["class"].partition(":")
-    if not module.startswith(PACKAGE):
+    if not module.startswith("bwbayes."):
         raise ValueError(f"{value['class']} is no class of this package")
     made = getattr(import_module(module), name)
     if not isinstance(made, type) or _names_of(made) is None:

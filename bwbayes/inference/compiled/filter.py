@@ -28,12 +28,6 @@ from bwbayes.inference.compiled.lanes import (
 # fmt: on
 # isort: on
 
-# A covariance that changes by less of itself over a reading has settled.
-SETTLED = 2e-15
-
-# An estimate that follows its response to this part of it does not do so better.
-ROUNDING = 1e-13
-
 
 @inner(fastmath={"contract", "nsz"})
 def follow(
@@ -150,7 +144,7 @@ def is_tracked(
         at, rho = series[k] * LANES, decays[k]
         for i in range(LANES):
             response = state[RESPONSE + at + i]
-            size = ROUNDING * abs(response)
+            size = 1e-13 * abs(response)
             if not abs(state[ESTIMATE + at + i] - response * _part(state, second, i, rho)) <= size:
                 return False
             if second is not None:
@@ -163,10 +157,10 @@ def is_tracked(
 
 @inner()
 def is_settled(state: FloatArray) -> bool:
-    """Tell whether no model's covariance changed by the last reading."""
+    """Tell whether no model's covariance changed by the last reading, but for rounding."""
     settled = True
     for i in range(LANES):
-        settled &= state[CHANGE + i] <= SETTLED * state[COVARIANCE + i]
+        settled &= state[CHANGE + i] <= 2e-15 * state[COVARIANCE + i]
     return settled
 
 

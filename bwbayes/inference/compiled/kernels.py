@@ -32,12 +32,6 @@ from bwbayes.inference.compiled.lanes import (
 from bwbayes.inference.compiled.motion import PIECE, displace
 from bwbayes.inference.compiled.stages import Kind, drive_of
 
-# Fewer until the filter has settled and forgotten the start, which is looked at after each piece.
-SHORT_PIECE = 32
-
-# What is below this part of its size at the start adds nothing.
-FORGOTTEN = 1e-18
-
 
 @inner()
 def _one_by_one(
@@ -128,14 +122,15 @@ def _add_products(
 def _is_heard(state: FloatArray, series: int) -> bool:
     """Tell whether any model's filter still hears of the unknown start in one of its series.
 
-    What a model no longer hears is nothing from now on: numbers that decay for ever come below the
-    normal ones, with which a processor takes ten times as long.
+    What is below 10⁻¹⁸ of its size at the start adds nothing. What a model no longer hears is
+    nothing from now on: numbers that decay for ever come below the normal ones, with which a
+    processor takes ten times as long.
     """
     heard = False
     for i in range(series * LANES, (series + 1) * LANES):
         response = max(abs(state[RESPONSE + i]), abs(state[RESPONSE_2 + i]))
         estimate = max(abs(state[ESTIMATE + i]), abs(state[ESTIMATE_2 + i]))
-        if max(response, estimate) > FORGOTTEN:
+        if max(response, estimate) > 1e-18:
             heard = True
         else:
             state[RESPONSE + i] = state[RESPONSE_2 + i] = 0.0
@@ -232,7 +227,8 @@ def sums(
         # Not a literal, which numba would compile all that follows for a second time.
         now, steady = int(np.int64(0)), False
         while now < voltage.size:
-            last = min(now + (PIECE if steady else SHORT_PIECE), voltage.size)
+            # Short until the filter has settled and forgotten the start, as it is asked after each.
+            last = min(now + (PIECE if steady else 32), voltage.size)
             complete = steady and gaps[now] == 0
             if complete:
                 # As far as every sample has a reading.

@@ -24,9 +24,6 @@ from bwbayes.model.operators.preisach import DENSITY
 # the ramp for a bell.
 WIDEST = 10.0
 
-# A width on its bound may exceed it by rounding.
-ROUNDED = 1 + 1e-9
-
 # Beyond this many bells no relays are left: tanh is one to machine precision.
 SATURATED = 20.0
 
@@ -82,7 +79,8 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         super().check(column)
-        wide = column["width"] > WIDEST * ROUNDED * column["saturation"]
+        # A width on its bound may exceed it by rounding.
+        wide = column["width"] > WIDEST * (1 + 1e-9) * column["saturation"]
         refuse("width", wide, column["width"], f"must be at most {WIDEST:g} times saturation")
 
     def numbers(self, column: Values) -> FloatArray:
