@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.map_estimate import PointFit, fit, peaks
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.test_validation_end_to_end import made
@@ -27,6 +30,32 @@ def fits() -> dict[str, tuple[Posterior, PointFit]]:
 
 
 Fits = dict[str, tuple[Posterior, PointFit]]
+
+
+@pytest.mark.parametrize("steps", [False, True])
+def test_least_squares_side_by_side_come_as_low_as_scipys(steps: bool) -> None:
+    """From each of four prior draws, good starts or bad ones, to the optimum that scipy finds."""
+    posterior = case("lag")
+    prior = posterior.prior
+    draws = prior.unconstrain(prior.draw(np.random.default_rng(4), 100))
+    center, spread = np.median(draws, axis=0), np.std(draws, axis=0)
+    problem = LeastSquares(posterior, center, spread, steps=steps)
+    starts = draws[:4]
+
+    def residuals(physical: FloatArray) -> FloatArray:
+        place = center.copy()
+        place[problem.physical] = physical
+        residual: FloatArray = problem.residuals(place[np.newaxis])[0]
+        return residual
+
+    lowest = [
+        2 * least_squares(residuals, start, x_scale=spread[problem.physical], jac="3-point").cost
+        for start in starts[:, problem.physical]
+    ]
+    costs = problem.costs(problem.optima(starts))
+    assert np.min(costs) <= np.min(lowest) * (1 + 1e-6)
+    # One may end in another valley.
+    assert np.sum(costs <= np.array(lowest) * (1 + 1e-3)) >= 3
 
 
 @pytest.mark.parametrize("name", CASES)
