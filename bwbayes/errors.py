@@ -9,13 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
+from enum import IntEnum
 from shlex import quote
-
-# How alike two words must be, from 0 to 1, for one to be a misspelling of the other.
-ALIKE = 0.6
 
 # Of a longer text, as a stranger's file may cause, the beginning and the end are shown.
 LONGEST = 600
+
+
+class ExitStatus(IntEnum):
+    """What a command ends with; those that build on a run end with that run's."""
+
+    SUCCESS = 0
+    INVALID_INPUT = 2
+    VALIDATION_FAILED = 3
+    NOT_CONVERGED = 4
+    VALIDATION_INCONCLUSIVE = 5
+    INTERRUPTED = 130
 
 
 class InputError(ValueError):
@@ -88,7 +97,7 @@ def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | 
     meant = (meanings or {}).get(word.lower().replace("-", "_"))
     if meant in known:
         return f"did you mean {meant}?"
-    near = get_close_matches(word, known, 1, ALIKE)
+    near = get_close_matches(word, known, 1)
     return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
 
 

@@ -19,9 +19,6 @@ MOST_LINES, LONGEST = 12, 1200
 # Characters of a line, and of a value in it.
 WIDTH, VALUE = 96, 70
 
-# What shows itself shortly.
-PLAIN = (bool, int, float, complex, str, bytes, slice, Path)
-
 # An array with at most so many numbers is shown by them.
 FEW = 4
 
@@ -79,7 +76,10 @@ def _value(value: Any, *, nested: bool = True) -> str:
         line = f"{type(value).__name__}({', '.join(parts)})"
         return line if len(line) <= VALUE else f"{type(value).__name__}(...)"
     plain = value.item() if isinstance(value, np.generic) else value
-    if plain is None or isinstance(plain, PLAIN):
+    # These show themselves shortly.
+    if plain is None or isinstance(
+        plain, bool | int | float | complex | str | bytes | slice | Path
+    ):
         return f"{plain:.6g}" if isinstance(plain, float) else _cut(repr(plain))
     return str(getattr(value, "__name__", f"{type(value).__name__}(...)"))
 

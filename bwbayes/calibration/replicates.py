@@ -37,9 +37,6 @@ from bwbayes.shown import brief
 # Draws that a truth is ranked among.
 RANKED = 199
 
-# What is ranked besides the free parameters.
-EXTRA = ("log_likelihood", "opening", "range")
-
 
 class Entry(TypedDict):
     """A replicate as it is stored.
@@ -111,7 +108,7 @@ class Experiment:
     @property
     def statistics(self) -> tuple[str, ...]:
         """Names of what is ranked."""
-        return (*self.posterior.names, *EXTRA)
+        return (*self.posterior.names, "log_likelihood", "opening", "range")
 
     @property
     def bands(self) -> tuple[str, ...]:

@@ -21,9 +21,6 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
 from bwbayes.sampling.proposals import StudentMixture
 
-# Draws that the mixture is fitted to, and draws at the other end, at most.
-MAX_DRAWS = 20_000
-
 
 class Bridge(NamedTuple):
     """The log of an unknown integral, nats, its standard error, and effective draws behind it."""
@@ -95,14 +92,15 @@ def evidence(
     coordinates = coordinates.reshape(draws.shape)
     half = draws.shape[1] // 2
     fitted = coordinates[:, :half].reshape(-1, free)
-    fitted = fitted[:: max(len(fitted) // MAX_DRAWS, 1)]
+    most_draws = 20_000  # that the mixture is fitted to, and at the other end
+    fitted = fitted[:: max(len(fitted) // most_draws, 1)]
     mass, mass_error = log_prior_mass(posterior.prior, generator)
     try:
         proposal = StudentMixture.fitted(fitted)
     except np.linalg.LinAlgError:  # too few draws
         highest = float(np.max(log_likelihood))
         return Evidence(np.nan, np.inf, mass, 0.0, max_log_likelihood=highest)
-    thin = max(log_density[:, half:].size // MAX_DRAWS, 1)
+    thin = max(log_density[:, half:].size // most_draws, 1)
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))

@@ -18,16 +18,6 @@ from typing import Any
 
 from bwbayes.errors import InputError
 
-# NumPy's names of functions that math.h calls otherwise.
-MATH_NAMES = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
-
-# Arguments of these names are arrays; all others are numbers.
-ARRAYS = {
-    "parameters": "const double *parameters",
-    "memory": "const double *memory",
-    "after": "double *after",
-}
-
 
 def c_functions(function: Callable[..., Any], lengths: Mapping[str, int], prefix: str) -> str:
     """Return a function and those that it calls as static functions of C, callees first.
@@ -99,7 +89,9 @@ class _Printer(ast.NodeTransformer):
         returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
         results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
         names = [argument.arg for argument in tree.args.args]
-        arguments = [ARRAYS.get(name, f"double {name}") for name in names]
+        # Arguments of these names are arrays; all others are numbers.
+        kinds = {"parameters": "const double *", "memory": "const double *", "after": "double *"}
+        arguments = [f"{kinds.get(name, 'double ')}{name}" for name in names]
         arguments += [f"double *result_{number}" for number in range(1, results)]
         return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"
 
@@ -236,7 +228,9 @@ class _Printer(ast.NodeTransformer):
         arguments = ", ".join([*map(self.text, node.args), *pointers])
         match node.func:
             case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
-                return f"{MATH_NAMES.get(name, name)}({arguments})"
+                # What math.h calls otherwise.
+                others = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
+                return f"{others.get(name, name)}({arguments})"
             case ast.Name(id=name):
                 function = self.function.__globals__.get(name)
                 if inspect.isfunction(function):

@@ -306,7 +306,7 @@ def _sensitivities(
     From draws (draws, free), taken as one chain: weights depend on no order.
     """
     import arviz_base  # noqa: PLC0415  # slow to load
-    from arviz_stats import psense  # type: ignore[attr-defined]  # noqa: PLC0415
+    from arviz_stats import psense  # noqa: PLC0415
 
     tree = arviz_base.from_dict(
         {

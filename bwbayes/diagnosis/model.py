@@ -19,10 +19,6 @@ from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 
-# Operators that are tried: compiled ones, each of another family, and plays of any weights, which
-# follow loops that no formula has.
-OPERATORS = ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem")
-
 
 def nonlinearity(scene: Scene) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
@@ -71,7 +67,9 @@ def hold(scene: Scene) -> Iterator[Explanation]:
 def operator(scene: Scene) -> Iterator[Explanation]:
     """Try other hysteresis operators."""
     present = type(scene.posterior.only.actuator.hysteresis)
-    for name in OPERATORS:
+    # Compiled ones, each of another family, and plays of any weights, which follow loops that no
+    # formula has.
+    for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
         changes = {"hysteresis": name}
         posterior = scene.rebuilt(changes)
         if posterior is None or type(posterior.only.actuator.hysteresis) is present:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from bwbayes.diagnosis.validation import STATUSES, Verdict
+from bwbayes.errors import ExitStatus
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,10 @@ class Standing:
         return STATUSES[self.holds]
 
     @property
-    def exit_status(self) -> int:
+    def exit_status(self) -> ExitStatus:
         """What a command ends with that builds on it."""
-        return {True: 0, False: 3, None: 5}[self.holds]
+        statuses = {False: ExitStatus.VALIDATION_FAILED, None: ExitStatus.VALIDATION_INCONCLUSIVE}
+        return statuses.get(self.holds, ExitStatus.SUCCESS)
 
     @property
     def headline(self) -> str:

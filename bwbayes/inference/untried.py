@@ -34,9 +34,6 @@ from bwbayes.model.reversals import time_between_turns
 # Strengths a decade of time apart are alike: creep goes with the logarithm of the time.
 ALIKE = 0.9
 
-# Creep that is so many times as fast as the drive between turning points is part of its gain.
-FAST = 100.0
-
 # Step of the slopes, in prior sds, and steps to the mode.
 STEP, ROUNDS = 1e-3, 4
 
@@ -93,8 +90,9 @@ def _creep(posterior: Posterior, duration: float) -> Creep:
         time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
         for dataset in posterior.datasets
     ]
+    # Creep that is a hundred times as fast as the drive between turning points is part of its gain.
     interval = max(
-        min(dataset.actuator.interval for dataset in posterior.datasets), min(turns) / FAST
+        min(dataset.actuator.interval for dataset in posterior.datasets), min(turns) / 100
     )
     longest = max(
         dataset.voltage.size * dataset.actuator.interval for dataset in posterior.datasets

@@ -29,9 +29,6 @@ from bwbayes.model.step import OneStateStep
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100
 
-# With a rate below zero, h has left any start and passed zero when it has grown by exp of this.
-LARGEST = 100.0
-
 # With a rate below zero, h = α / c is a state of unstable rest, and for β = 0 it is the ceiling
 # itself. A start that rounding puts on it or beyond is taken to lie this fraction of the way there.
 INSIDE = 1 - 1e-14
@@ -224,7 +221,8 @@ def third(z: Any) -> Any:
 def phi(z: Any) -> Any:
     """Return φ₁(−z) = (1 − exp(−z))/z, by its series where z is small."""
     if anywhere(np.abs(z) > SHORT):
-        grown = np.expm1(np.minimum(-z, LARGEST))
+        # With a rate below zero, h has left any start and passed zero when it grew by exp(100).
+        grown = np.expm1(np.minimum(-z, 100.0))
         return select(z == 0.0, 1.0, -grown / select(z == 0.0, 1.0, z))
     return series(z)
 

@@ -18,10 +18,6 @@ import scipy
 
 from bwbayes.arrays import FloatArray, Floating
 
-# Values of the mixture at a sample, at least: one of each of as many draws as predictions take, so
-# that a quantile is as sure as the draws themselves make it.
-VALUES = 1000
-
 
 def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     """Draw standard normal scores for posterior draws, (scores, draws).
@@ -31,7 +27,8 @@ def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     0 ... S - 1. So each draw has a score in each of K equal parts of the probability, and all
     together have one in each of S K.
     """
-    each = -(-VALUES // draws)
+    # One value of each of as many draws as predictions take: quantiles are as sure as the draws.
+    each = -(-1000 // draws)
     ranks = rng.permuted(np.tile(np.arange(draws), (each, 1)), axis=1)
     below = (np.arange(each)[:, np.newaxis] + (ranks + 0.5) / draws) / each
     scores: FloatArray = scipy.special.ndtri(below)

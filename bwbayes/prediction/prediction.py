@@ -35,9 +35,6 @@ DRAWS = 1000
 # of two: rows of draws that far apart would take each other's place in it.
 PIECE = 400
 
-# Threads that summarize pieces, while this one simulates the next.
-THREADS = 2
-
 
 @dataclass(frozen=True)
 class _Draws:
@@ -205,8 +202,8 @@ def _bands(
             joined[key][first : first + values.size] = values
         watch(values.size)
 
-    begin = 0
-    with ThreadPoolExecutor(THREADS) as executor:
+    begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
+    with ThreadPoolExecutor(threads) as executor:
         for simulated in mixed.start.pieces(record.voltage[: window.stop], PIECE):
             first, begin = max(begin, window.start), begin + simulated.shape[1]
             if begin <= first:
@@ -216,7 +213,7 @@ def _bands(
             pending.append((first - window.start, work))
             totals += inside.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
-            if len(pending) > THREADS:
+            if len(pending) > threads:
                 put()
         while pending:
             put()

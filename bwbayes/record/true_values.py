@@ -19,8 +19,10 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 
-# The ring bender driven at 1 Hz by 100 V.
-RING_BENDER = Ranges(100.0, 62.0, 0.0, 0.5, 0.0, 1e-3, 16.0)
+# The paper's ring bender on its identification signal: +-100 V at 1 Hz, +-62 um.
+RING_BENDER = Ranges(
+    voltage=100.0, displacement=62.0, middle=0.0, time=0.5, interval=1e-3, duration=16.0
+)
 
 # Priors that other parameters' bounds cut, and priors about zero, say little by their medians.
 # Loops of the ring bender at 100 V, and terms beside it that show.

@@ -22,9 +22,6 @@ from markupsafe import Markup, escape
 
 from bwbayes.report.report import Report, Table
 
-# What a cell with a number begins with, or what stands for a number that is not known.
-NUMBER = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
-
 
 @dataclass(frozen=True)
 class Script:
@@ -72,6 +69,8 @@ def fragment(report: Report) -> str:
 
 def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment:
     """Return the room of the templates, which know pictures and plots by name."""
+    # What a cell with a number begins with, or what stands for a number that is not known.
+    number = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
     environment = Environment(
         loader=PackageLoader("bwbayes.report"),
         autoescape=True,
@@ -86,7 +85,7 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
         "csv_link": csv_link,
         # Whether each column holds words, which go to the left.
         "is_wordy": lambda rows: [
-            not all(map(NUMBER.match, column)) for column in zip(*rows, strict=True)
+            not all(map(number.match, column)) for column in zip(*rows, strict=True)
         ],
         # The titles above those of the columns, but the first, with how many each spans.
         "spans": lambda columns: [

@@ -12,8 +12,6 @@ from rich.table import Table as Grid
 
 from bwbayes.report.report import Banner, Facts, Report, Table, Text
 
-COLORS = {"good": "green", "note": "yellow", "bad": "red"}
-
 
 def show(report: Report, console: Console) -> None:
     """Show the banners of a report, and the tables and texts that are meant for a screen."""
@@ -37,7 +35,8 @@ def as_text(report: Report, width: int = 110) -> str:
 
 
 def _show_banner(banner: Banner, console: Console) -> None:
-    color, lines = COLORS[banner.kind], [escape(_plain(line)) for line in banner.lines]
+    color = {"good": "green", "note": "yellow", "bad": "red"}[banner.kind]
+    lines = [escape(_plain(line)) for line in banner.lines]
     headline = f"[bold {color}]{escape(_plain(banner.headline))}[/]"
     label = escape(banner.label) or headline
     if lines or not banner.items:

@@ -40,8 +40,6 @@ EQUAL = 1e-6
 # Steps in autocorrelation times, before which no estimate of it can be trusted.
 LENGTH = 50
 
-TAIL = (0.05, 0.95)
-
 
 @dataclass(frozen=True)
 class Check:
@@ -262,7 +260,9 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
     tail are worth another number.
     """
     # A comparison would take what is not a number for a draw beyond the tail.
-    tails = [np.where(np.isnan(scores), np.nan, scores <= scipy.special.ndtri(p)) for p in TAIL]
+    tails = [
+        np.where(np.isnan(scores), np.nan, scores <= scipy.special.ndtri(p)) for p in (0.05, 0.95)
+    ]
     means = np.mean(values, axis=2)
     series = (scores, *tails, as_chains(values), means.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -338,6 +338,6 @@ def autocorrelation_time(chains: FloatArray) -> float:
 
 def _arviz() -> Any:
     """Return arviz's statistics, which are slow to load."""
-    from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # noqa: PLC0415
+    from arviz_stats.base import array_stats  # noqa: PLC0415
 
     return array_stats

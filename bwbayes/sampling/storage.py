@@ -77,7 +77,8 @@ class ChainFile(Chain):
         text = {"format": FORMAT, "block": block, "attributes": created._attributes}
         start = {"text": json.dumps(text)} | _arrays_of(chain.proposals["pilot"])
         start |= {f"point_{field.name}": getattr(point, field.name) for field in fields(point)}
-        start |= {name: np.stack([getattr(s, name) for s in chain.starts]) for name in _STATE}
+        for name in (field.name for field in fields(EnsembleState)):
+            start[name] = np.stack([getattr(state, name) for state in chain.starts])
         _create_folder(path, {"start": start})
         return created
 
@@ -194,7 +195,7 @@ class ChainFile(Chain):
             raise ValueError(f"its format is {text['format']}, this version reads {FORMAT}")
         point = {field.name: arrays[f"point_{field.name}"] for field in fields(PointFit)}
         point["log_density"] = float(point["log_density"])
-        states = zip(*(arrays[name] for name in _STATE), strict=True)
+        states = zip(*(arrays[field.name] for field in fields(EnsembleState)), strict=True)
         starts = [EnsembleState(*state) for state in states]
         begun = cls(path, PointFit(**point), starts, text["block"], text["attributes"])
         begun.proposals["pilot"] = StudentMixture.of_arrays(arrays)
@@ -213,9 +214,6 @@ class ChainFile(Chain):
         # Blocks are lost from the end: then all that are left count again.
         if aside is not None and aside["blocks"] <= len(self.history("sampling")):
             Chain.fall_back(self, int(aside["blocks"]), StudentMixture.of_arrays(aside))
-
-
-_STATE = ("coordinates", "log_density", "random_state")
 
 
 def _load(folder: Path, name: str) -> Arrays | None:

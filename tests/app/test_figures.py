@@ -20,7 +20,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.report.figures import interactive
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
-from bwbayes.report.figures.style import MEAN_COLOR, envelope, zigzag
+from bwbayes.report.figures.style import Color, envelope, zigzag
 from tests.app import example
 
 
@@ -143,7 +143,7 @@ def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
                 polygons = [np.asarray(corners) for corners in path.to_polygons()]
                 assert all(np.ptp(corners[:, 0]) < 1.01 for corners in polygons)
     whole = draw_loop([bands]).axes[0]
-    sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == MEAN_COLOR]
+    sizes = [np.size(line.get_xdata()) for line in whole.lines if line.get_color() == Color.MEAN]
     assert 2 == len(sizes)
     every = interactive._series(bands).references()
     times = [np.asarray(one.data["time"]) for one in every if isinstance(one, ColumnDataSource)]

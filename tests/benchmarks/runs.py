@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from arviz_stats.base import array_stats  # not in an __all__
 from emcee.moves import StretchMove
 
 from bwbayes.app.config.config import load
@@ -34,7 +34,7 @@ from bwbayes.calibration.replicates import replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.diagnostics import TAIL, Check, Outcome, as_chains
+from bwbayes.sampling.diagnostics import Check, Outcome, as_chains
 from bwbayes.sampling.ensemble import advance
 from bwbayes.sampling.moves import sampling_moves
 from bwbayes.sampling.sampler import first_chain, sample
@@ -138,7 +138,7 @@ def draws_per_step(posterior: Posterior, state: EnsembleState, steps: int) -> fl
     ess = [
         min(
             array_stats.ess(chains, method="bulk"),
-            array_stats.ess(chains, method="tail", prob=TAIL),
+            array_stats.ess(chains, method="tail", prob=(0.05, 0.95)),
         )
         for chains in map(as_chains, columns)
     ]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
@@ -88,7 +88,7 @@ def weighted_draws(
     places, ratio = _tried(posterior, proposal, random, DRAWS)
     # A place that is not possible has a weight of next to none; arviz takes finite ones alone.
     lowest = np.min(ratio, where=np.isfinite(ratio), initial=0.0) - 100.0
-    smoothed, _ = array_stats.psislw(-np.maximum(ratio, lowest))  # type: ignore[no-untyped-call]
+    smoothed, _ = array_stats.psislw(-np.maximum(ratio, lowest))
     weights = np.exp(smoothed - np.max(smoothed)) * np.isfinite(ratio)
     return posterior.prior.constrain(places)[0], weights / np.sum(weights)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]  # not in an __all__
+from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.diagnostics import (

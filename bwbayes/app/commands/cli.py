@@ -18,12 +18,12 @@ from concurrent.futures.process import BrokenProcessPool
 
 import click
 
-from bwbayes.app.commands.ending import BAD_INPUT, INTERRUPTED, NOT_CONVERGED, as_typed
+from bwbayes.app.commands.ending import as_typed
 from bwbayes.app.commands.fitting import check, init, report, resume, run
 from bwbayes.app.commands.options import WithParts
 from bwbayes.app.commands.products import compensate, design, export, predict, track
 from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
-from bwbayes.errors import ColumnsError, InputError, NotConvergedError, one_line
+from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
 
 
 @click.command()
@@ -80,11 +80,11 @@ def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
 
 def _failure(error: BaseException) -> tuple[str, int]:
     """Return the line that says what went wrong, and the exit status; raise what is a defect."""
-    text, status = str(error), BAD_INPUT
+    text, status = str(error), ExitStatus.INVALID_INPUT
     match error:
         case NotConvergedError():
             text = text.removeprefix("not converged: ")
-            return f"NOT CONVERGED: {as_typed(text)}", NOT_CONVERGED
+            return f"NOT CONVERGED: {as_typed(text)}", ExitStatus.NOT_CONVERGED
         case ColumnsError():
             text = str(error.in_config())
         case InputError():
@@ -105,7 +105,7 @@ def _failure(error: BaseException) -> tuple[str, int]:
         case MemoryError():
             text = "out of memory; use a shorter record or fewer `sampling.walkers`"
         case KeyboardInterrupt() | click.Abort():
-            text, status = "interrupted", INTERRUPTED
+            text, status = "interrupted", ExitStatus.INTERRUPTED
         case _:
             raise error
     return f"bwbayes: {as_typed(text)}", status

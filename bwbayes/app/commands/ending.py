@@ -17,16 +17,12 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
-from bwbayes.errors import InputError
+from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
     from bwbayes.diagnosis.standing import Standing
     from bwbayes.report.report import Report
-
-BAD_INPUT = 2
-NOT_CONVERGED = 4
-INTERRUPTED = 130
 
 
 def show_report(report: Report) -> None:
@@ -44,7 +40,7 @@ def resumable(command: str) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         click.echo(f"interrupted; resume with {command}", err=True)
-        raise click.exceptions.Exit(INTERRUPTED) from None
+        raise click.exceptions.Exit(ExitStatus.INTERRUPTED) from None
 
 
 def require_new_or_resumed(
@@ -99,7 +95,7 @@ def finish(
             f"`{fit.resuming}`, and look at the traces in {path}/report.html",
             err=True,
         )
-        return NOT_CONVERGED
+        return ExitStatus.NOT_CONVERGED
     # The screen begins with how the bands do.
     for line in fit.standing.said if quiet else ():
         click.echo(line, err=True)

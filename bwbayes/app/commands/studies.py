@@ -9,7 +9,6 @@ import click
 from rich.console import Console
 
 from bwbayes.app.commands.ending import (
-    NOT_CONVERGED,
     present,
     require_new_or_resumed,
     resumable,
@@ -17,7 +16,7 @@ from bwbayes.app.commands.ending import (
 )
 from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_option, seed_option
 from bwbayes.app.config.limits import USUAL_MODELS
-from bwbayes.errors import InputError
+from bwbayes.errors import ExitStatus, InputError
 
 
 @click.command()
@@ -86,7 +85,7 @@ def calibrate(
     first, *others = calibration.shortcomings
     more = f", and {len(others)} more" if others else ""
     click.echo(f"CALIBRATION FAILED: {first}{more}; see {page}", err=True)
-    return NOT_CONVERGED
+    return ExitStatus.NOT_CONVERGED
 
 
 @click.command()
@@ -192,5 +191,5 @@ def compare(
     status = present(comparison.report(), [page], comparison.standing, quiet=quiet)
     if comparison.recommended is None:
         click.echo("NOT CONVERGED: no model has converged, so none is recommended", err=True)
-        return NOT_CONVERGED
+        return ExitStatus.NOT_CONVERGED
     return status

@@ -20,16 +20,12 @@ from bwbayes.app.config.keys import ANY, Key, keys, synonyms
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.creep import Creep
-from bwbayes.model.declaration import Context, Declaration, Ranges
+from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
 from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
+from bwbayes.record.true_values import RING_BENDER
 from bwbayes.record.waveforms import signal_names
-
-# The paper's ring bender on its identification signal: +-100 V at 1 Hz, +-62 um.
-RING_BENDER = Ranges(
-    voltage=100.0, displacement=62.0, middle=0.0, time=0.5, interval=1e-3, duration=16.0
-)
 
 Maker = Callable[..., Any]
 

@@ -19,7 +19,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
+from bwbayes.errors import ExitStatus, InputError
 from bwbayes.population.population import Population, PopulationParameter, next_specimen
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 
 # How a record ended, in the order in which they matter, and the exit status of each.
 STATUSES = {
-    "refused": 2,
-    "not converged": 4,
-    "validation failed": 3,
-    "validation inconclusive": 5,
-    "passed": 0,
+    "refused": ExitStatus.INVALID_INPUT,
+    "not converged": ExitStatus.NOT_CONVERGED,
+    "validation failed": ExitStatus.VALIDATION_FAILED,
+    "validation inconclusive": ExitStatus.VALIDATION_INCONCLUSIVE,
+    "passed": ExitStatus.SUCCESS,
 }
 
 
@@ -108,9 +108,9 @@ class Campaign(Product):
         return {status: counted[status] for status in STATUSES}
 
     @property
-    def exit_status(self) -> int:
+    def exit_status(self) -> ExitStatus:
         """The status of the command: 2 if records were refused, else 4, 3, 5 or 0 as of a run."""
-        return next((s for name, s in STATUSES.items() if self.counts[name]), 0)
+        return next((s for name, s in STATUSES.items() if self.counts[name]), ExitStatus.SUCCESS)
 
     @property
     def outliers(self) -> dict[str, list[str]]:

@@ -22,18 +22,17 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 
-# Keys of a config that a chain does not depend on; of tables, everything in them. The record is
-# compared by its readings, not by its file's name.
-FREE_TO_CHANGE = re.compile(
-    r"(name|stand|truth|validation|sampling\.(engine|ess|steps|pilot_steps)"
-    r"|record\.([^.]+\.)?(file|remarks|signal)|parameters\..*\.(label|description))(\..*)?"
-)
-
 
 def fingerprint(config: Config) -> str:
     """Return what a chain notes of a resolved config: its keys and values, as JSON."""
     values = dict(_flat(config.model_dump(exclude_none=True)))
-    noted = {key: value for key, value in values.items() if not FREE_TO_CHANGE.fullmatch(key)}
+    # Keys that a chain does not depend on; of tables, everything in them. The record is compared by
+    # its readings, not by its file's name.
+    free_to_change = re.compile(
+        r"(name|stand|truth|validation|sampling\.(engine|ess|steps|pilot_steps)"
+        r"|record\.([^.]+\.)?(file|remarks|signal)|parameters\..*\.(label|description))(\..*)?"
+    )
+    noted = {key: value for key, value in values.items() if not free_to_change.fullmatch(key)}
     return json.dumps({"coordinates": COORDINATES, **noted})
 
 

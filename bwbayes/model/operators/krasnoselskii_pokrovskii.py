@@ -24,9 +24,6 @@ from bwbayes.model.operators.preisach import DENSITY
 # the ramp for a bell.
 WIDEST = 10.0
 
-# Beyond this many bells no relays are left: tanh is one to machine precision.
-SATURATED = 20.0
-
 # artanh(w) / w − 1 by so many terms of its series, to 2e-16 of itself, where w² is no larger.
 SMALL, TERMS = 0.01, 8
 
@@ -89,7 +86,8 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
         sinh = np.sinh(omega)
         height = 2 * column["rayleigh"] * scale**2
         height *= np.divide(sinh, omega, where=omega > 0, out=np.ones_like(omega))
-        limit = (omega / 2 + SATURATED) * scale
+        # Beyond twenty bells no relays are left: tanh is one to machine precision.
+        limit = (omega / 2 + 20.0) * scale
         return np.column_stack([column["d"], scale, height, sinh, np.cosh(omega), limit])
 
     @staticmethod

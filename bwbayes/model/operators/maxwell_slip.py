@@ -19,9 +19,6 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 
 ELEMENT = "alpha_"
 
-# The slope just after a turn may be below zero by rounding, in units of d.
-ROUNDING = 1e-9
-
 
 @dataclass(frozen=True)
 class MaxwellSlip(Plays):
@@ -67,7 +64,7 @@ class MaxwellSlip(Plays):
     def check(self, column: Values) -> None:
         """Raise an InputError that names the parameter where a model is outside of the domain."""
         super().check(column)
-        back = self.slope(column) < -ROUNDING * column["d"]
+        back = self.slope(column) < -1e-9 * column["d"]  # by rounding it may be below zero
         demand = "must not be less than the sum of all alpha, or the displacement turns back"
         refuse("d", back, column["d"], demand)
 

@@ -24,18 +24,13 @@ from bwbayes.record.io.series import Series, Source
 
 QUANTITIES = ("time", "voltage", "displacement")
 
-# Units: a prefix's power of ten and a base unit, and the power that leads from it to s, V or um.
+# The powers of ten of units' prefixes.
 _PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
-_BASES = {"time": ("s", 0), "voltage": ("V", 0), "displacement": ("m", 6), "truth": ("m", 6)}
 _COMMON_UNITS = {
     "time": ("s", "ms", "us"),
     "voltage": ("V", "mV", "kV"),
     "displacement": ("um", "nm", "mm", "m"),
 }
-_WRITTEN_OUT = re.compile(
-    r"(pico|nano|micro|milli|kilo|)(?:(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?))",
-    re.IGNORECASE,
-)
 # What other people call the quantities, in lower case and without a unit.
 _WORDS = {
     "time": ("t", "time", "timestamp", "sec", "seconds", "zeit", "x_value", "elapsed time"),
@@ -253,12 +248,13 @@ def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Seri
 
 def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
-    written = _WRITTEN_OUT.fullmatch(unit)
+    base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
+    written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
     if written:
         prefix, *bases = written.groups()
         base = "sVm"[[*map(bool, bases[:3])].index(True)] if not bases[3] else "um"
         unit = {"micro": "u", "kilo": "k"}.get(prefix.lower(), prefix[:1].lower()) + base
-    base, shift = _BASES[quantity]
+    base, shift = {"time": ("s", 0), "voltage": ("V", 0)}.get(quantity, ("m", 6))
     if not unit.endswith(base) or unit.removesuffix(base) not in _PREFIXES:
         return None
     return _PREFIXES[unit.removesuffix(base)] + shift

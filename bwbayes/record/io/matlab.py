@@ -38,7 +38,6 @@ _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _CHAR = 1, 2, 4
 _NUMERIC = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 _IS_LOGICAL, _IS_COMPLEX = 0x0200, 0x0800
-_LARGEST = 16 * MAXIMUM_SAMPLES  # bytes that compressed elements may unpack to
 
 
 def read_mat(path: Path) -> Source:
@@ -55,7 +54,7 @@ def read_mat(path: Path) -> Source:
         raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
     notes: dict[str, str] = {}
     series: list[Series] = []
-    room = _LARGEST
+    room = 16 * MAXIMUM_SAMPLES  # bytes that compressed elements may unpack to
     for kind, body in _elements(data[128:], order, padded=False):
         matrix = body
         if kind == _COMPRESSED:

@@ -24,8 +24,8 @@ def draw_histograms(calibration: Calibration, bins: int = 20) -> Figure:
     figure, panels = _rank_panels(calibration, "replicates\n(expected: 1)")
     for panel, column in zip(panels, calibration.positions.T, strict=True):
         heights, edges = np.histogram(column, bins, range=(0, 1))
-        panel.axhspan(low, high, color=style.CHANCE_COLOR, lw=0, label="99 % of even bars")
-        panel.axhline(1.0, color=style.EXPECTED_COLOR, lw=0.8)
+        panel.axhspan(low, high, color=style.Color.CHANCE, lw=0, label="99 % of even bars")
+        panel.axhline(1.0, color=style.Color.EXPECTED, lw=0.8)
         look: style.Look = {"color": style.COLORS[0], "lw": 1.2, "label": "replicates"}
         panel.stairs(heights * bins / count, 100 * edges, **look)
     panels[0].set_ylim(bottom=0)
@@ -40,8 +40,8 @@ def draw_ecdf(calibration: Calibration) -> Figure:
     steps = np.repeat(np.arange(count + 1) / count, 2)
     columns = np.sort(calibration.positions, axis=0).T
     for panel, ranks, column in zip(panels, calibration.statistics.values(), columns, strict=True):
-        panel.axhspan(-limit, limit, color=style.CHANCE_COLOR, lw=0, label="simultaneous band")
-        panel.axhline(0.0, color=style.EXPECTED_COLOR, lw=0.8)
+        panel.axhspan(-limit, limit, color=style.Color.CHANCE, lw=0, label="simultaneous band")
+        panel.axhline(0.0, color=style.Color.EXPECTED, lw=0.8)
         # The distribution function before and after each rank.
         at = np.concatenate([[0.0], np.repeat(column, 2), [1.0]])
         label = "leaves the band" if ranks.outside else "replicates"
@@ -90,7 +90,7 @@ def _draw_bands(panel: Axes, calibration: Calibration, other: str) -> None:
         error = [100 * LIMIT * coverage.error for coverage in coverages]
         look: style.Look = {"fmt": "os^"[i], "ms": 5, "capsize": 3, "color": style.COLORS[i]}
         panel.errorbar(x + 0.15 * (i - 1), off, error, label=f"{kind} band", **look)
-    panel.axhline(0.0, color=style.EXPECTED_COLOR, lw=0.8, ls="--")
+    panel.axhline(0.0, color=style.Color.EXPECTED, lw=0.8, ls="--")
     panel.set_xticks(x, [f"{level} %" for level in LEVELS])
     panel.set(xlabel="nominal coverage (%)", ylabel="measured less nominal coverage (%)")
     panel.set_title(f"bands on {other or 'held-out samples'} (whiskers: 3 standard errors)")

@@ -38,14 +38,14 @@ def draw_parameters(
             if estimate is None:
                 continue
             edges = estimate["lower_95"], estimate["upper_95"]
-            panel.vlines(x, *edges, color=style.LEAD_IN_COLOR, lw=0.8)
+            panel.vlines(x, *edges, color=style.Color.LEAD_IN, lw=0.8)
             if "shrunk_median" in estimate:
                 color = style.COLORS[1] if estimate["outlier"] else style.COLORS[0]
                 edges = estimate["shrunk_lower_95"], estimate["shrunk_upper_95"]
                 panel.vlines(x + 0.25, *edges, color=color, lw=1.4)
                 panel.plot(x + 0.25, estimate["shrunk_median"], "o", color=color, ms=2.5)
             else:
-                panel.plot(x, estimate["median"], ".", color=style.LEAD_IN_COLOR, ms=3)
+                panel.plot(x, estimate["median"], ".", color=style.Color.LEAD_IN, ms=3)
         label = style.plain(label_with_unit(name, unit))
         panel.set(ylabel=label, xlim=(0, len(records) + 1))
         # The names of more records would overlap.

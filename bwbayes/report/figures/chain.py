@@ -50,7 +50,7 @@ def draw_corner(result: Result) -> Figure:
             panel.set_ylabel(labels[row], fontsize=13)
             panel.yaxis.set_label_coords(-0.75, 0.5)
         if (truth := truths[column]) is not None:
-            panel.axvline(truth, color=style.TRUTH_COLOR)
+            panel.axvline(truth, color=style.Color.TRUTH)
         if row == column:
             panel.hist(flat[:, row], 20, range=ranges[row], histtype="step", color=style.COLORS[0])
             panel.set(xlim=ranges[row], yticks=[])
@@ -72,7 +72,7 @@ def draw_corner(result: Result) -> Figure:
         panel.xaxis.set_major_locator(ticks[column])
         panel.yaxis.set_major_locator(ticks[row])
         if (truth := truths[row]) is not None:
-            panel.axhline(truth, color=style.TRUTH_COLOR)
+            panel.axhline(truth, color=style.Color.TRUTH)
     return figure
 
 
@@ -141,14 +141,14 @@ def draw_ranks(result: Result) -> Figure:
     for i, panel in enumerate(panels):
         panel.set_title(style.axis_label(result.free[i]))
         panel.margins(y=0.12)
-        panel.axhline(1.0, color=style.EXPECTED_COLOR, lw=0.8)
+        panel.axhline(1.0, color=style.Color.EXPECTED, lw=0.8)
         time = float(np.maximum(result.outcome.check.autocorrelation[i], 1.0))
         if np.isfinite(time):
             independent = steps * ensembles * walkers / time
             reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
             label = "what independent draws show"
             band = max(1 - reach, 0.0), 1 + reach
-            panel.axhspan(*band, color=style.CHANCE_COLOR, lw=0, label=label)
+            panel.axhspan(*band, color=style.Color.CHANCE, lw=0, label=label)
         edges = np.linspace(0, 100, RANK_BINS + 1)
         for ensemble, heights in enumerate(_rank_heights(thinned[..., i])):
             panel.stairs(heights, edges, baseline=None, lw=1.2, **_look(ensemble))

@@ -20,7 +20,7 @@ from matplotlib.ticker import (
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
 
-COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.MEAN_COLOR}
+COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.Color.MEAN}
 
 
 # By name, "uncompensated" and "compensated": what has the command's ``voltage`` (samples,), V, its
@@ -45,7 +45,7 @@ def draw_command(
         center.plot(*style.zigzag(time, command.bands.mean), color=color, label=label)
     top.set(ylabel="voltage (V)", title=style.plain(f"command for {name}"))
     line = style.zigzag(time, reference)
-    center.plot(*line, "--", color=style.MEASURED_COLOR, label="reference")
+    center.plot(*line, "--", color=style.Color.MEASURED, label="reference")
     center.set_ylabel("displacement (µm)")
     _draw_errors(below, reference, commands, limit)
     style.share_legend(figure, ncols=5)
@@ -82,8 +82,8 @@ def draw_loops(reference: FloatArray, commands: Commands) -> Figure:
     figure, (panels,) = style.new_figure(10, 4.6, 1, 2, sharex=True, sharey=True)
     ends = [float(reference.min()), float(reference.max())]
     for panel, (label, command) in zip(panels, commands.items(), strict=True):
-        panel.plot(ends, ends, "--", color=style.MEASURED_COLOR, label="reference")
-        panel.plot(reference, command.bands.mean, color=style.MEAN_COLOR, label="predicted")
+        panel.plot(ends, ends, "--", color=style.Color.MEASURED, label="reference")
+        panel.plot(reference, command.bands.mean, color=style.Color.MEAN, label="predicted")
         panel.set(title=label, xlabel="reference (µm)")
         panel.legend(fontsize=8)
     panels[0].set_ylabel("displacement (µm)")
@@ -99,7 +99,7 @@ def _draw_errors(
         error = style.zigzag(bands.time, command.bands.mean - reference)
         panel.plot(*error, color=COLOR_OF[label], label=label)
     for side in () if limit is None else (-limit, limit):
-        panel.axhline(side, color=style.MEASURED_COLOR, lw=0.8, ls=":")
+        panel.axhline(side, color=style.Color.MEASURED, lw=0.8, ls=":")
     panel.set(xlabel="time (s)", ylabel="error (µm)")
 
 
@@ -136,7 +136,7 @@ def draw_promises(
     """
     figure, ((panel,),) = style.new_figure(7, 1.2 + 0.32 * len(names))
     rows, percent = np.arange(len(names)), 100 * remaining
-    colors = [style.MEAN_COLOR, *[style.COLORS[0]] * (len(names) - 1)]
+    colors = [style.Color.MEAN, *[style.COLORS[0]] * (len(names) - 1)]
     panel.hlines(rows, percent, 100, color="#bbbbbb", lw=1)
     panel.errorbar(percent, rows, xerr=200 * error, fmt="none", ecolor="#222222", capsize=5)
     panel.scatter(percent, rows, color=colors, s=28, zorder=3)
@@ -153,7 +153,7 @@ def draw_signal(
     """Draw a voltage (samples,), V, every ``interval`` s, between the amplifier's limits."""
     figure, ((panel,),) = style.new_figure(7, 2.8)
     time = interval * np.arange(voltage.size, dtype=np.float64)
-    panel.plot(*style.zigzag(time, voltage), color=style.MEAN_COLOR)
+    panel.plot(*style.zigzag(time, voltage), color=style.Color.MEAN)
     for limit in limits:
         panel.axhline(limit, color="#222222", lw=1, ls=":")
     panel.set(title=style.plain(name), xlabel="time (s)", ylabel="voltage (V)")

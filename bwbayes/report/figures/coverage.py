@@ -22,7 +22,7 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     scored = [bands for bands in predictions if bands.name in scores]
     figure, ((nominal, pit),) = style.new_figure(11, 4.2, 1, 2)
     x = np.arange(len(LEVELS))
-    expected: style.Look = {"color": style.EXPECTED_COLOR, "lw": 1}
+    expected: style.Look = {"color": style.Color.EXPECTED, "lw": 1}
     nominal.hlines(LEVELS, x - 0.4, x + 0.4, ls="--", label="nominal", **expected)
     for i, bands in enumerate(scored):
         color, name = style.COLORS[i % len(style.COLORS)], style.plain(style.title(bands))

@@ -106,13 +106,13 @@ def _series(bands: Bands) -> Model:
         for height, label in ((330, "displacement (µm)"), (230, residual))
     )
     for source in sources:
-        voltage.line("time", "voltage", source=source, color=style.MEASURED_COLOR)
+        voltage.line("time", "voltage", source=source, color=style.Color.MEASURED)
     for plot, about in ((displacement, ""), (below, "_residual")):
         means = [_draw_window(plot, source, about) for source in sources]
         plot.add_tools(HoverTool(renderers=means, mode="vline", tooltips=_tips(bands)))
         if bands.scored_from:
             left, right = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]].tolist()
-            look: style.Look = {"fill_color": style.LEAD_IN_COLOR, "fill_alpha": 0.35}
+            look: style.Look = {"fill_color": style.Color.LEAD_IN, "fill_alpha": 0.35}
             plot.add_layout(BoxAnnotation(left=left, right=right, **look))
     _legend(displacement, 2)
     below.legend.visible = False
@@ -135,11 +135,11 @@ def _draw_window(plot: figure, source: ColumnDataSource, about: str) -> DataRend
         plot.varea("time", *edges, color=style.BAND_COLORS[kind], **look)
         if kind == "sensor":
             for edge in edges:
-                plot.line("time", edge, color=style.EDGE_COLOR, line_dash="dashed", **look)
-    look = {"source": source, "color": style.MEAN_COLOR, "legend_label": "mean"}
+                plot.line("time", edge, color=style.Color.EDGE, line_dash="dashed", **look)
+    look = {"source": source, "color": style.Color.MEAN, "legend_label": "mean"}
     mean = plot.line("time", f"mean{about}", **look)
     if f"measured{about}" in source.data:
-        look |= {"color": style.MEASURED_COLOR, "legend_label": "measured"}
+        look |= {"color": style.Color.MEASURED, "legend_label": "measured"}
         plot.scatter("time", f"measured{about}", size=2.5, alpha=0.6, **look)
     return mean
 
@@ -212,14 +212,14 @@ def _loop(bands: Bands) -> figure:
     if bands.measured is not None:
         read = _one_in_each_cell(bands.voltage, bands.measured)
         x, y = (values[read].astype(np.float32) for values in (bands.voltage, bands.measured))
-        look = {"color": style.MEASURED_COLOR, "legend_label": "measured"}
+        look = {"color": style.Color.MEASURED, "legend_label": "measured"}
         plot.scatter(x, y, size=2, alpha=0.4, **look)
     means: list[DataRenderer] = [
         plot.line(
             "voltage",
             "mean",
             source=ColumnDataSource(_columns(along, residuals=False)),
-            color=style.MEAN_COLOR,
+            color=style.Color.MEAN,
             line_width=1.5,
             legend_label="mean",
         )

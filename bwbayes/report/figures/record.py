@@ -41,12 +41,12 @@ def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Fin
         rows = np.flatnonzero(record.has_reading)
         time, values = record.time[rows], record.displacement[rows]
         if rows.size < 2000:
-            panels[1].plot(time, values, ".", color=style.MEASURED_COLOR, ms=2.5, mew=0)
+            panels[1].plot(time, values, ".", color=style.Color.MEASURED, ms=2.5, mew=0)
         else:
             # More readings are shown as a line, which ends at a gap that is longer than usual.
             steps = np.diff(rows, prepend=rows[0])
             values = np.where(steps > 3 * np.median(steps), np.nan, values)
-            panels[1].plot(*style.zigzag(time, values), color=style.MEASURED_COLOR, lw=0.7)
+            panels[1].plot(*style.zigzag(time, values), color=style.Color.MEASURED, lw=0.7)
         panels[1].set_ylabel("displacement (µm)")
     for panel in panels:
         _mark(panel, record, training, findings)
@@ -66,7 +66,7 @@ def _mark(
     ]
     for start, stop in [*fitted, (end, end)] if fitted else []:
         if start - at > record.interval / 2:
-            gray: style.Look = {"color": style.LEAD_IN_COLOR, "alpha": 0.25}
+            gray: style.Look = {"color": style.Color.LEAD_IN, "alpha": 0.25}
             panel.axvspan(at, start, lw=0, label="not fitted", **gray)
         at = max(at, stop)
     parts = [f for f in findings if f.stop - f.start < 0.98 * record.duration]

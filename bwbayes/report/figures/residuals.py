@@ -32,9 +32,9 @@ def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
     bound = 1.96 / np.sqrt(innovations.white.size)
     lags = np.arange(1, correlation.size + 1)
     label = "95 % of independent ones"
-    panel.axhspan(-bound, bound, color=style.CHANCE_COLOR, lw=0, label=label)
+    panel.axhspan(-bound, bound, color=style.Color.CHANCE, lw=0, label=label)
     panel.vlines(lags, 0, correlation, color=style.COLORS[0], lw=2)
-    panel.axhline(0, color=style.MEASURED_COLOR, lw=0.8)
+    panel.axhline(0, color=style.Color.MEASURED, lw=0.8)
     reach = max(float(np.max(np.abs(correlation))), 2 * bound, 0.1) * 1.15
     panel.set(title="Autocorrelation", xlabel="lag (readings)", ylabel="autocorrelation")
     panel.set(ylim=(-reach, reach), xlim=(0, lags[-1] + 1))
@@ -53,8 +53,8 @@ def _draw_quantiles(panel: Axes, white: FloatArray) -> None:
         for level in (0.025, 0.975)
     )
     label = "95 % of normal ones"
-    panel.fill_between(expected, low, high, color=style.CHANCE_COLOR, lw=0, label=label)
-    panel.plot(expected, expected, color=style.MEAN_COLOR, lw=1)
+    panel.fill_between(expected, low, high, color=style.Color.CHANCE, lw=0, label=label)
+    panel.plot(expected, expected, color=style.Color.MEAN, lw=1)
     panel.plot(expected, np.sort(white)[at], ".", color=style.COLORS[0], ms=3, mew=0)
     panel.set(title="Normal quantiles", xlabel="normal quantile")
     panel.legend(loc="upper left")
@@ -64,7 +64,7 @@ def _draw_time(panel: Axes, time: FloatArray, white: FloatArray) -> None:
     """Draw all innovations, and the root mean square of 40 segments: 1 if the size is right."""
     reach = max(4.5, 1.1 * float(np.quantile(np.abs(white), 0.9995)))
     dots: style.Look = {"ms": 2, "mew": 0, "alpha": min(0.7, 8000 / white.size)}
-    panel.plot(time, np.clip(white, -reach, reach), ".", color=style.MEASURED_COLOR, **dots)
+    panel.plot(time, np.clip(white, -reach, reach), ".", color=style.Color.MEASURED, **dots)
     # Each segment has twenty readings or more; a gap of a fiftieth of the time ends the line.
     count = min(40, max(white.size // 20, 1))
     gaps = np.flatnonzero(np.diff(time) > 0.02 * np.ptp(time)) + 1
@@ -73,8 +73,8 @@ def _draw_time(panel: Axes, time: FloatArray, white: FloatArray) -> None:
         centers = [np.mean(time[part]) for part in parts]
         size = [np.sqrt(np.mean(white[part] ** 2)) for part in parts]
         label = "_nolegend_" if rows[0] else "root mean square: 1 is right"
-        panel.plot(centers, size, color=style.MEAN_COLOR, lw=1.5, label=label)
-    panel.axhline(1, color=style.MEAN_COLOR, lw=0.8, ls=":")
+        panel.plot(centers, size, color=style.Color.MEAN, lw=1.5, label=label)
+    panel.axhline(1, color=style.Color.MEAN, lw=0.8, ls=":")
     panel.set(ylim=(-reach, reach), title="Stationarity")
     panel.set_xlabel("time (s)")
     panel.legend(loc="upper right")
@@ -119,10 +119,10 @@ def draw_spectrum(innovations: Innovations) -> Figure:
     """Draw the amplitude spectral density of the residual and of the noise model."""
     frequency, density = innovations.residual_density()
     figure, ((panel,),) = style.new_figure(11, 4.2)
-    panel.loglog(frequency, density, color=style.MEASURED_COLOR, lw=0.9, label="residual")
+    panel.loglog(frequency, density, color=style.Color.MEASURED, lw=0.9, label="residual")
     model = innovations.noise_density(frequency)
     if model is not None:
-        panel.loglog(frequency, model, color=style.MEAN_COLOR, lw=1.5, label="noise model")
+        panel.loglog(frequency, model, color=style.Color.MEAN, lw=1.5, label="noise model")
     panel.set(xlabel="frequency (Hz)", ylabel="amplitude density (µm/√Hz)")
     figure.legend(loc="outside right upper")
     return figure
@@ -138,7 +138,7 @@ def draw_agreement(agreements: Mapping[str, Agreement]) -> Figure:
         ):
             dots: style.Look = {"ms": 2, "mew": 0, "alpha": 0.7}
             panel.plot(agreement.time, values, ".", color=color, label=label, **dots)
-        panel.axhline(0, color=style.MEAN_COLOR, lw=0.8)
+        panel.axhline(0, color=style.Color.MEAN, lw=0.8)
         verdict = "DOES NOT AGREE" if agreement.disagrees else "agrees"
         distance = f"chi-square {agreement.distance:.3g} of {agreement.degrees:.3g}"
         chance = f"({distance}, p = {agreement.p_value:.2g})"

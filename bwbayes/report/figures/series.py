@@ -45,22 +45,22 @@ def draw_bands(bands: Bands) -> Figure:
 
 def _draw_column(column: Sequence[Axes], bands: Bands) -> None:
     voltage, displacement, residual = column
-    residual.axhline(0.0, color=style.MEAN_COLOR, lw=1.0, label="mean")
+    residual.axhline(0.0, color=style.Color.MEAN, lw=1.0, label="mean")
     residual.set_xlabel(style.time_label(bands.time_offset))
     for segment in style.segments(bands):
         time = segment.time
-        voltage.plot(*style.zigzag(time, segment.voltage), color=style.MEASURED_COLOR, lw=0.8)
+        voltage.plot(*style.zigzag(time, segment.voltage), color=style.Color.MEASURED, lw=0.8)
         style.draw_ribbons(displacement, segment)
         style.draw_ribbons(residual, segment, segment.mean)
-        displacement.plot(*style.zigzag(time, segment.mean), color=style.MEAN_COLOR, lw=0.8)
+        displacement.plot(*style.zigzag(time, segment.mean), color=style.Color.MEAN, lw=0.8)
         if segment.truth is not None and bands.time.size < DOTS:
             true = style.zigzag(time, segment.truth - segment.mean)
             label = "true displacement, without noise"
-            residual.plot(*true, color=style.TRUTH_COLOR, zorder=2.1, label=label)
+            residual.plot(*true, color=style.Color.TRUTH, zorder=2.1, label=label)
     if bands.measured is not None:
         _draw_readings(displacement, bands.time, bands.measured)
         _draw_readings(residual, bands.time, bands.measured - bands.mean)
-        residual.plot([], [], ".", color=style.MEASURED_COLOR, label="measured")
+        residual.plot([], [], ".", color=style.Color.MEASURED, label="measured")
 
 
 def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
@@ -69,7 +69,7 @@ def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
         dots: style.Look = {"marker": ".", "ms": 2.5, "mew": 0, "alpha": 0.7}
     else:
         dots = {"marker": ",", "alpha": min(1.0, 15_000 / time.size)}
-    panel.plot(time, readings, ls="", color=style.MEASURED_COLOR, **dots)
+    panel.plot(time, readings, ls="", color=style.Color.MEASURED, **dots)
 
 
 def _around_largest_error(bands: Bands, height: float = 8.0, least: int = 40) -> slice:
@@ -94,12 +94,12 @@ def _around_largest_error(bands: Bands, height: float = 8.0, least: int = 40) ->
 def _mark(panel: Axes, bands: Bands, zoom: slice) -> None:
     """Show where the zoom is, and which samples are not judged."""
     start, stop = bands.time[zoom][[0, -1]]
-    zoomed: style.Look = {"color": style.ZOOM_COLOR, "alpha": 0.5, "zorder": 0.5}
+    zoomed: style.Look = {"color": style.Color.ZOOM, "alpha": 0.5, "zorder": 0.5}
     panel.axvspan(start, stop, lw=1, label="shown on the right", **zoomed)
     if bands.scored_from:
         lead_in = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]]
         label = "lead-in, not judged"
-        panel.axvspan(*lead_in, fc=style.LEAD_IN_COLOR, alpha=0.35, lw=0, label=label)
+        panel.axvspan(*lead_in, fc=style.Color.LEAD_IN, alpha=0.35, lw=0, label=label)
 
 
 LOOP_KINDS: tuple[Kind, ...] = ("sensor", "parameter")
@@ -137,13 +137,13 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
             panel.add_collection(
                 PolyCollection(corners, lw=0.4, label=style.BAND_NAMES[kind], **look)
             )
-        panel.plot(segment.voltage, segment.mean, color=style.MEAN_COLOR, lw=0.7, label="mean")
+        panel.plot(segment.voltage, segment.mean, color=style.Color.MEAN, lw=0.7, label="mean")
     if bands.measured is not None:
-        panel.plot([], [], ".", color=style.MEASURED_COLOR, label="measured")
+        panel.plot([], [], ".", color=style.Color.MEASURED, label="measured")
         # Few readings have large and dark dots.
         size, alpha, marker = (3.0, 0.7, ".") if bands.measured.size <= 5000 else (2.0, 0.25, dot)
         dots: style.Look = {"ls": "", "ms": size, "mew": 0.0, "zorder": 1.5, "alpha": alpha}
-        panel.plot(bands.voltage, bands.measured, marker=marker, color=style.MEASURED_COLOR, **dots)
+        panel.plot(bands.voltage, bands.measured, marker=marker, color=style.Color.MEASURED, **dots)
     panel.autoscale_view()
     panel.set_xlabel("voltage (V)")
 
@@ -187,5 +187,5 @@ def _zoom(full: Axes, tip: Axes, bands: Bands) -> None:
     width = (float(np.ptp(voltage)) or 1.0) * height / whole
     left, bottom = float(voltage[at]) - 0.9 * width, float(upper[at]) - 0.9 * height
     tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
-    outline: style.Look = {"edgecolor": style.ZOOM_COLOR, "alpha": 1.0, "linewidth": 1.5}
+    outline: style.Look = {"edgecolor": style.Color.ZOOM, "alpha": 1.0, "linewidth": 1.5}
     full.indicate_inset((left, bottom, width, height), **outline)

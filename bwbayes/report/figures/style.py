@@ -48,13 +48,19 @@ STYLE: dict[Any, Any] = {
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
-MEAN_COLOR = "#D55E00"
-MEASURED_COLOR = "#222222"
-TRUTH_COLOR = "#E69F00"
-LEAD_IN_COLOR = "#999999"
-EXPECTED_COLOR = "#777777"  # of what is expected
-CHANCE_COLOR = "#dddddd"  # of what chance does
-ZOOM_COLOR = "#CC79A7"
+
+class Color:
+    """What a color stands for."""
+
+    MEAN = "#D55E00"
+    MEASURED = "#222222"
+    TRUTH = "#E69F00"
+    LEAD_IN = "#999999"
+    EXPECTED = "#777777"
+    CHANCE = "#dddddd"  # what chance does
+    ZOOM = "#CC79A7"
+    EDGE = "#12344D"  # of the sensor band
+
 
 # From the widest band, drawn first, to the narrowest.
 BAND_COLORS: Mapping[Kind, str] = {
@@ -62,7 +68,6 @@ BAND_COLORS: Mapping[Kind, str] = {
     "displacement": "#ACD0E8",
     "parameter": "#6FAAD6",
 }
-EDGE_COLOR = "#12344D"
 BAND_NAMES: Mapping[Kind, str] = {
     "sensor": "95 % sensor reading",
     "displacement": "95 % displacement",
@@ -187,7 +192,7 @@ def draw_ribbons(
     """Draw 95 % bands along time less something, the widest first, the sensor's with an edge."""
     for kind in kinds:
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
-        edge: Look = {"ec": EDGE_COLOR, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
+        edge: Look = {"ec": Color.EDGE, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
         drawn = envelope(bands.time, bands.lower[kind, 95] - about, bands.upper[kind, 95] - about)
         panel.fill_between(*drawn, fc=BAND_COLORS[kind], label=BAND_NAMES[kind], **edge)
 
