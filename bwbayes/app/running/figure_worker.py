@@ -1,8 +1,9 @@
 """Draw what a page shows, if possible in a process beside this one, which predicts and writes.
 
-That process loads what draws while this one loads what samples, and begins with each picture as
-soon as what it shows is known: the draws before predictions are made, the bands before they are
-judged. The pictures are the same as drawn in one process.
+That process loads what draws while this one loads what samples, and compiles what simulates while
+this one compiles the likelihood. It begins with each picture as soon as what it shows is known: the
+draws before predictions are made, the bands before they are judged. The pictures are the same as
+drawn in one process.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from bwbayes.app.running.workers import processes
 
 # All else is loaded where it is used: an artist begins before anything is loaded.
 if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
     from bwbayes.report.page import PagePlots
     from bwbayes.report.result import Result
 
@@ -37,6 +39,14 @@ class Artist:
         self.begun: dict[str, Future[Any]] = {}
         if pool is not None:
             pool.submit(_prepare)
+
+    def rehearse(self, posterior: Posterior) -> None:
+        """Let the other process compile what this one needs later, while this one does the rest."""
+        if self.pool is None or posterior.engine == "numpy":
+            return
+        from bwbayes.inference.compiled import rehearse  # noqa: PLC0415
+
+        self.pool.submit(rehearse, posterior)
 
     def draw(self, result: Result) -> None:
         """Begin with all that can be seen of a result, but for what was begun before."""

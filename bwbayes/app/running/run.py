@@ -101,8 +101,10 @@ def resume(
             config = load(folder.config)
             sampling = config.sampling.model_copy(update=targets)
             _rewrite(folder, config.model_copy(update={"sampling": sampling}))
+        problem = folder.problem()
         if show is not None:
-            show(folder.problem())
+            show(problem)
+        artist.rehearse(problem.posterior)
         fit = _drawn(folder, console, workers, engine, backend)
         console.print("computing predictions ...", highlight=False)
         with StepProgress(console) as watch:

@@ -9,6 +9,7 @@ others the drive comes from NumPy, and the rest of the work is compiled still.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +21,23 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
 
-__all__ = ["products", "whiten"]
+if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
+
+__all__ = ["products", "rehearse", "whiten"]
+
+
+def rehearse(posterior: Posterior) -> None:
+    """Simulate and whiten one model, which compiles what :func:`products` does not need.
+
+    What one process has compiled is there for others, such as one that is at the products.
+    """
+    prior, likelihood = posterior.prior, posterior.likelihoods[0]
+    center, _ = prior.constrain(np.zeros((1, prior.dimensions)))
+    theta = posterior.table.of(prior.theta(center), posterior.datasets[0].name)
+    likelihood.simulate(likelihood.table.actuator(theta), likelihood.voltage[:2])
+    series = np.zeros((1, 1, likelihood.readings.rows.size))
+    likelihood.whiten(likelihood.table.noise(theta), series)
 
 
 def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
