@@ -192,7 +192,7 @@ def test_dimensions_beyond_the_numbers_are_refused_and_cells_not_made(tmp_path: 
 def test_a_compressed_array_cannot_unpack_to_all_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(matlab, "_LARGEST", 10_000)
+    monkeypatch.setattr(matlab, "MAXIMUM_SAMPLES", 625)
     path = store(tmp_path, "compressed", {"zeros": np.zeros(10**5)} | GOOD)
     assert "damaged" in fault(path)
 
