@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
@@ -105,7 +107,7 @@ def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        *((text, f"{text!r} is not a number") for text in ("abc", "1.5V", "0x10", "1_000", "1;5")),
+        *((text, f"{text!r} is not a number") for text in ("1.5V", "0x10", "1_000", "1;5")),
         ("inf", "inf is not a finite number"),
         ("-Infinity", "-inf is not a finite number"),
         ("1e999", "inf is not a finite number"),
@@ -120,8 +122,9 @@ def test_a_bad_cell_is_named_by_line_and_column(
     assert fault(tmp_path, cell(line, column, text)).startswith(where + problem)
 
 
-@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN", "#N/A"])
-def test_an_empty_cell_is_a_missing_reading_but_no_time_or_voltage(
+@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN", "#N/A", "OVERLOAD", "---", "no signal"])
+@pytest.mark.filterwarnings("ignore:.*record.csv.17.*, taken as missing")
+def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     tmp_path: Path, text: str
 ) -> None:
     whole, record = read(tmp_path, GOOD), read(tmp_path, cell(17, 2, text))
@@ -129,8 +132,35 @@ def test_an_empty_cell_is_a_missing_reading_but_no_time_or_voltage(
     np.testing.assert_array_equal(whole.voltage, record.voltage)
     for column in (0, 1):
         where = f"record.csv:17: {HEADER.split(',')[column]}: "
-        problem = "no number (empty or nan); give one at every sample (only a displacement may be"
+        problem = (
+            "no number (empty, a word or nan); give one at every sample (only a displacement may be"
+        )
         assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
+
+
+@given(
+    word=st.from_regex("[A-Z*-][A-Za-z*! -]{0,9}", fullmatch=True),
+    where=st.sets(st.integers(0, len(ROWS) - 1), min_size=1, max_size=len(ROWS) // 2 - 1),
+)
+def test_words_are_missing_readings_and_are_said(
+    tmp_path_factory: pytest.TempPathFactory, word: str, where: set[int]
+) -> None:
+    # Numbers to Python, or missing to pandas.
+    assume(word.strip().lower().lstrip("-") not in ("inf", "infinity", "na", "nan", "none", "null"))
+    rows = [
+        row.rpartition(",")[0] + f",{word}" if number in where else row
+        for number, row in enumerate(ROWS)
+    ]
+    line = rf"record.csv:{2 + min(where)}: displacement_um: .*: {len(where)} cells? without"
+    with pytest.warns(InputWarning, match=line):
+        record = read(tmp_path_factory.mktemp("words"), lines(HEADER, *rows))
+    assert sorted(where) == np.flatnonzero(~record.has_reading).tolist()
+
+
+def test_a_column_of_words_is_refused(tmp_path: Path) -> None:
+    rows = [row.rpartition(",")[0] + ",Error" for row in ROWS[:15]]
+    text = fault(tmp_path, lines(HEADER, *rows, *ROWS[15:]))
+    assert text.startswith("record.csv:2: displacement_um: 'Error' is not a number")
 
 
 def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ class Series:
             values = np.asarray(self.load())
             if values.dtype.kind in "iuf" and values.shape != (self.size,):
                 raise ValueError(f"{values.size} values for {self.size}")
-        except InputError:
+        except (InputError, Warning):
             raise
         except Exception as error:
             raise damaged(f"{where}: {self.name}", error) from error

@@ -281,12 +281,18 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
 
 
 def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
-    """Return a column's numbers; dates and times of day in seconds.
+    """Return a column's numbers, nan for words; dates and times of day in seconds.
 
     Raises
     ------
     InputError
-        A cell is none; the text names its line.
+        A cell with digits is no number, or most cells are words; the text names the first one's
+        line.
+
+    Warns
+    -----
+    InputWarning
+        If some cells are words.
     """
     if column.dtype.kind in "iuf":
         return np.asarray(column)
@@ -305,10 +311,13 @@ def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) 
                 continue
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
-    raise InputError(
-        f"{path}:{first_line + wrong[0]}: {name}: {shown} is not a number; write it like 1.5, or "
-        "nothing where a reading is missing"
-    )
+    where = f"{path}:{first_line + wrong[0]}: {name}: {shown}"
+    if 2 * wrong.size < column.size and not text.iloc[wrong].str.contains(r"[\d\0]").any():
+        # As loggers write where there is nothing to read: OVERLOAD, ---, Error.
+        cells = f"{wrong.size} cell{'s' * (wrong.size > 1)} without a number"
+        warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
+        return np.asarray(numbers, dtype=np.float64)
+    raise InputError(f"{where} is not a number; write it like 1.5, or nothing where it is missing")
 
 
 def _is_cut(body: Sequence[str], separator: str) -> bool:
