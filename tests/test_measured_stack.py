@@ -22,7 +22,6 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record, thinned
 from bwbayes.record import Record, read_record
-from bwbayes.sampling.chain import draws
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
@@ -189,9 +188,7 @@ def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
     fit = finished(RunFolder.open(folder))
-    problem, chain = fit.problem, fit.chain
-    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
-    return problem.posterior, thinned(flat, np.random.default_rng(1))
+    return fit.problem.posterior, thinned(fit.flat_draws, np.random.default_rng(1))
 
 
 def cut(record: Record, number: int, transient: float = 0.0) -> Record:
@@ -248,10 +245,9 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     """Their 95 % bands cover 88 to 99 %, and are at least 35 % narrower than plain Bouc-Wen's."""
     assert parts["converged"]
     fit = finished(RunFolder.open(parts_folder))
-    problem, chain = fit.problem, fit.chain
-    flat = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
     # So many draws are enough: most of their band is the discrepancy.
-    usual, knocked = on_cuts(problem.posterior, thinned(flat, np.random.default_rng(1), 250))
+    chosen = thinned(fit.flat_draws, np.random.default_rng(1), 250)
+    usual, knocked = on_cuts(fit.problem.posterior, chosen)
     plain, _ = plain_on_cuts
     assert 0.88 <= usual[0] <= 0.99
     assert usual[1] < plain[1]

@@ -136,6 +136,12 @@ class Parameter:
         ends = scipy.special.ndtr(self.prior.form.score(np.array(self.support)))
         return float(ends[0]), float(ends[1])
 
+    def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
+        """Draw from its own prior between its bounds, whatever others are, (size,)."""
+        assert self.prior is not None
+        uniform = generator.uniform(*self.mass_between, size)
+        return np.asarray(self.prior.frozen.ppf(uniform), dtype=np.float64)
+
 
 class JointPrior:
     """The joint prior of the parameters, cut by the physical constraints.
@@ -228,7 +234,7 @@ class JointPrior:
         accepted = np.empty((0, self.dimensions))
         tried = 0
         while accepted.shape[0] < size:
-            batch = np.stack([_draw_single(p, generator, size) for p in self.free], axis=1)
+            batch = np.stack([p.draw(generator, size) for p in self.free], axis=1)
             accepted = np.concatenate([accepted, batch[np.isfinite(self.log_density(batch))]])
             tried += size
             if accepted.shape[0] < 1e-4 * tried - 10:
@@ -273,7 +279,8 @@ class JointPrior:
             free[row], between = parameter.prior.from_normal(safe[row], *bounds)
             room *= between
         # Rounding may put a positive parameter on its open bound, where there is no model.
-        possible &= self._above_floors(free) & self._possible(values)
+        above, at_least = self._floors
+        possible &= ((free > above) & (free >= at_least)).all(axis=0) & self._possible(values)
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
         return free.T, np.where(possible, log_prior, -np.inf)
@@ -304,12 +311,6 @@ class JointPrior:
         nothing = np.full(len(self.free), -np.inf)
         above, at_least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
         return above[:, np.newaxis], at_least[:, np.newaxis]
-
-    def _above_floors(self, free: FloatArray) -> BoolArray:
-        """Tell which models (models,) of free parameters (free, models) are on or above floors."""
-        above, at_least = self._floors
-        inside: BoolArray = ((free > above) & (free >= at_least)).all(axis=0)
-        return inside
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
@@ -342,17 +343,11 @@ class JointPrior:
         specific = {plain: values[name] for plain, name in self._own[record] if name in values}
         return {**values, **specific}
 
-    def _views(self, parameter: Parameter) -> tuple[str, ...]:
-        """Return the records whose values a parameter's bounds depend on; empty for any."""
-        if parameter.record or not self.records:
-            return (parameter.record,)
-        return self.records
-
     def _between(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the bounds (models,) that other values set; of several records, the tightest."""
-        if parameter.declared is None or parameter.declared.bounds is None:
-            return np.asarray(-np.inf), np.asarray(np.inf)
-        limits = [parameter.limits(self.seen(values, record)) for record in self._views(parameter)]
+        # Those of a parameter that all records have depend on the values of each.
+        views = (parameter.record,) if parameter.record or not self.records else self.records
+        limits = [parameter.limits(self.seen(values, record)) for record in views]
         low, high = limits[0]
         for lower, upper in limits[1:]:
             low, high = np.maximum(low, lower), np.minimum(high, upper)
@@ -371,10 +366,3 @@ class JointPrior:
         x = values[parameter.name]
         inside: BoolArray = (low <= x) & (x <= high) & parameter.above_floor(x)
         return inside
-
-
-def _draw_single(parameter: Parameter, generator: np.random.Generator, size: int) -> FloatArray:
-    assert parameter.prior is not None
-    uniform = generator.uniform(*parameter.mass_between, size)
-    draws: FloatArray = np.asarray(parameter.prior.frozen.ppf(uniform), dtype=np.float64)
-    return draws

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
-from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.population.normal import NormalLikelihoods
 
@@ -159,7 +159,7 @@ def _log_prior(
     places, n_others = 33, 400
     marginal = prior.free[column].prior
     assert marginal is not None
-    others = np.stack([_single(p, n_others, generator) for p in prior.free], axis=1)
+    others = np.stack([p.draw(generator, n_others) for p in prior.free], axis=1)
     at = np.quantile(x, np.linspace(0, 1, places))
     tried = np.tile(others, (places, 1))
     tried[:, column] = np.repeat(at, n_others)
@@ -168,10 +168,3 @@ def _log_prior(
     possible = np.maximum(np.mean(inside, axis=1), 0.5 / n_others)
     density: FloatArray = marginal.frozen.logpdf(x) + np.interp(x, at, np.log(possible))
     return density
-
-
-def _single(parameter: Parameter, size: int, generator: np.random.Generator) -> FloatArray:
-    """Draw from a parameter's own prior, whatever the others are, (size,)."""
-    assert parameter.prior is not None
-    uniform = generator.uniform(*parameter.mass_between, size)
-    return np.asarray(parameter.prior.frozen.ppf(uniform), dtype=np.float64)
