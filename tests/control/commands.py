@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,13 +17,11 @@ from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.limits import Limits
 from bwbayes.prediction.bands import LEVELS
@@ -33,8 +30,8 @@ from bwbayes.record.record import Record
 from bwbayes.record.teststand import LaserSensor, VirtualTestStand
 from bwbayes.record.waveforms import signal
 from bwbayes.sampling.chain import draws
-from bwbayes.sampling.sampler import first_chain, sample
 from tests.measured import keep
+from tests.sampled import sampled
 
 CONFIG = Path(__file__).resolve().parents[2] / "runs" / "ring_bender.toml"
 LIMITS = Limits(-100.0, 100.0)
@@ -90,16 +87,12 @@ def discrepancy(samples: int, interval: float, source: np.random.Generator) -> F
     return noise.draw(np.array([[0.0, DISCREPANCY, TIME]]), samples, source)[0]
 
 
-def drawn(of: Problem, seed: int) -> FloatArray:
+def drawn(of: Problem) -> FloatArray:
     """Fit a problem, and return a thousand draws (draws, free)."""
-    posterior = of.posterior
-    with ThreadPoolExecutor(1) as executor, one_thread():
-        point = pointfit.fit(posterior, generator(seed, "point fit"))
-        chain = first_chain(posterior, point, of.plan, generator(seed, "sampling"))
-        outcome = sample(posterior, of.plan, chain, executor)
+    outcome, chain = sampled(of)
     assert outcome.converged, outcome.stop_reason
-    flat = draws(posterior, chain).reshape(-1, len(posterior.names))
-    return thinned(flat, generator(seed, "draws"))
+    flat = draws(of.posterior, chain).reshape(-1, len(of.posterior.names))
+    return thinned(flat, generator(of.config.seed, "draws"))
 
 
 def about(of: Problem, spread: float, count: int, source: np.random.Generator) -> FloatArray:

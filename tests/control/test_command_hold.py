@@ -130,7 +130,7 @@ def parts(seed: int) -> dict[tuple[str, int], float]:
     """Return what the bands held of a DAC's plays of a command for one fit."""
     of, source = measured_voltage(RATE, seed), np.random.default_rng(10_000 + seed)
     asked = shaped("triangle", 1 / RATE, 40.0, 2.0, periods=16)
-    command = compensated(of, asked, drawn(of, seed))
+    command = compensated(of, asked, drawn(of))
     truth = played(asked, command.voltage)
     plays = [
         inside(command, truth + discrepancy(truth.size, asked.interval, source))

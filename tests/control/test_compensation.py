@@ -232,7 +232,7 @@ def test_forty_seeds_of_the_stand_are_where_their_commands_say() -> None:
     def part(seed: int) -> dict[tuple[str, int], float]:
         of = problem.__wrapped__("process", 1000.0, seed)
         asked = shaped("triangle", 1e-3, 40.0, 0.5, periods=8)
-        command = compensated(of, asked, drawn(of, seed))
+        command = compensated(of, asked, drawn(of))
         error = reached(asked, command.voltage, "process", 10_000 + seed)
         return inside(command, error + np.asarray(asked.displacement))
 
