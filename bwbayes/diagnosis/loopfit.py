@@ -48,6 +48,9 @@ class LoopFit:
         Part of a trend that loops do not imitate, at most 1; with little of it `trend` means none.
     explained : float
         Part of the displacement's variance that the voltage explains, at most 1.
+    without_loops : float
+        Probability (F test, for white noise) that a curve and a lag leave so much more than loops
+        do if there are none.
     """
 
     rows: IntArray
@@ -60,6 +63,7 @@ class LoopFit:
     trend: float
     trend_told: float
     explained: float
+    without_loops: float
 
 
 def fit_loop(record: Record) -> LoopFit:
@@ -90,7 +94,7 @@ def fit_loop(record: Record) -> LoopFit:
         if best is None or remainder < best[0]:
             best = remainder, basis, lag, which
     assert best is not None
-    _, basis, lag, which = best
+    least, basis, lag, which = best
     design = np.column_stack([basis, decays[:, which]])
     products = _products(design, centered[:, np.newaxis])
     among = _products(design, design)
@@ -101,6 +105,23 @@ def fit_loop(record: Record) -> LoopFit:
     undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centered - undriven
     lagged = basis[:, 1] - basis[:, 1].mean()
+
+    def curved(samples: float) -> float:
+        """Return the sum of squares that a curve leaves behind a lag, and no loops."""
+        u = _lagged(record.voltage, samples)[rows[judged]]
+        u = (u - u.mean()) / max(float(np.ptp(u)), 1e-300)
+        columns = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
+        return _best_decay(columns, decays, centered)[0]
+
+    # Loops imitate what is left of a lag: it is found between those above.
+    samples = lags / record.interval
+    nearest = int(np.argmin([curved(lag) for lag in samples]))
+    between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
+    found = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
+    (loops,) = _bases(_lagged(record.voltage, found.x)[np.newaxis, rows], judged)
+    least = min(least, _best_decay(np.column_stack([loops, trend_shape]), decays, centered)[0])
+    added, left = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
+    ratio = (found.fun - least) / added / max(least / left, 1e-300)
     return LoopFit(
         rows[judged],
         residual,
@@ -113,6 +134,7 @@ def fit_loop(record: Record) -> LoopFit:
         float(coefficients[-2]),
         1 - imitated / float(trend_shape @ trend_shape),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
+        float(scipy.stats.f.sf(ratio, added, left)),
     )
 
 

@@ -262,7 +262,7 @@ def unlike(name: str, record: Record) -> Iterator[str]:
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_from = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in ("one amplitude", "few readings"):
+        if finding.kind not in ("one amplitude", "few readings", "no hysteresis"):
             yield f"{name}: {replace(finding, fix=fix)}"
 
 
