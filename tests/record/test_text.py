@@ -132,9 +132,8 @@ def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     np.testing.assert_array_equal(whole.voltage, record.voltage)
     for column in (0, 1):
         where = f"record.csv:17: {HEADER.split(',')[column]}: "
-        problem = (
-            "no number (empty, a word or nan); give one at every sample (only a displacement may be"
-        )
+        word = text in ("OVERLOAD", "---", "no signal")
+        problem = f"{text!r} is not a number" if word else "no number (empty or nan); give one at"
         assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 
 

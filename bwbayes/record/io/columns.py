@@ -159,7 +159,11 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
         _warn(f"{path}: taken by its unit: {reasons}; if not, say `columns`")
     columns = {
-        quantity: FileColumn(chosen[quantity].name, chosen[quantity].numbers(path), unit)
+        quantity: FileColumn(
+            chosen[quantity].name,
+            chosen[quantity].numbers(path, readings=quantity == "displacement"),
+            unit,
+        )
         for quantity, unit in units.items()
         if unit
     }

@@ -159,11 +159,7 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
         raw = column.values[sample]
         problem = f"{raw:g} is absurdly large; check the unit in the column's name"
         if not np.isfinite(raw):
-            fact = (
-                "no number (empty, a word or nan)"
-                if np.isnan(raw)
-                else f"{raw} is not a finite number"
-            )
+            fact = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
             problem = f"{fact}; give one at every sample (only a displacement may be missing: nan)"
         raise table.error(problem, quantity, sample)
     return values

@@ -27,7 +27,8 @@ NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
 class Series:
     """A row of numbers: its path in the file, which begins with its group, and how to load it.
 
-    ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values.
+    ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values, and
+    ``load_readings``, if it is given, the same of which some may be missing: words are nan.
     """
 
     name: str
@@ -35,14 +36,15 @@ class Series:
     load: Callable[[], NDArray[Any]]
     unit: str = ""
     group: str = ""
+    load_readings: Callable[[], NDArray[Any]] | None = None
 
     @property
     def label(self) -> str:
         """The name without the path."""
         return self.name.removeprefix(self.group)
 
-    def numbers(self, where: object) -> NDArray[Any]:
-        """Load the numbers, (size,), of a series in the file ``where``.
+    def numbers(self, where: object, *, readings: bool = False) -> NDArray[Any]:
+        """Load the numbers, (size,), of a series in the file ``where``; of ``readings`` some.
 
         Raises
         ------
@@ -50,7 +52,8 @@ class Series:
             They are not real numbers, or damaged.
         """
         try:
-            values = np.asarray(self.load())
+            load = (readings and self.load_readings) or self.load
+            values = np.asarray(load())
             if values.dtype.kind in "iuf" and values.shape != (self.size,):
                 raise ValueError(f"{values.size} values for {self.size}")
         except (InputError, Warning):

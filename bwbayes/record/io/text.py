@@ -91,17 +91,16 @@ def read_text(path: Path) -> Source:
         raise InputError(f"{path}:{len(lines)}: the last line is cut off; remove it")
     _check_fields(path, body, layout, len(names))
     frame, decimal = _parsed(path, body, layout)
-    series = [
-        Series(
-            name,
-            len(body),
-            partial(_numbers, path, frame[column], decimal, name, layout.first + 1),
-            # Dates and times of day have no unit, and become seconds.
-            "s" if re.match(r".*\d:\d\d", str(frame[column].iloc[0])) else unit,
+    series = []
+    for column, (name, unit) in enumerate(zip(names, units, strict=True)):
+        if column >= layout.fields:
+            break
+        # Dates and times of day have no unit, and become seconds.
+        stated = "s" if re.match(r".*\d:\d\d", str(frame[column].iloc[0])) else unit
+        load = partial(_numbers, path, frame[column], decimal, name, layout.first + 1)
+        series.append(
+            Series(name, len(body), load, stated, load_readings=partial(load, words=True))
         )
-        for column, (name, unit) in enumerate(zip(names, units, strict=True))
-        if column < layout.fields
-    ]
     return Source(path, tuple(series), {"": notes}, layout.first + 1, interval)
 
 
@@ -280,14 +279,15 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
     return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
 
 
-def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) -> NDArray[Any]:
-    """Return a column's numbers, nan for words; dates and times of day in seconds.
+def _numbers(
+    path: Path, column: Any, decimal: str, name: str, first_line: int, *, words: bool = False
+) -> NDArray[Any]:
+    """Return a column's numbers, nan for ``words``; dates and times of day in seconds.
 
     Raises
     ------
     InputError
-        A cell with digits is no number, or most cells are words; the text names the first one's
-        line.
+        A cell is no number, or one with digits is none, or most are words; the text names its line.
 
     Warns
     -----
@@ -312,7 +312,11 @@ def _numbers(path: Path, column: Any, decimal: str, name: str, first_line: int) 
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     where = f"{path}:{first_line + wrong[0]}: {name}: {shown}"
-    if 2 * wrong.size < column.size and not text.iloc[wrong].str.contains(r"[\d\0]").any():
+    if (
+        words
+        and 2 * wrong.size < column.size
+        and not text.iloc[wrong].str.contains(r"[\d\0]").any()
+    ):
         # As loggers write where there is nothing to read: OVERLOAD, ---, Error.
         cells = f"{wrong.size} cell{'s' * (wrong.size > 1)} without a number"
         warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
