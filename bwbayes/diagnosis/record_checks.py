@@ -171,7 +171,7 @@ def _thin(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """
     turns = turning_points(record.voltage, 0.2 * float(np.ptp(record.voltage)))
     # A loop has a third of its opening for rms; the test of nine plays sees 30 times the square of
-    # what is uncertain in 95 of 100. Some of it may look like a lag.
+    # what is uncertain in nine of ten. Some of it may look like a lag.
     thinnest = 3 * np.sqrt(30 / loop.rows.size) * np.std(loop.residual) / _extent(_readings(record))
     if turns.size >= 3 and loop.without_loops > 0.01 and thinnest < 0.005:
         text = "a curve and a lag explain rising and falling voltage alike"

@@ -209,6 +209,18 @@ def test_what_was_said_of_a_record_stays_with_its_run(folder: Path) -> None:
     assert first.remarks == again.remarks
 
 
+def test_a_model_without_hysteresis_needs_no_loops(tmp_path: Path) -> None:
+    """So the fix of this finding removes it."""
+    voltage = 50 * np.sin(np.arange(4000) / 50)
+    error = np.random.default_rng(1).normal(0, 0.005, voltage.size)
+    write_record(Record(voltage, 0.1 * voltage + error, 1e-3), tmp_path / "record.h5")
+    text = '[record]\nfile = "record.h5"\n'
+    kinds = [finding.kind for finding in of(text, tmp_path).findings["record"]]
+    assert ["one amplitude", "no hysteresis"] == kinds
+    linear = of(f'{text}[model]\nhysteresis = "linear"\n', tmp_path)
+    assert () == linear.findings["record"]
+
+
 def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -> None:
     transient = SPOILT["switch-on transient"](looping(0), np.random.default_rng(0))
     write_record(transient, tmp_path / "record.h5")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference import engine
+from bwbayes.inference import compiled, engine
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.engine import choose
 from bwbayes.inference.posterior import Posterior
@@ -153,6 +153,16 @@ def test_both_engines_simulate_alike(name: str, parts: bool) -> None:
     size = np.abs(expected).max(axis=1, keepdims=True)
     tolerance = 1e-6 if name in ("jiles-atherton", "domain-wall") else 1e-11
     assert (np.abs(got - expected) <= tolerance * size).all()
+
+
+@pytest.mark.parametrize("name", HYSTERESIS)
+def test_what_is_rehearsed_simulates_and_whitens_but_needs_no_products(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process does it, in which an error would not be seen."""
+    posterior = replace(of_operator(name), engine="numba")
+    monkeypatch.setattr(compiled.kernels, "sums", None)
+    compiled.rehearse(posterior)
 
 
 def test_twin_a_defect_of_a_millionth_is_found() -> None:

@@ -80,13 +80,21 @@ class Problem:
 
     @cached_property
     def findings(self) -> dict[str, tuple[Finding, ...]]:
-        """What is wrong with each record that is fitted, and not made up for by the others."""
-        made_up_for = ("one amplitude", "few readings") if len(self.records) > 1 else ()
+        """What is wrong with each record that is fitted, and matters to the model.
+
+        Several records make up for what one of them does not show, and a model without hysteresis
+        needs no loops.
+        """
+        no_matter: tuple[str, ...] = ()
+        if len(self.records) > 1:
+            no_matter += ("one amplitude", "few readings", "no hysteresis")
+        if self.config.model.hysteresis == "linear":
+            no_matter += ("one amplitude", "no hysteresis")
         return {
             name: tuple(
                 finding
                 for finding in findings_of(record, [*chain(*self.windows(name).values())])
-                if finding.kind not in made_up_for
+                if finding.kind not in no_matter
             )
             for name, record in self.records.items()
         }
