@@ -20,7 +20,8 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
 from bwbayes.record.io.columns import QUANTITIES, Naming, select
-from bwbayes.record.io.grid import VoltageIs, clock, record_fields, require_voltage_is
+from bwbayes.record.io.fields import VoltageIs, record_fields, require_voltage_is
+from bwbayes.record.io.grid import clock
 from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.shown import brief
 
@@ -115,7 +116,7 @@ class Record:
         interval, start : float, s
             Sampling interval, and time of the first sample (default: 0).
         time : array (samples,), s
-            Times of the samples, uniform, in place of interval and start; dates and durations too.
+            Times of the samples, in place of interval and start; dates and durations too.
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
             ``"-nm"`` turns the sign.
@@ -128,7 +129,7 @@ class Record:
         Warns
         -----
         InputWarning
-            If samples are missing between the times, in which a commanded voltage was held.
+            If samples are missing between the times, or they are not uniform.
 
         Examples
         --------

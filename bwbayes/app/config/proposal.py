@@ -28,8 +28,9 @@ from bwbayes.model.registry import DYNAMICS
 from bwbayes.model.reversals import rate
 from bwbayes.record import Record
 from bwbayes.record.io.columns import ColumnTable, Naming
+from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.formats import read_table
-from bwbayes.record.io.grid import decimals_of, record_fields
+from bwbayes.record.io.grid import decimals_of
 
 
 @dataclass(frozen=True)

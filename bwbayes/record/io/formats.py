@@ -19,7 +19,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.record.io.columns import QUANTITIES, ColumnTable, Naming, select
-from bwbayes.record.io.grid import VoltageIs, record_fields, reference_fields, require_voltage_is
+from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields, require_voltage_is
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
@@ -29,7 +29,7 @@ from bwbayes.record.record import Record
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
 # What a folder of records is searched for.
-SUFFIXES = (*_TEXT, *_BINARY, ".lvm", ".tdms")
+SUFFIXES = (*_TEXT, *_BINARY, ".lvm", ".tdms", ".gz")
 
 
 def read_record(
@@ -46,10 +46,11 @@ def read_record(
     Parameters
     ----------
     path : path
-        Text of any layout, HDF5, MATLAB, LabVIEW's LVM or TDMS; the content says which. Columns
-        may carry their units in their names, `time_s`, `voltage_V`, `displacement_um` or with other
-        SI prefixes; time must be uniform. Other names are recognized where they can mean nothing
-        else: ``t [ms]``, ``U_mV``, ``pos (nm)``.
+        Text of any layout, packed by gzip or not, HDF5, MATLAB, LabVIEW's LVM or TDMS; the content
+        says which. Columns may carry their units in their names, `time_s`, `voltage_V`,
+        `displacement_um` or with other SI prefixes. Other names are recognized where they can mean
+        nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``. Times that are not uniform are taken as
+        the nearest that are.
     voltage_is : "command", "output" or None
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
@@ -73,8 +74,8 @@ def read_record(
     Warns
     -----
     InputWarning
-        If columns are ignored, a column is recognized by nothing but its unit, or a commanded
-        voltage is held where samples are missing.
+        If columns are ignored, a column is recognized by nothing but its unit, samples are missing,
+        or times are not uniform.
     """
     path = Path(path)
     if voltage_is is not None:

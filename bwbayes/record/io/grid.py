@@ -1,49 +1,57 @@
-"""From the columns of a file to a record that can be trusted: units, a uniform time grid, checks.
+"""The uniform grid on which the samples of a record are, from their times.
 
-What all formats share is checked here: lengths, finite numbers, times that are uniform as far as
-their digits can tell, a voltage and a displacement that move. A displacement may be missing here
-and there (nan), and so may whole samples where the voltage is a command, which is held. A problem
-is one line, ``file:line: column: problem; what to do``; files without lines name the sample,
-counted from 0. Time stamps of a clock count from the first of them.
+Times count as uniform as far as their digits can tell. Where samples are missing, the others stay
+at their places. Where times scatter, as those of a loop in a program do, samples move to the
+nearest times of the grid, along the columns' slopes. Time stamps of a clock count from the first.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from typing import Any, Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.series import MAXIMUM_SAMPLES
 
-VoltageIs = Literal["command", "output"]
-"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
 
-_MINIMUM_SAMPLES = 10
-
-
-class _Grid(NamedTuple):
+class Grid(NamedTuple):
     """The times of a record, s, what a clock adds to them, and where the samples are on the grid.
 
-    ``positions`` (samples,) are given where some samples are missing.
+    Where not all times of the grid have one sample each, the samples ``kept`` (kept,) are at
+    ``positions``; where they were taken at other times, ``elapsed`` (samples,) has these, s.
     """
 
     start: float
     interval: float
     time_offset: float = 0.0
     positions: IntArray | None = None
+    kept: IntArray | None = None
+    elapsed: FloatArray | None = None
 
+    def filled(self, values: FloatArray) -> FloatArray:
+        """Return a column (samples,) at all times of the grid, nan where no sample is.
 
-def require_voltage_is(text: str) -> VoltageIs:
-    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
-    for kind in get_args(VoltageIs):
-        if text == kind:
-            return kind  # type: ignore[no-any-return]
-    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
+        Values that were taken a little earlier or later are moved along the column's own slope, by
+        central differences. That keeps a branch of a loop, as it keeps all that is linear, and
+        white noise, but for a tenth more of its variance where they are moved by half an interval.
+        """
+        if self.positions is None:
+            return values
+        full = np.full(int(self.positions[-1]) + 1, np.nan)
+        full[self.positions] = values[self.kept]
+        if self.elapsed is not None:
+            known = ~np.isnan(values)
+            between = np.interp(self.elapsed, self.elapsed[known], values[known])
+            slope = np.gradient(between, self.elapsed)[self.kept]
+            full[self.positions] += slope * (
+                self.interval * self.positions - self.elapsed[self.kept]
+            )
+        return full
 
 
 def decimals_of(interval: float) -> int:
@@ -56,133 +64,20 @@ def clock(time: float, interval: float) -> str:
     return f"{round(float(time), decimals_of(interval)):.15g}"
 
 
-def record_fields(
-    table: ColumnTable, voltage_is: VoltageIs | None = None, need_displacement: bool = True
-) -> dict[str, Any]:
-    """Return a record's arguments, after all checks that do not depend on the format.
-
-    ``voltage_is`` overrides what the file says; a file that says nothing means "output". Without
-    the need of a displacement, one that is missing everywhere is a planned voltage.
+def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
+    """Return the grid of a table's times, whose values in s are ``stamps`` (samples,).
 
     Raises
     ------
     InputError
-        For the first problem, in one line.
+        Times are repeated or go back, or a gap makes the record too long.
 
     Warns
     -----
     InputWarning
-        If samples are missing in which a command was held.
+        If samples are missing, or times are not uniform.
     """
-    _check_lengths(table)
-    try:
-        kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
-    except InputError as error:
-        raise table.error(str(error)) from error
-    grid = _grid(table, held=kind == "command")
-    values = {name: _converted(table, name) for name in table.columns if name != "time"}
-    if values["voltage"].size < _MINIMUM_SAMPLES:
-        raise table.error(
-            f"too short, samples: {values['voltage'].size}; give at least {_MINIMUM_SAMPLES}"
-        )
-    _check_moving(table, "voltage", values["voltage"])
-    if not need_displacement and np.isnan(values.get("displacement", 0.0)).all():
-        del values["displacement"]
-    if "displacement" in values:
-        readings = values["displacement"][~np.isnan(values["displacement"])]
-        if readings.size < _MINIMUM_SAMPLES:
-            problem = f"too few readings: {readings.size}; give at least {_MINIMUM_SAMPLES}"
-            raise table.error(problem, "displacement")
-        _check_moving(table, "displacement", readings)
-    if grid.positions is not None:
-        values = {name: _filled(v, grid.positions, name) for name, v in values.items()}
-    return {
-        "displacement": None,
-        **values,
-        "interval": grid.interval,
-        "start": grid.start,
-        "voltage_is": kind,
-        "origin": table.notes.get("origin") or table.source.path.name,
-        "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
-    }
-
-
-def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
-    """Return a displacement that is asked for, (samples,), um, and its sampling interval, s.
-
-    Raises
-    ------
-    InputError
-        For the first problem, in one line.
-    """
-    _check_lengths(table)
-    interval = _grid(table, held=False).interval
-    values = _converted(table, "displacement")
-    if np.isnan(values).any():
-        sample = int(np.argmax(np.isnan(values)))
-        raise table.error("not a number; give one at every sample", "displacement", sample)
-    return values, interval
-
-
-def _check_lengths(table: ColumnTable) -> None:
-    (first, *_), others = table.columns, table.columns.items()
-    samples = table.columns[first].values.size
-    for quantity, column in others:
-        if column.values.size != samples:
-            problem = f"{column.values.size} values where {first} has {samples}"
-            raise table.error(f"{problem}; store one per sample", quantity)
-    if samples < 2:
-        raise table.error(f"too short, samples: {samples}; give at least {_MINIMUM_SAMPLES}")
-
-
-def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None:
-    extent = float(np.ptp(values))
-    if extent == 0:
-        problem = f"constant at {values[0]:g}; give a record in which it moves"
-        raise table.error(problem, quantity)
-    if extent < 1e-9:  # V or um
-        problem = f"moves by {extent:.3g} at most, which is absurdly little; check the unit"
-        raise table.error(problem, quantity)
-
-
-def _converted(table: ColumnTable, quantity: str) -> FloatArray:
-    """Return a column in the package's unit after refusing what is not finite or absurdly large."""
-    column = table.columns[quantity]
-    largest = 1e12 if quantity == "time" else 1e9  # s; V or um, whatever the actuator
-    with np.errstate(all="ignore"):
-        values = column.scaled(np.asarray(column.values, dtype=np.float64), quantity)
-        refused = ~(np.abs(values) <= largest)
-    if quantity == "displacement":
-        refused &= ~np.isnan(values)
-    if refused.any():
-        sample = int(np.argmax(refused))
-        raw = column.values[sample]
-        problem = f"{raw:g} is absurdly large; check the unit in the column's name"
-        if not np.isfinite(raw):
-            fact = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
-            problem = f"{fact}; give one at every sample (only a displacement may be missing: nan)"
-        raise table.error(problem, quantity, sample)
-    return values
-
-
-def _filled(values: FloatArray, positions: IntArray, quantity: str) -> FloatArray:
-    """Return a column on the whole grid: the voltage held in the gaps, all else missing there."""
-    if quantity == "voltage":
-        return np.repeat(values, np.diff(positions, append=positions[-1] + 1))
-    full = np.full(int(positions[-1]) + 1, np.nan)
-    full[positions] = values
-    return full
-
-
-def _grid(table: ColumnTable, held: bool) -> _Grid:
-    """Return the grid of the times after checking that they are uniform.
-
-    With `held` samples may be missing; then their positions on the whole grid are given.
-    """
-    if "time" not in table.columns:
-        fs, interval = table.naming.fs, table.source.interval
-        return _Grid(table.source.start, 1 / fs if fs else interval or 0.0)
-    column, stamps = table.columns["time"], _converted(table, "time")
+    column = table.columns["time"]
     is_float = column.values.dtype.kind == "f"
     raw = column.values if is_float else column.values.astype(np.int64)
     # From the first one on, which loses no digits of a clock's times. No measurement counts from
@@ -203,33 +98,67 @@ def _grid(table: ColumnTable, held: bool) -> _Grid:
     if typical < 1e-12:
         problem = f"steps of {typical:.3g} s are absurdly small; check the unit"
         raise table.error(problem, "time")
-    gaps = steps > 1.5 * typical
-    positions = np.arange(elapsed.size)
-    if held and gaps.any():
-        # The mean of the other steps, as the rounding of the times goes to nothing in it.
-        counts = np.maximum(np.rint(steps / steps[~gaps].mean()), 1.0)
-        if counts.sum() >= MAXIMUM_SAMPLES:
-            sample = int(np.argmax(steps))
-            problem = f"gap of {steps[sample]:.6g} s makes the record too long; cut it there"
-            raise table.error(problem, "time", sample + 1)
-        positions = np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
-    interval = float(elapsed[-1] / positions[-1])
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
-    tolerance = _tolerance(stamps, interval, rounding)
-    deviation = np.abs(elapsed - interval * positions)
-    if not (deviation <= tolerance).all():
-        raise _uneven(table, elapsed + (start - offset), tolerance, deviation, held)
-    interval = _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
-    if positions[-1] < elapsed.size:
-        return _Grid(start - offset, interval, offset)
-    lost, count = int(positions[-1]) + 1 - elapsed.size, int(np.count_nonzero(gaps))
-    remark = f"{lost} samples are missing, from here on in {count} gap{'s' * (count > 1)}"
-    error = table.error(
-        f"{remark}; the commanded voltage is taken as held there", "time", int(np.argmax(gaps)) + 1
+    samples = np.arange(elapsed.size)
+    for positions in (samples, _with_gaps(table, steps)):
+        interval = float(elapsed[-1] / positions[-1])
+        tolerance = _tolerance(stamps, interval, rounding)
+        if (np.abs(elapsed - interval * positions) <= tolerance).all():
+            interval = _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
+            grid = Grid(start - offset, interval, offset)
+            is_whole = positions[-1] < elapsed.size
+            return grid if is_whole else grid._replace(positions=positions, kept=samples)
+    return _moved(table, elapsed, positions, start - offset, offset)
+
+
+def _moved(
+    table: ColumnTable, elapsed: FloatArray, positions: IntArray, start: float, time_offset: float
+) -> Grid:
+    """Return the grid that lies nearest to times that are on none, s after the first of them.
+
+    ``positions`` (samples,) on it are right but for a few.
+    """
+    kept = np.arange(elapsed.size)
+    first, interval = np.polynomial.polynomial.polyfit(positions, elapsed, 1)
+    elapsed = elapsed - first
+    away = np.abs(elapsed - interval * positions)
+    if away.max() > 0.4 * interval:
+        nearest = np.rint(elapsed / interval).astype(np.int64)
+        away = np.abs(elapsed - interval * nearest)
+        order = np.lexsort((away, nearest))
+        positions, index = np.unique(nearest[order], return_index=True)
+        kept = order[index]
+    scatter = float(away.max())
+    # As exact as three standard errors of the line's slope.
+    unsure = 1.5 * scatter / math.sqrt(elapsed.size)
+    interval = _exact_interval(table, interval, scatter, unsure, int(np.ptp(positions)))
+    remark = f"up to {scatter:.2g} s off a uniform grid, and moved to its nearest times"
+    if shared := elapsed.size - kept.size:
+        remark += f"; {shared} samples that share one with another are left out"
+    remark = str(table.error(remark, "time", int(np.argmax(away))))
+    warnings.warn(remark, InputWarning, stacklevel=6)
+    begin = interval * positions[0]
+    return Grid(
+        start + float(first + begin),
+        interval,
+        time_offset,
+        positions - positions[0],
+        kept,
+        elapsed - begin,
     )
-    warnings.warn(str(error), InputWarning, stacklevel=4)
-    return _Grid(start - offset, interval, offset, positions)
+
+
+def _with_gaps(table: ColumnTable, steps: FloatArray) -> IntArray:
+    """Return where samples are that follow one another by these steps, s, if some are missing."""
+    gaps = steps > 1.5 * np.median(steps)
+    # The mean of the other steps, as the rounding of the times goes to nothing in it.
+    counts = np.where(gaps, np.rint(steps / steps[~gaps].mean()), 1.0)
+    if counts.sum() >= MAXIMUM_SAMPLES:
+        sample = int(np.argmax(steps))
+        problem = f"gap of {steps[sample]:.6g} s makes the record too long; cut it there"
+        raise table.error(problem, "time", sample + 1)
+    return np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
 
 
 def _tolerance(stamps: FloatArray, interval: float, rounding: float) -> float:
@@ -246,34 +175,6 @@ def _tolerance(stamps: FloatArray, interval: float, rounding: float) -> float:
             printed = 0.999 * unit
             break
     return max(0.01 * interval, min(max(printed, rounding), 0.4 * interval))
-
-
-def _uneven(
-    table: ColumnTable, time: FloatArray, tolerance: float, deviation: FloatArray, held: bool
-) -> InputError:
-    """Return the error that says where the times leave the grid, and by how much."""
-    steps = np.diff(time)
-    typical = float(np.median(steps))
-    is_off = np.abs(steps - typical) > tolerance
-    if not is_off.any():
-        sample = int(np.argmax(deviation))
-        problem = f"irregular sampling: {deviation[sample]:.3g} s off the uniform grid"
-        return table.error(f"{problem}; resample it or print more decimals", "time", sample)
-    sample = int(np.argmax(is_off)) + 1
-    step, before = float(steps[sample - 1]), clock(time[sample - 1], typical)
-    problem = f"irregular sampling: {step:.6g} s after the sample before, {typical:.6g} s elsewhere"
-    advice = "resample it on a uniform grid"
-    if step > 1.5 * typical and held:
-        problem = f"gap of {step:.6g} s is not a whole number of intervals of {typical:.6g} s"
-        advice = "resample it or cut the record"
-    elif step > 1.5 * typical:
-        missing = round(step / typical) - 1
-        problem = f"gap of {step:.6g} s after {before} s, about {missing} missing"
-        advice = (
-            "give the voltage there (the displacement may be nan), say voltage_is = "
-            '"command" if it was held, or cut the record'
-        )
-    return table.error(f"{problem}; {advice}", "time", sample)
 
 
 def _exact_interval(

@@ -1,16 +1,17 @@
 """Text files: columns of numbers, with a header above them or without one.
 
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
-have decimal commas. The numbers are looked for, and the line above them names the columns; a second
-line may hold their units. What stands above the header is skipped with a remark, but for lines
-``# key: value`` of which ``voltage`` (command or output), ``origin``, ``interval_s`` and
-``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is a missing reading.
-A line that cannot be read is named with its number.
+have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
+them names the columns; a second line may hold their units. What stands above the header is skipped
+with a remark, but for lines ``# key: value`` of which ``voltage`` (command or output), ``origin``,
+``interval_s`` and ``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is
+a missing reading. A line that cannot be read is named with its number.
 """
 
 from __future__ import annotations
 
 import csv
+import gzip
 import re
 import warnings
 from collections import Counter
@@ -121,7 +122,11 @@ def write_text(record: Record, path: Path) -> None:
 
 def _decoded(path: Path) -> str:
     """Return a file's text with line ends as on Unix, whatever its encoding is."""
-    data = path.read_bytes()
+    with path.open("rb") as file:
+        is_packed = file.read(2) == b"\x1f\x8b"
+    # No more of what is packed than can be a record.
+    with gzip.open(path) if is_packed else path.open("rb") as file:
+        data = file.read(2**31)
     if not data.strip():
         raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and a line a sample")
     try:

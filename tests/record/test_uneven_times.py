@@ -1,0 +1,113 @@
+"""Times that are not uniform: samples move to the nearest ones of a grid, along their slopes."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.record import Record
+
+
+def uneven(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Record:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return Record.from_arrays(voltage, displacement, time=time)
+
+
+@given(
+    st.integers(200, 3000),
+    st.floats(-5, 0),
+    st.floats(-100, 100),
+    st.floats(0.02, 0.14),
+    st.booleans(),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=60, deadline=None)
+def test_columns_are_what_they_were_at_the_times_of_the_grid(
+    samples: int, exponent: float, start: float, jitter: float, drifts: bool, seed: int
+) -> None:
+    """Any scatter of any clock, about a grid or from step to step, displacements missing or not.
+
+    A cubic is met within what central differences leave of it, twenty times better than by taking
+    each sample as it is (the twin); a displacement that is linear in the voltage stays so.
+    """
+    rng, interval = np.random.default_rng(seed), 10.0**exponent
+    scatter = jitter * interval * np.clip(rng.standard_normal(samples), -3, 3)
+    time = start + interval * np.arange(samples) + (np.cumsum(scatter) if drifts else scatter / 2)
+
+    def voltage(time: FloatArray) -> FloatArray:
+        phase = (time - start) / (samples * interval)
+        result: FloatArray = 100 * phase * (1 - phase) * (1.5 - phase)
+        return result
+
+    displacement = 0.3 * voltage(time) - 5.0
+    displacement[2:-2][rng.random(samples - 4) < 0.05] = np.nan
+    record = uneven(time, voltage(time), displacement)
+    assert record.interval == pytest.approx(interval, rel=0.05)
+    moved = np.abs(record.voltage - voltage(record.time))[1:-1].max()
+    assert moved <= 20 * 150 / samples**2
+    as_it_is = np.abs(voltage(time) - voltage(start + interval * np.arange(samples)))
+    assert moved < 0.2 * as_it_is.max()
+    assert record.displacement is not None
+    has = record.has_reading
+    np.testing.assert_allclose(
+        record.displacement[has], 0.3 * record.voltage[has] - 5.0, atol=0.3 * 1200 / samples**2
+    )
+    lost = np.count_nonzero(~np.isnan(displacement)) - record.readings
+    assert 0 <= lost <= (0.3 * samples if drifts else 0)
+
+
+def test_white_noise_stays_white() -> None:
+    """Over 40,000 readings: variance at most a seventh more, neighbors within 0.03 of unrelated."""
+    rng = np.random.default_rng(5)
+    time = np.cumsum(rng.uniform(0.75, 1.25, 40_000))
+    record = uneven(time, np.sin(time / 50), rng.standard_normal(40_000))
+    assert record.displacement is not None
+    noise = np.nan_to_num(record.displacement)
+    assert 0.98 <= np.nanvar(record.displacement) <= 1.14
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) <= 0.03
+
+
+def test_what_is_done_is_said() -> None:
+    rng = np.random.default_rng(3)
+    time = np.arange(500) * 0.01
+    voltage = np.sin(time)
+    with pytest.warns(InputWarning, match=r"up to 0.0003. s off a uniform grid, and moved to its"):
+        record = Record.from_arrays(voltage, voltage, time=time + rng.uniform(-3e-4, 3e-4, 500))
+    assert 0.01 == record.interval
+    steps = 0.01 * rng.uniform(0.7, 1.3, 499)
+    time = np.concatenate([[0.0], np.cumsum(steps)])
+    with (
+        pytest.warns(InputWarning, match=r"\d+ samples that share one with another are left out"),
+        pytest.warns(
+            InputWarning, match=r"\d+ samples are missing, .* is taken as on a line there"
+        ),
+    ):
+        Record.from_arrays(np.sin(time), np.sin(time), time=time)
+
+
+@pytest.mark.parametrize(
+    ("missing", "period", "accepted"),
+    [(3, 300, True), (3, 20, False), (40, 300, False)],
+)
+def test_a_short_gap_in_a_smooth_output_is_bridged_and_a_long_one_refused(
+    missing: int, period: int, accepted: bool
+) -> None:
+    """A line across the gap is accepted where it can hide no extremum of 1 % of the range."""
+    index = np.delete(np.arange(2000), np.arange(1000, 1000 + missing))
+    voltage = 50 * np.sin(2 * np.pi * np.arange(2000) / period)
+    arrays = voltage[index], voltage[index] * 0.4
+    if not accepted:
+        with pytest.raises(InputError, match=rf"gap of .* after .*, about {missing} missing; give"):
+            Record.from_arrays(*arrays, time=index * 0.001)
+        return
+    record = uneven(0.001 * index.astype(np.float64), *arrays)
+    assert (2000, 2000 - missing) == (record.samples, record.readings)
+    np.testing.assert_allclose(record.voltage, voltage, atol=1.0)
+    np.testing.assert_array_equal(record.voltage[index], voltage[index])
