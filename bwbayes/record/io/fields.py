@@ -165,11 +165,13 @@ def _without_gaps(
         return values
     values, steps = grid.filled(values)[positions], np.diff(positions)
     longest, samples = int(np.argmax(steps)), int(positions[-1]) + 1
-    missing, half = int(steps[longest]) - 1, (int(steps[longest]) + 1) // 2
+    missing = int(steps[longest]) - 1
     if missing and not held:
         # Hysteresis depends on extrema alone: how far beyond both ends such a gap would hide one.
-        ends, middle = np.array([values[: -2 * half], values[2 * half :]]), values[half:-half]
-        hidden = np.abs(middle - np.clip(middle, ends.min(axis=0), ends.max(axis=0)))
+        ends = np.array([values[: -missing - 1], values[missing + 1 :]])
+        lowest, highest = ends.min(axis=0), ends.max(axis=0)
+        inside = [values[i : i + lowest.size] for i in {(missing + 1) // 2, missing // 2 + 1}]
+        hidden = np.abs(inside - np.clip(inside, lowest, highest))
         if not (hidden.size and hidden.max() <= 0.01 * np.ptp(values)):
             since = clock(grid.start + positions[longest] * grid.interval, grid.interval)
             held_too = ""
