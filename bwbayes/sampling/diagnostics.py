@@ -71,6 +71,11 @@ class Check:
         """Whether the proposal, if there is one, covers the draws."""
         return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
+    @property
+    def fewest(self) -> float:
+        """The effective draws of the parameter that has the fewest, of ranks or tails."""
+        return float(np.min([self.ess_bulk, self.ess_tail]))
+
     def shortcomings(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
@@ -78,9 +83,9 @@ class Check:
         ``fraction`` is enough. Every comparison is written so that nan fails it.
         """
         reasons = self.disagreements()
-        fewest, draws = np.min([self.ess_bulk, self.ess_tail]), fraction * ess
-        if not fewest >= draws:
-            reasons.append(f"ESS {np.floor(fewest):.0f} has not reached {draws:g}")
+        draws = fraction * ess
+        if not self.fewest >= draws:
+            reasons.append(f"ESS {np.floor(self.fewest):.0f} has not reached {draws:g}")
         times, length = self.steps / np.max(self.autocorrelation), fraction * LENGTH
         if not times >= length:
             reasons.append(f"{np.floor(times):.0f} autocorrelation times are fewer than {length:g}")

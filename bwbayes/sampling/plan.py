@@ -66,9 +66,7 @@ def best_together(ensembles: int, walkers: int, samples: int) -> int:
 def best_places(walkers: int, samples: int) -> int:
     """Return how many places a step of the mixture has to choose from, on so many samples.
 
-    Several where readings are few, four of 20 readings with 64 walkers: they tell little, and the
-    mixture covers so wide and curved a posterior badly. 24 such fits took 3.1 CPU s on the mean and
-    2.4 s at the median (fits of 300 readings 3.0 and 2.0); with two places 4.7 and 2.2 s, with six
-    3.3 and 2.7 s.
+    Several where a step is mostly Python's work, four of up to 256 samples with 64 walkers: what a
+    short record leaves open is wide and curved, and the mixture covers it badly.
     """
-    return max(1, min(4, (1 << 13) // (walkers * samples)))
+    return max(1, min(4, (1 << 16) // (walkers * samples)))

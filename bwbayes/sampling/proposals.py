@@ -21,10 +21,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
-# Where the draws are first cut, along their most skewed coordinate: body, flank and tail.
-CUTS = (0.5, 0.85)
-PARTS = len(CUTS) + 1
-
 _ARRAYS = ("weights", "centers", "factors", "freedom")
 
 
@@ -62,6 +58,7 @@ class StudentMixture:
     def fitted(cls, draws: FloatArray, log_density: FloatArray | None = None) -> StudentMixture:
         """Fit to draws (count, free), by expectation maximization of a Gaussian mixture.
 
+        Of three components, or up to six where draws are many: few would be followed too closely.
         With their log densities (count,) under what they are drawn from, the mixture gets one more
         component, of the draws where log p − log q is largest: a walker that is there would hardly
         be led away.
@@ -77,11 +74,12 @@ class StudentMixture:
             draws = bend.to_straight(draws)
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
-        mixture = _first_cut(sample)
+        mixture = _first_cut(sample, parts=min(max(len(draws) // 4_000, 3), 6))
         for _ in range(25):
             mixture = mixture._fitted_on(sample)
+        sample = subsample(draws, 10_000)
         for _ in range(5):
-            mixture = mixture._fitted_on(draws)
+            mixture = mixture._fitted_on(sample)
         if log_density is not None:
             mixture = mixture._with_worst(draws, log_density - mixture.log_density(draws))
         return replace(mixture, bend=bend)
@@ -95,11 +93,11 @@ class StudentMixture:
         The first three modes; of fewer, the same ones again, twice and three times as wide. No
         component gets less than a twelfth: the shares of modes are a guess.
         """
-        modes = np.arange(PARTS) % len(optima)
-        widths = 1.0 + np.arange(PARTS) // len(optima)
+        modes = np.arange(3) % len(optima)
+        widths = 1.0 + np.arange(3) // len(optima)
         factors = widths[:, np.newaxis, np.newaxis] * np.linalg.cholesky(covariances)[modes]
         split_shares = shares[modes] / np.bincount(modes)[modes]
-        weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / PARTS
+        weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / 3
         return cls(weights, optima[modes], factors)
 
     def arrays(self) -> dict[str, Any]:
@@ -152,11 +150,14 @@ class StudentMixture:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free)."""
-        lost = 0.0
-        if self.bend is not None:
-            coordinates, lost = self.bend.to_straight(coordinates), self.bend.log_volume
-        density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(coordinates))) - lost
-        return density
+        flat = coordinates.reshape(-1, coordinates.shape[-1])
+        density, lost = np.empty(len(flat)), 0.0 if self.bend is None else self.bend.log_volume
+        for start in range(0, len(flat), 1 << 15):  # the components take memory
+            chunk = flat[start : start + (1 << 15)]
+            straight = chunk if self.bend is None else self.bend.to_straight(chunk)
+            parts = self.log_parts(self.squares(straight))
+            density[start : start + len(chunk)] = np.logaddexp.reduce(parts) - lost
+        return density.reshape(coordinates.shape[:-1])
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw coordinates (count, free) with emcee's generator."""
@@ -197,14 +198,12 @@ def _require_spread(draws: FloatArray) -> None:
         raise np.linalg.LinAlgError("the draws do not span the space")
 
 
-def _first_cut(draws: FloatArray) -> StudentMixture:
-    """Cut draws (count, free) along their most skewed coordinate."""
-    shape = np.asarray(scipy.stats.skew(draws, axis=0))
-    axis = int(np.argmax(np.abs(shape)))
-    # Ranks from the body of the distribution to its longer tail.
-    along = draws[:, axis] * (1 if shape[axis] >= 0 else -1)
-    start = np.searchsorted(np.quantile(along, CUTS), along)
-    return _of_shares(draws, np.equal.outer(np.arange(PARTS), start))
+def _first_cut(draws: FloatArray, parts: int) -> StudentMixture:
+    """Let draws (count, free) belong to the nearest of a few of them, in units of their sds."""
+    white = draws / np.std(draws, axis=0)
+    few = white[np.linspace(0, len(white) - 1, parts).astype(int)]
+    nearest = np.argmin(np.sum((few[:, np.newaxis] - white) ** 2, axis=2), axis=0)
+    return _of_shares(draws, np.equal.outer(np.arange(parts), nearest))
 
 
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:

@@ -2,21 +2,21 @@
 
 The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
 by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
-draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on,
-each time with a new fit and twice as long: a long, curved posterior needs more draws to be seen
-whole. Pilot and tuning are thrown away. Then draws count, and the chain is judged
-(:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row find nothing wrong, the first
-on half the draws that are to be reached, the second on all of them and a fifth more than the first
-at least; or the budget of steps is used up.
+draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on a
+little, each time with a new fit and twice as long. Pilot and tuning are thrown away. Then draws
+count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row
+find nothing wrong, the first on half the draws that are to be reached, the second on all of them
+and a fifth more than the first at least; or the budget of steps is used up.
 To judge costs as much as many steps, so each judgment predicts how long the chain must become,
 and the next one waits until then, and until the chain is long against its autocorrelation times.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
-from there. It is judged on the draws that it made, by Pareto k. Above 0.7 they are set aside, and
-the sampling starts again from where the ensembles are with another proposal, which is fitted to all
-that was set aside, for that has been where the first hardly goes. After half of the budget
-differential evolution goes on alone, which needs about ten times the steps. So all draws that count
-come from one kernel, fixed before the first of them.
+from there. It is judged on the draws that it made, by Pareto k, and by whether effective draws grow
+with the steps. Where k is above 0.7, or where a chain that was to be long enough is far from it,
+the draws are set aside, and the sampling starts again from where the ensembles are with another
+proposal, which is fitted to all that was set aside, for that has been where the first hardly goes.
+If k is above 0.7 after half of the budget, differential evolution goes on alone, which needs about
+ten times the steps. So all draws that count come from one kernel, fixed before the first of them.
 
 All decisions are functions of the chain alone, and are taken again from its beginning when a run
 that was interrupted goes on: it comes to the same end.
@@ -58,6 +58,9 @@ from bwbayes.sampling.proposals import StudentMixture
 FIRST_CHECK = 2
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
+
+# Where a chain was to be long enough and is too short by this factor, its proposal is to blame.
+LARGEST_SHORTFALL = 1.2
 
 # Of the two checks that a chain must pass: for the first, this part of the draws that are to be
 # reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
@@ -116,16 +119,20 @@ class _Sampling:
     watcher: Watcher
 
     def run(self) -> Outcome:
-        plan, chain = self.plan, self.chain
+        chain = self.chain
         while not chain.blocks("tuning") and not self._pilot_is_done():
             self._extend("pilot")
         if not chain.history("sampling"):
             self._tune()
         while (outcome := self._sampled()) is None:
-            blocks = chain.history("sampling")
-            early = len(blocks) * plan.block <= plan.most_steps / 2
-            chain.fall_back(len(blocks), _refit(chain) if early else None)
+            blocks = len(chain.history("sampling"))
+            chain.fall_back(blocks, _refit(chain) if self._is_early else None)
         return replace(outcome, remarks=_remarks(chain))
+
+    @property
+    def _is_early(self) -> bool:
+        """Whether there is budget enough for one more proposal."""
+        return len(self.chain.history("sampling")) * self.plan.block <= self.plan.most_steps / 2
 
     def _extend(self, phase: Phase) -> None:
         """Advance every ensemble by a block, wherever the executor likes."""
@@ -165,14 +172,15 @@ class _Sampling:
     def _tune(self) -> None:
         """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
 
-        The first is one block; others follow until walkers take half of the places, at most 16
-        blocks in all, or 64 where walkers hardly take any place. A run that goes on within a round
-        fits again to what that round had begun with.
+        The first is one block; others follow until walkers take half of the places, or most where a
+        step has several to choose from, at most four blocks in all: where these do not suffice, the
+        sampling will tell. A run that goes on within a round fits again to what that round had
+        begun with.
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
         begin, end, rate = 0, 1, 0.0
-        while rate < 0.5 and end <= (16 if rate > 0.25 else 64):
+        while rate < (0.8 if plan.places > 1 else 0.5) and end <= 4:
             if chain.blocks("tuning") < end:
                 chain.freeze("tuning", proposal)
             while chain.blocks("tuning") < end:
@@ -190,20 +198,27 @@ class _Sampling:
         plan, chain = self.plan, self.chain
         # A chain may be longer than its budget, if that was made smaller.
         budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+        fitted_to = chain.set_aside if chain.refit else 0
         blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
+        was_predicted = False  # to be long enough by now
         while True:
             blocks = min(blocks, budget)
             while chain.blocks("sampling") < blocks:
                 self._extend("sampling")
+            at_end = blocks == chain.blocks("sampling")
+            drawn = chain.set_aside + blocks
+            may_lag = was_predicted and at_end and drawn >= 2 * fitted_to and self._is_early
+            was_predicted = True
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
             if required > blocks and blocks < budget:
+                if may_lag and required > LARGEST_SHORTFALL * blocks:
+                    return None
                 blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
                 continue
             latest = judgment.check()
             self.watcher("sampling", latest)
             missing = latest.shortcomings(plan.ess)
-            at_end = blocks == chain.blocks("sampling")
             # One whose target was made smaller has converged before its end.
             done = not missing and 0 < APART * passed <= blocks
             if done and at_end:
@@ -211,9 +226,9 @@ class _Sampling:
             if blocks == budget:
                 why = "; ".join(missing) or "only the last check passed"
                 return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
-            fitted_to = chain.set_aside if chain.refit else 0
-            enough = chain.set_aside + blocks >= LEAST_STRETCH * fitted_to
-            if not latest.covered and at_end and enough:
+            if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
+                return None
+            if may_lag and latest.fewest < plan.ess / LARGEST_SHORTFALL:
                 return None
             first = not latest.shortcomings(plan.ess, FIRST_PART)
             passed = (passed or blocks) if first else 0
@@ -263,10 +278,9 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     else is missing. After the first check that ``passed``, at so many blocks, comes the second.
     """
     fraction = 1.0 if passed else FIRST_PART
-    fewest = np.min([latest.ess_bulk, latest.ess_tail])
     with np.errstate(divide="ignore"):
         steps = np.maximum(
-            latest.steps * plan.ess / fewest, LENGTH * np.max(latest.autocorrelation)
+            latest.steps * plan.ess / latest.fewest, LENGTH * np.max(latest.autocorrelation)
         )
     following = max(fraction * steps / plan.block, APART * passed)
     if not following > blocks:  # nan too
@@ -319,8 +333,8 @@ def _remarks(chain: Chain) -> tuple[str, ...]:
         steps = sum(len(block.log_density) for block in flat) // len(chain.starts)
         followed = "one that was fitted to them made the draws that count"
         remarks.append(
-            f"the proposal did not cover the first {steps} steps (Pareto k {shape:.2f}): they are "
-            f"set aside, and {followed if chain.refit else alone}"
+            f"the proposal covered the posterior badly in the first {steps} steps (Pareto k "
+            f"{shape:.2f}): they are set aside, and {followed if chain.refit else alone}"
         )
     thin = thinning(chain.draws("sampling"))
     if thin > 1:

@@ -34,6 +34,18 @@ def command(*words):
     except SystemExit as ended:
         assert ended.code in (0, 3, 4, 5), ended.code
 
+def few(readings, seeds):
+    import numpy as np
+    import bwbayes
+    for seed in range(seeds):
+        rng, t = np.random.default_rng(seed), np.linspace(0, 3, 300)
+        u = 75 * np.exp(-t / 4) * np.sin(2 * np.pi * t)
+        x = 0.7 * u - bwbayes.hysteresis(u, alpha=0.36, beta=0.027, gamma=0.017).ravel()
+        x += 0.3 * np.sin(2.2 * t + seed) + rng.normal(0, 0.1, t.size)
+        x[np.setdiff1d(np.arange(300), np.linspace(0, 299, readings).astype(int))] = np.nan
+        record = bwbayes.Record.from_arrays(u, x, interval=float(t[1]))
+        bwbayes.fit(record, progress=False)
+
 def stand(samples, dynamics="none", **keys):
     import numpy as np
     import bwbayes
@@ -71,6 +83,8 @@ WAITS: dict[str, tuple[str, str, float | None]] = {
     ),
     "fit of 20 readings": ("", "stand(20)", None),
     "fit of 300 readings": ("", "stand(300)", None),
+    "six fits of 20 readings, lag and discrepancy": ("", "few(20, 6)", None),
+    "six fits of 300 readings, lag and discrepancy": ("", "few(300, 6)", None),
     "fit with creep": ("", "stand(20_000, creep=True, folder=out + '/creep')", 0.2),
     "predict with creep": (
         "import bwbayes; fit = bwbayes.open_run(out + '/creep'); record = plan(); fit.converged",
