@@ -11,12 +11,13 @@ To judge costs as much as many steps, so each judgment predicts how long the cha
 and the next one waits until then, and until the chain is long against its autocorrelation times.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
-from there. It is judged on the draws that it made, by Pareto k, and by whether effective draws grow
-with the steps. Where k is above 0.7, or where a chain that was to be long enough is far from it,
-the draws are set aside, and the sampling starts again from where the ensembles are with another
-proposal, which is fitted to all that was set aside, for that has been where the first hardly goes.
-If k is above 0.7 after half of the budget, differential evolution goes on alone, which needs about
-ten times the steps. So all draws that count come from one kernel, fixed before the first of them.
+from there. It is judged on the draws that it made: by Pareto k, and, until there are half of the
+draws that are to be reached, by whether effective draws grow with the steps. Where k is above 0.7,
+or where they do not, the draws are set aside, and the sampling starts again from where the
+ensembles are with another proposal, which is fitted to all that was set aside, for that has been
+where the first hardly goes. If k is above 0.7 after half of the budget, differential evolution goes
+on alone, which needs about ten times the steps. So all draws that count come from one kernel, fixed
+before the first of them.
 
 All decisions are functions of the chain alone, and are taken again from its beginning when a run
 that was interrupted goes on: it comes to the same end.
@@ -59,8 +60,8 @@ FIRST_CHECK = 2
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
-# Where a chain was to be long enough and is too short by this factor, its proposal is to blame.
-LARGEST_SHORTFALL = 1.2
+# A longer chain that has fewer effective draws a step by this factor needs another proposal.
+LARGEST_LAG = 1.2
 
 # Of the two checks that a chain must pass: for the first, this part of the draws that are to be
 # reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
@@ -200,20 +201,20 @@ class _Sampling:
         budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
         fitted_to = chain.set_aside if chain.refit else 0
         blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
-        was_predicted = False  # to be long enough by now
+        needed, efficiency = math.inf, 0.0  # blocks, and effective draws of a block, as told so far
         while True:
             blocks = min(blocks, budget)
             while chain.blocks("sampling") < blocks:
                 self._extend("sampling")
             at_end = blocks == chain.blocks("sampling")
             drawn = chain.set_aside + blocks
-            may_lag = was_predicted and at_end and drawn >= 2 * fitted_to and self._is_early
-            was_predicted = True
+            may_lag = not passed and at_end and drawn >= 2 * fitted_to and self._is_early
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
             if required > blocks and blocks < budget:
-                if may_lag and required > LARGEST_SHORTFALL * blocks:
+                if may_lag and required > LARGEST_LAG * needed:
                     return None
+                needed = required
                 blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
                 continue
             latest = judgment.check()
@@ -228,9 +229,10 @@ class _Sampling:
                 return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
-            if may_lag and latest.fewest < plan.ess / LARGEST_SHORTFALL:
-                return None
             first = not latest.shortcomings(plan.ess, FIRST_PART)
+            if may_lag and not first and LARGEST_LAG * latest.fewest < efficiency * blocks:
+                return None
+            efficiency = latest.fewest / blocks
             passed = (passed or blocks) if first else 0
             blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, latest)
 
