@@ -160,8 +160,8 @@ def _without_gaps(
         It is interpolated, and the longest gap may hide an extremum: between others that are as
         far apart is a value beyond both, by more than 1 % of the range.
     """
-    positions, kept = grid.positions, grid.kept
-    if positions is None or kept is None:
+    positions, sources = grid.positions, grid.sources
+    if positions is None or sources is None:
         return values
     values, steps = grid.filled(values)[positions], np.diff(positions)
     longest, samples = int(np.argmax(steps)), int(positions[-1]) + 1
@@ -182,13 +182,13 @@ def _without_gaps(
             problem = f"gap of {steps[longest] * grid.interval:.6g} s after {since} s"
             advice = f"give the {quantity} there{held_too}, or cut the record"
             problem = f"{problem}, about {missing} missing; {advice}"
-            raise table.error(problem, "time", int(kept[longest + 1]))
+            raise table.error(problem, "time", int(sources[longest + 1]))
     if missing:
         kind = "held" if held else "on a line"
         remark = f"{samples - values.size} samples are missing, from here on in "
         count = int(np.count_nonzero(steps > 1))
         remark += f"{count} gap{'s' * (count > 1)}; the {quantity} is taken as {kind} there"
-        where = int(kept[int(np.argmax(steps > 1)) + 1])
+        where = int(sources[int(np.argmax(steps > 1)) + 1])
         warnings.warn(str(table.error(remark, "time", where)), InputWarning, stacklevel=5)
     if held:
         return np.repeat(values, np.append(steps, 1))

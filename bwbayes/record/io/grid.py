@@ -22,7 +22,7 @@ from bwbayes.record.io.series import MAXIMUM_SAMPLES
 class Grid(NamedTuple):
     """The times of a record, s, what a clock adds to them, and where the samples are on the grid.
 
-    Where not all times of the grid have one sample each, the samples ``kept`` (kept,) are at
+    Where not all times of the grid have one sample each, the samples ``sources`` (sources,) are at
     ``positions``; where they were taken at other times, ``elapsed`` (samples,) has these, s.
     """
 
@@ -30,7 +30,7 @@ class Grid(NamedTuple):
     interval: float
     time_offset: float = 0.0
     positions: IntArray | None = None
-    kept: IntArray | None = None
+    sources: IntArray | None = None
     elapsed: FloatArray | None = None
 
     def filled(self, values: FloatArray) -> FloatArray:
@@ -43,13 +43,13 @@ class Grid(NamedTuple):
         if self.positions is None:
             return values
         full = np.full(int(self.positions[-1]) + 1, np.nan)
-        full[self.positions] = values[self.kept]
+        full[self.positions] = values[self.sources]
         if self.elapsed is not None:
-            known = ~np.isnan(values)
-            between = np.interp(self.elapsed, self.elapsed[known], values[known])
-            slope = np.gradient(between, self.elapsed)[self.kept]
+            measured = ~np.isnan(values)
+            between = np.interp(self.elapsed, self.elapsed[measured], values[measured])
+            slope = np.gradient(between, self.elapsed)[self.sources]
             full[self.positions] += slope * (
-                self.interval * self.positions - self.elapsed[self.kept]
+                self.interval * self.positions - self.elapsed[self.sources]
             )
         return full
 
@@ -108,7 +108,7 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
             interval = _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
             grid = Grid(start - offset, interval, offset)
             is_whole = positions[-1] < elapsed.size
-            return grid if is_whole else grid._replace(positions=positions, kept=samples)
+            return grid if is_whole else grid._replace(positions=positions, sources=samples)
     return _moved(table, elapsed, positions, start - offset, offset)
 
 
@@ -119,7 +119,7 @@ def _moved(
 
     ``positions`` (samples,) on it are right but for a few.
     """
-    kept = np.arange(elapsed.size)
+    sources = np.arange(elapsed.size)
     first, interval = np.polynomial.polynomial.polyfit(positions, elapsed, 1)
     elapsed = elapsed - first
     away = np.abs(elapsed - interval * positions)
@@ -128,13 +128,13 @@ def _moved(
         away = np.abs(elapsed - interval * nearest)
         order = np.lexsort((away, nearest))
         positions, index = np.unique(nearest[order], return_index=True)
-        kept = order[index]
+        sources = order[index]
     scatter = float(away.max())
     # As exact as three standard errors of the line's slope.
     unsure = 1.5 * scatter / math.sqrt(elapsed.size)
     interval = _exact_interval(table, interval, scatter, unsure, int(np.ptp(positions)))
     remark = f"up to {scatter:.2g} s off a uniform grid, and moved to its nearest times"
-    if shared := elapsed.size - kept.size:
+    if shared := elapsed.size - sources.size:
         remark += f"; {shared} samples that share one with another are left out"
     remark = str(table.error(remark, "time", int(np.argmax(away))))
     warnings.warn(remark, InputWarning, stacklevel=6)
@@ -144,7 +144,7 @@ def _moved(
         interval,
         time_offset,
         positions - positions[0],
-        kept,
+        sources,
         elapsed - begin,
     )
 
