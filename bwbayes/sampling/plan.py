@@ -63,10 +63,10 @@ def best_together(ensembles: int, walkers: int, samples: int) -> int:
     return ensembles if size <= 1 << 16 else ensembles // 2 if size <= 1 << 18 else 1
 
 
-def best_places(walkers: int, samples: int) -> int:
-    """Return how many places a step of the mixture has to choose from, on so many samples.
+def best_places(walkers: int, readings: int) -> int:
+    """Return how many places a step of the mixture has to choose from, for so many readings.
 
-    Several where a step is mostly Python's work, four of up to 256 samples with 64 walkers: what a
-    short record leaves open is wide and curved, and the mixture covers it badly.
+    Several where readings are few, four of up to 32 with 64 walkers: what they leave open is wide
+    and curved, and the mixture covers it badly.
     """
-    return max(1, min(4, (1 << 16) // (walkers * samples)))
+    return max(1, min(4, (1 << 13) // (walkers * readings)))

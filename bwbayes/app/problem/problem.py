@@ -309,7 +309,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
             f"use at least {fewest}"
         )
     samples = sum(dataset.readings.samples for dataset in posterior.datasets)
-    places = best_places(walkers, samples)
+    places = best_places(walkers, sum(len(data.readings.values) for data in posterior.datasets))
     return SamplingPlan(
         ess=settings.ess,
         ensembles=settings.ensembles,
