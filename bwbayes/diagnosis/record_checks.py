@@ -64,7 +64,11 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     unlike += _stuck(record)
     findings += [*unlike, *spiky]
     if not unlike:
-        findings += [*_transient(record, loop), *_drift(record, loop), *_thin(record, loop)]
+        findings += [
+            *_transient(record, loop),
+            *_drift(record, loop),
+            *_no_hysteresis(record, loop),
+        ]
     return tuple(findings)
 
 
@@ -164,7 +168,7 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
         yield _whole(record, "swapped columns", text, fix)
 
 
-def _thin(record: Record, loop: LoopFit) -> Iterator[Finding]:
+def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that goes back as it came: 99 of 100 such, if their noise is white.
 
     Nothing is said where there are no turns, or where noise would hide loops of half a percent.

@@ -72,7 +72,7 @@ class Check:
         return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
 
     @property
-    def fewest(self) -> float:
+    def lowest_ess(self) -> float:
         """The effective draws of the parameter that has the fewest, of ranks or tails."""
         return float(np.min([self.ess_bulk, self.ess_tail]))
 
@@ -84,8 +84,8 @@ class Check:
         """
         reasons = self.disagreements()
         draws = fraction * ess
-        if not self.fewest >= draws:
-            reasons.append(f"ESS {np.floor(self.fewest):.0f} has not reached {draws:g}")
+        if not self.lowest_ess >= draws:
+            reasons.append(f"ESS {np.floor(self.lowest_ess):.0f} has not reached {draws:g}")
         times, length = self.steps / np.max(self.autocorrelation), fraction * LENGTH
         if not times >= length:
             reasons.append(f"{np.floor(times):.0f} autocorrelation times are fewer than {length:g}")

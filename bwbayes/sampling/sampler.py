@@ -61,7 +61,7 @@ LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
 # A longer chain that has fewer effective draws a step by this factor needs another proposal.
-LARGEST_LAG = 1.2
+LARGEST_SLOWDOWN = 1.2
 
 # Of the two checks that a chain must pass: for the first, this part of the draws that are to be
 # reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
@@ -208,11 +208,11 @@ class _Sampling:
                 self._extend("sampling")
             at_end = blocks == chain.blocks("sampling")
             drawn = chain.set_aside + blocks
-            may_lag = not passed and at_end and drawn >= 2 * fitted_to and self._is_early
+            may_refit = not passed and at_end and drawn >= 2 * fitted_to and self._is_early
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
             if required > blocks and blocks < budget:
-                if may_lag and required > LARGEST_LAG * needed:
+                if may_refit and required > LARGEST_SLOWDOWN * needed:
                     return None
                 needed = required
                 blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
@@ -230,9 +230,13 @@ class _Sampling:
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
             first = not latest.shortcomings(plan.ess, FIRST_PART)
-            if may_lag and not first and LARGEST_LAG * latest.fewest < efficiency * blocks:
+            if (
+                may_refit
+                and not first
+                and LARGEST_SLOWDOWN * latest.lowest_ess < efficiency * blocks
+            ):
                 return None
-            efficiency = latest.fewest / blocks
+            efficiency = latest.lowest_ess / blocks
             passed = (passed or blocks) if first else 0
             blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, latest)
 
@@ -282,7 +286,7 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     fraction = 1.0 if passed else FIRST_PART
     with np.errstate(divide="ignore"):
         steps = np.maximum(
-            latest.steps * plan.ess / latest.fewest, LENGTH * np.max(latest.autocorrelation)
+            latest.steps * plan.ess / latest.lowest_ess, LENGTH * np.max(latest.autocorrelation)
         )
     following = max(fraction * steps / plan.block, APART * passed)
     if not following > blocks:  # nan too

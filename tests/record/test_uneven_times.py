@@ -78,16 +78,14 @@ def test_what_is_done_is_said() -> None:
     rng = np.random.default_rng(3)
     time = np.arange(500) * 0.01
     voltage = np.sin(time)
-    with pytest.warns(InputWarning, match=r"up to 0.0003. s off a uniform grid, and moved to its"):
+    with pytest.warns(InputWarning, match=r"samples are moved by up to 0.0003. s onto a"):
         record = Record.from_arrays(voltage, voltage, time=time + rng.uniform(-3e-4, 3e-4, 500))
     assert 0.01 == record.interval
     steps = 0.01 * rng.uniform(0.7, 1.3, 499)
     time = np.concatenate([[0.0], np.cumsum(steps)])
     with (
-        pytest.warns(InputWarning, match=r"\d+ samples that share one with another are left out"),
-        pytest.warns(
-            InputWarning, match=r"\d+ samples are missing, .* is taken as on a line there"
-        ),
+        pytest.warns(InputWarning, match=r"\d+ are left out, where another"),
+        pytest.warns(InputWarning, match=r"\d+ samples are missing, .* is interpolated there"),
     ):
         Record.from_arrays(np.sin(time), np.sin(time), time=time)
 

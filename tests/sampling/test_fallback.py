@@ -168,6 +168,6 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
     assert chain.refit is not None
     (shape,) = re.findall(r"\(Pareto k (0\.\d\d)\)", outcome.remarks[0])
     assert float(shape) < 0.7
-    monkeypatch.setattr(sampler, "LARGEST_LAG", np.inf)
+    monkeypatch.setattr(sampler, "LARGEST_SLOWDOWN", np.inf)
     slow, _ = run(LONG)
     assert 3 * len(chain.history("sampling")) < len(slow.history("sampling"))

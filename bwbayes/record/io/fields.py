@@ -184,10 +184,10 @@ def _without_gaps(
             problem = f"{problem}, about {missing} missing; {advice}"
             raise table.error(problem, "time", int(sources[longest + 1]))
     if missing:
-        kind = "held" if held else "on a line"
+        kind = "held" if held else "interpolated"
         remark = f"{samples - values.size} samples are missing, from here on in "
         count = int(np.count_nonzero(steps > 1))
-        remark += f"{count} gap{'s' * (count > 1)}; the {quantity} is taken as {kind} there"
+        remark += f"{count} gap{'s' * (count > 1)}; the {quantity} is {kind} there"
         where = int(sources[int(np.argmax(steps > 1)) + 1])
         warnings.warn(str(table.error(remark, "time", where)), InputWarning, stacklevel=5)
     if held:

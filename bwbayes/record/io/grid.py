@@ -38,7 +38,7 @@ class Grid(NamedTuple):
 
         Values that were taken a little earlier or later are moved along the column's own slope, by
         central differences. That keeps a branch of a loop, as it keeps all that is linear, and
-        white noise, but for a tenth more of its variance where they are moved by half an interval.
+        white noise, but for an eighth more variance where they are moved by half an interval.
         """
         if self.positions is None:
             return values
@@ -109,10 +109,10 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
             grid = Grid(start - offset, interval, offset)
             is_whole = positions[-1] < elapsed.size
             return grid if is_whole else grid._replace(positions=positions, sources=samples)
-    return _moved(table, elapsed, positions, start - offset, offset)
+    return _nearest_grid(table, elapsed, positions, start - offset, offset)
 
 
-def _moved(
+def _nearest_grid(
     table: ColumnTable, elapsed: FloatArray, positions: IntArray, start: float, time_offset: float
 ) -> Grid:
     """Return the grid that lies nearest to times that are on none, s after the first of them.
@@ -133,20 +133,16 @@ def _moved(
     # As exact as three standard errors of the line's slope.
     unsure = 1.5 * scatter / math.sqrt(elapsed.size)
     interval = _exact_interval(table, interval, scatter, unsure, int(np.ptp(positions)))
-    remark = f"up to {scatter:.2g} s off a uniform grid, and moved to its nearest times"
+    remark = f"irregular sampling: samples are moved by up to {scatter:.2g} s onto a uniform grid"
     if shared := elapsed.size - sources.size:
-        remark += f"; {shared} samples that share one with another are left out"
+        remark += f"; {shared} are left out, where another is nearer to the same time"
     remark = str(table.error(remark, "time", int(np.argmax(away))))
     warnings.warn(remark, InputWarning, stacklevel=6)
-    begin = interval * positions[0]
-    return Grid(
-        start + float(first + begin),
-        interval,
-        time_offset,
-        positions - positions[0],
-        sources,
-        elapsed - begin,
-    )
+    # No more digits than tell a hundredth of an interval.
+    begin = round(float(first + interval * positions[0]), decimals_of(interval) + 2)
+    moved = elapsed + first - begin
+    positions = positions - positions[0]
+    return Grid(start + begin, interval, time_offset, positions, sources, moved)
 
 
 def _with_gaps(table: ColumnTable, steps: FloatArray) -> IntArray:
