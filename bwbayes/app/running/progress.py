@@ -119,14 +119,13 @@ class Progress(_Line):
         if self.check is None:
             return f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   burn-in"
         check = self.check
-        fewest = float(np.min([check.ess_bulk, check.ess_tail]))
         # It counts down to the end that was forecast at the last check.
         remaining = "unknown" if self.end is None else _minutes(self.end - time.monotonic())
         cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
             f"sampling  {check.steps:6d} steps   {rate:6.0f} evaluations/s   "
             f"ETA {remaining}   acceptance {check.acceptance:.2f}   "
-            f"R-hat {np.max(check.rhat):.3f}   ESS {fewest:.0f} of {self.plan.ess:.0f}   "
+            f"R-hat {np.max(check.rhat):.3f}   ESS {check.lowest_ess:.0f} of {self.plan.ess:.0f}   "
             f"{cover}"
         )
 
@@ -136,10 +135,9 @@ class Progress(_Line):
         There is none while the draws disagree, which more of them may or may not cure; and a run
         that goes on is checked before its first step.
         """
-        fewest = float(np.min([check.ess_bulk, check.ess_tail]))
-        if not self.steps or check.disagreements() or not fewest > 0:
+        if not self.steps or check.disagreements() or not check.lowest_ess > 0:
             return None
-        needed = check.steps * self.plan.ess / fewest
+        needed = check.steps * self.plan.ess / check.lowest_ess
         needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
         if not np.isfinite(needed):
             return None

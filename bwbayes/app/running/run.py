@@ -15,7 +15,6 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
@@ -150,9 +149,9 @@ def _drawn(
         folder.summary.unlink(missing_ok=True)
         outcome = sample(problem.posterior, plan, chain, pool, progress)
     models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
-    fewest = float(np.min([outcome.check.ess_bulk, outcome.check.ess_tail]))
+    ess = outcome.check.lowest_ess
     console.print(
-        f"sampled {models} models, {models / fewest:.1f} for each of {fewest:.0f} effective draws",
+        f"sampled {models} models, {models / ess:.1f} for each of {ess:.0f} effective draws",
         highlight=False,
     )
     return Fit(chain, folder).knowing(problem=problem, outcome=outcome)
