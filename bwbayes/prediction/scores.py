@@ -85,7 +85,7 @@ class Scores:
         }
 
 
-def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Scores:
+def score(bands: Bands, full: float = 0.0) -> Scores:
     """Judge bands against what was measured, and against the truth where it is known.
 
     ``full`` is the range of all readings that were fitted, um, if it is known.
@@ -126,7 +126,7 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
             hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
             coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
             block = _block_length((values - bands.mean)[known])
-            error[kind] = _coverage_errors(hits, block, generator)
+            error[kind] = _coverage_errors(hits, block)
     width, interval_score, worst = {}, {}, {}
     scored = slice(bands.scored_from, None)
     for level in LEVELS:
@@ -150,16 +150,14 @@ def score(bands: Bands, generator: np.random.Generator, full: float = 0.0) -> Sc
     )
 
 
-def _bootstrap_error(
-    hits: BoolArray, block: int, generator: np.random.Generator, replicates: int = 2000
-) -> float:
+def _bootstrap_error(hits: BoolArray, block: int) -> float:
     """Estimate the standard error of the mean of a correlated series by a circular block bootstrap.
 
-    The series is closed to a ring, whole blocks are drawn from it with replacement until they
-    make up its length, and the standard deviation of their means is taken over replicates (2000
-    leave 2 % of chance in it). Means of blocks scatter around the mean of the series, not around
-    the unknown one, which loses the share block / samples of the variance; it is given back. Zero
-    if all hits are equal, since then the series shows no variance.
+    The series is closed to a ring, and whole blocks are drawn from it with replacement until they
+    make up its length: their mean has the variance of a block's mean over their number. Means of
+    blocks scatter around the mean of the series, not around the unknown one, which loses the share
+    block / samples of the variance; it is given back. Zero if all hits are equal, since then the
+    series shows no variance.
 
     D. N. Politis and J. P. Romano, A circular block-resampling procedure for stationary data,
     in Exploring the Limits of Bootstrap, Wiley 1992, 263-270.
@@ -167,14 +165,10 @@ def _bootstrap_error(
     samples = hits.size
     if (hits == hits[0]).all():
         return 0.0
-    # More than 500 blocks only cost time, and fewer than four say little.
-    block = max(1, samples // 500, min(block, samples // 4))
+    block = max(1, min(block, samples // 4))  # fewer than four say little
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([hits, hits[: block - 1]]))])
     means = (total[block:] - total[:-block]) / block
-    blocks = samples / block
-    starts = generator.integers(samples, size=(replicates, round(blocks)))
-    variance = means[starts].mean(axis=1).var() * round(blocks) / blocks
-    return float(np.sqrt(variance / (1 - block / samples)))
+    return float(np.sqrt(means.var() * block / (samples - block)))
 
 
 def _block_length(residual: FloatArray) -> int:
@@ -188,9 +182,7 @@ def _block_length(residual: FloatArray) -> int:
     return max(1, round(3 * time)) if np.isfinite(time) else 1
 
 
-def _coverage_errors(
-    hits: dict[int, BoolArray], block: int, generator: np.random.Generator
-) -> dict[int, float]:
+def _coverage_errors(hits: dict[int, BoolArray], block: int) -> dict[int, float]:
     """Estimate the errors of coverage by level, also where a band is hardly ever missed.
 
     With few misses, or none, the bootstrap takes the luck of the window for certainty. The level
@@ -198,7 +190,7 @@ def _coverage_errors(
     the squared error; another level's error is at least that of m hits at Jeffreys' estimate
     (m p + 1/2) / (m + 1) of its coverage.
     """
-    errors = {level: _bootstrap_error(hit, block, generator) for level, hit in hits.items()}
+    errors = {level: _bootstrap_error(hit, block) for level, hit in hits.items()}
     covered = {level: float(hit.mean()) for level, hit in hits.items()}
     nearest = min(covered, key=lambda level: abs(covered[level] - 0.5))
     p = covered[nearest]

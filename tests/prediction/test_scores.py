@@ -38,7 +38,7 @@ def inside(values: FloatArray, level: int) -> BoolArray:
 
 def test_errors_of_the_mean_are_those_of_the_definition() -> None:
     bands = bands_around(np.zeros(4), np.array([0.0, 3.0, -1.0, 0.0]))
-    scores = score(bands, np.random.default_rng(0))
+    scores = score(bands)
     assert np.sqrt(10 / 4) / 4 == pytest.approx(scores.nrmse)
     assert 3.0 == scores.max_error_um
     assert 1.0 == scores.crps_um
@@ -47,7 +47,7 @@ def test_errors_of_the_mean_are_those_of_the_definition() -> None:
 def test_width_and_interval_score_are_those_of_the_definition() -> None:
     """A reading at 3 lies 3 - 1.645 above the 90 % band: 20 times that on top of the width."""
     measured = np.array([0.0, 3.0, -3.0, 0.5])
-    scores = score(bands_around(np.zeros(4), measured), np.random.default_rng(0))
+    scores = score(bands_around(np.zeros(4), measured))
     width = 2 * norm.ppf(0.95)
     assert width == pytest.approx(scores.width_um[90])
     assert width + 20 * 2 * (3 - norm.ppf(0.95)) / 4 == pytest.approx(scores.interval_score_um[90])
@@ -56,7 +56,7 @@ def test_width_and_interval_score_are_those_of_the_definition() -> None:
 def test_coverage_counts_readings_in_the_sensor_band_and_truth_in_the_displacement_band() -> None:
     measured = np.array([0.0, 0.5, 1.0, 1.7, 1.9, 2.5])
     bands = replace(bands_around(np.zeros(6), measured), truth=measured)
-    coverage = score(bands, np.random.default_rng(0)).coverage
+    coverage = score(bands).coverage
     assert {50: 2 / 6, 90: 3 / 6, 95: 5 / 6} == pytest.approx(coverage["sensor"])
     assert {50: 1 / 6, 90: 2 / 6, 95: 2 / 6} == pytest.approx(coverage["displacement"])
 
@@ -66,13 +66,13 @@ def test_the_lead_in_is_not_judged() -> None:
     spoilt = values.copy()
     spoilt[:200] += 100
     bands = replace(bands_around(0 * values, spoilt), scored_from=200)
-    expected = score(bands_around(0 * values[200:], values[200:]), np.random.default_rng(0))
-    assert expected == score(bands, np.random.default_rng(0))
+    expected = score(bands_around(0 * values[200:], values[200:]))
+    assert expected == score(bands)
 
 
 def test_the_worst_second_is_the_lowest_coverage_of_any_200_samples_at_200_hz() -> None:
     values = correlated(np.random.default_rng(4), 1)[0]
-    scores = score(bands_around(0 * values, values), np.random.default_rng(0))
+    scores = score(bands_around(0 * values, values))
     for level in LEVELS:
         hits = inside(values, level)
         expected = min(hits[i : i + 200].mean() for i in range(SAMPLES - 199))
@@ -81,7 +81,7 @@ def test_the_worst_second_is_the_lowest_coverage_of_any_200_samples_at_200_hz() 
 
 def test_bands_without_a_measurement_are_refused() -> None:
     with pytest.raises(InputError, match=r"held-out: nothing was measured.*; give a record"):
-        score(bands_around(np.zeros(5), None), np.random.default_rng(0))
+        score(bands_around(np.zeros(5), None))
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -94,10 +94,9 @@ def test_the_error_of_coverage_is_its_spread_over_records(level: int) -> None:
     """
     series = correlated(np.random.default_rng(5), 400)
     spread = np.std([inside(values, level).mean() for values in series])
-    generator = np.random.default_rng(6)
     errors = []
     for values in series:
-        error = score(bands_around(0 * values, values), generator).coverage_error["sensor"]
+        error = score(bands_around(0 * values, values)).coverage_error["sensor"]
         assert error is not None
         errors.append(error[level])
     assert 1 == pytest.approx(np.mean(errors) / spread, abs=0.25)

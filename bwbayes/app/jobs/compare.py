@@ -28,7 +28,7 @@ from bwbayes.app.problem.parameters import actuator_of, in_words
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, training_records
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.predictions import predictions, scoring
+from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.run import begin, draw, resume
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
@@ -231,7 +231,7 @@ def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidat
     return replace(
         plain,
         held_out=tuple(bands),
-        scores={p.name: score(p, scoring(seed, p), extent) for p in bands},
+        scores={p.name: score(p, extent) for p in bands},
         parts=parts,
         evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
     )

@@ -18,7 +18,7 @@ from bwbayes.app.running.cache import load, save, state_of
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import version_remarks, versions
-from bwbayes.app.running.predictions import judged, predictions, scoring
+from bwbayes.app.running.predictions import judged, predictions
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
@@ -84,9 +84,7 @@ def assemble(
     result = replace(
         result,
         scores={
-            band.name: score(band, scoring(seed, band), background.extent)
-            for band in bands
-            if band.name in unexplained
+            band.name: score(band, background.extent) for band in bands if band.name in unexplained
         },
         innovations=series,
         loops=measure_loops(posterior, chosen),

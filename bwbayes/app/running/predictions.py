@@ -7,7 +7,6 @@ on the data alone: the same record under another name gets the same bands.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -133,7 +132,7 @@ def predict_another(
     bands = _of_another(problem, chosen, of, beyond, record, start, name, window)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
-    scores = None if verdict is None else score(bands, scoring(seed, bands), background.extent)
+    scores = None if verdict is None else score(bands, background.extent)
     remarks = tuple(finding.note for finding in beyond)
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
 
@@ -259,9 +258,3 @@ def judged(
         if verdict is not None:
             verdicts[predicted.name] = verdict
     return verdicts
-
-
-def scoring(seed: int, bands: Bands) -> np.random.Generator:
-    """Return the generator that scores bands: it depends on the readings, not on a name."""
-    assert bands.measured is not None
-    return generator(seed, f"score {hashlib.sha256(bands.measured.tobytes()).hexdigest()}")
