@@ -14,7 +14,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import islice
 from typing import TypedDict
 
@@ -22,11 +21,10 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.calibration.records import OtherRecord, Simulated, covered
-from bwbayes.errors import InputError, one_line
+from bwbayes.errors import one_line
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.prediction.loops import at_level, crossings
 from bwbayes.prediction.prediction import predict_windows, thinned
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
@@ -77,11 +75,6 @@ class Experiment:
     source
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
-
-    Raises
-    ------
-    InputError
-        No training voltage goes back and forth, so that there is no loop to measure.
     """
 
     __repr__ = brief
@@ -93,13 +86,6 @@ class Experiment:
     source: Posterior | None = None
     belongs: Mapping[str, str] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        if self.looped is None:
-            raise InputError(
-                "record: its training voltage does not go back and forth, so there is no loop to "
-                "calibrate; take another signal"
-            )
-
     @property
     def truth(self) -> Posterior:
         """The posterior whose prior and model make truths and records."""
@@ -108,7 +94,7 @@ class Experiment:
     @property
     def statistics(self) -> tuple[str, ...]:
         """Names of what is ranked."""
-        return (*self.posterior.names, "log_likelihood", "opening", "range")
+        return (*self.posterior.names, "log_likelihood", "loop_area", "range")
 
     @property
     def bands(self) -> tuple[str, ...]:
@@ -117,30 +103,20 @@ class Experiment:
         others = [f"{other} {name}" for other in self.others for name in names]
         return (*(names if self.held_out else []), *others)
 
-    @cached_property
-    def looped(self) -> tuple[str, FloatArray] | None:
-        """The first record that goes back and forth, and its voltage up to the last reading."""
-        for data in self.posterior.datasets:
-            path = data.voltage[: data.training[-1].stop]
-            if all(passage.size for passage in crossings(path)[1:]):
-                return data.name, path
-        return None
-
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
-        """Log likelihood and the two loop measures of models θ, (models, 3).
+        """Log likelihood and two measures of the displacement of models θ, (models, 3).
 
-        The opening (um) is the model's displacement where the voltage falls through zero, or
-        through the middle of a drive beside it, less that where it rises through it, interpolated
-        between samples, each the mean over all passages; the range (um) is its largest less its
-        smallest displacement. Of several records, in the first that goes back and forth.
+        The area of its loops, −∮ x du (um V), by trapezoids, positive where it lags behind the
+        voltage, summed over the records up to their last readings; and the largest range of any of
+        them (um).
         """
-        assert self.looped is not None
-        name, path = self.looped
-        displacement = posterior.simulate(theta, record=name)
-        level, *passages = crossings(path)
-        rising, falling = (at_level(displacement, path, rows, level) for rows in passages)
-        extent = np.ptp(displacement, axis=1)
-        return np.stack([posterior.log_likelihood(theta), falling - rising, extent], axis=1)
+        area, extent = np.zeros((2, len(theta)))
+        for data in posterior.datasets:
+            displacement = posterior.simulate(theta, record=data.name)
+            path = data.voltage[: data.training[-1].stop]
+            area -= np.trapezoid(displacement, path, axis=1)
+            extent = np.maximum(extent, np.ptp(displacement, axis=1))
+        return np.stack([posterior.log_likelihood(theta), area, extent], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

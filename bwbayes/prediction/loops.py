@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -311,24 +311,3 @@ def _crossing(voltage: FloatArray, branch: FloatArray) -> FloatArray:
     step = np.where(above > below, above - below, 1.0)
     crossed: FloatArray = voltage[after] - above / step * (voltage[after] - voltage[after - 1])
     return crossed
-
-
-def crossings(path: FloatArray) -> tuple[float, IntArray, IntArray]:
-    """Return zero volts, or the middle of a drive beside it, and samples before it is passed.
-
-    On the way up, and on the way down.
-    """
-    low, high = float(np.min(path)), float(np.max(path))
-    level = 0.0 if low < 0 < high else (low + high) / 2
-    change = np.diff((path > level).astype(np.int64))
-    return level, np.flatnonzero(change > 0), np.flatnonzero(change < 0)
-
-
-def at_level(
-    displacement: FloatArray, path: FloatArray, rows: IntArray, level: float
-) -> FloatArray:
-    """Displacement (models,) where a path passes a level after ``rows``, the mean of all, um."""
-    fraction = (level - path[rows]) / (path[rows + 1] - path[rows])
-    passed = displacement[:, rows] * (1 - fraction) + displacement[:, rows + 1] * fraction
-    mean: FloatArray = np.mean(passed, axis=1)
-    return mean

@@ -14,7 +14,7 @@ from bwbayes.report.words import symbol, unit_text
 # What is ranked besides parameters: its name, and its unit.
 EXTRA_WORDS = {
     "log_likelihood": ("log likelihood", "-"),
-    "opening": ("loop opening", "um"),
+    "loop_area": ("loop area", "um V"),
     "range": ("displacement range", "um"),
 }
 

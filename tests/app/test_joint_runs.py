@@ -228,14 +228,12 @@ def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: Ru
 
 
 def test_replicates_make_all_records_anew() -> None:
-    """Each with its own readings; the loop is measured in the record that has one."""
+    """Each with its own readings."""
     common = experiment(problem(("ess = 150", "ess = 100")))
-    assert common.looped is not None
-    assert common.looped[0] == "loops"
     assert {"later": "loops"} == common.belongs
     entry = replicate(common, 1, 0).entry
     assert entry["converged"]
-    assert {"offset[loops]", "offset[step]", "opening", "d"} <= entry["truth"].keys()
+    assert {"offset[loops]", "offset[step]", "loop_area", "d"} <= entry["truth"].keys()
     assert {"sensor 95", "sine sensor 95"} <= entry["covered"].keys()
 
 

@@ -61,7 +61,7 @@ def third() -> Replicate:
 def test_entry_is_plain_and_complete(third: Replicate) -> None:
     entry = third.entry
     assert entry == json.loads(json.dumps(entry))
-    names = ["d", "alpha", "sensor_sd", "log_likelihood", "opening", "range"]
+    names = ["d", "alpha", "sensor_sd", "log_likelihood", "loop_area", "range"]
     assert names == list(entry["ranks"]) == list(entry["truth"])
     assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
     assert (3, True) == (entry["number"], entry["converged"])
@@ -138,7 +138,7 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
 def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     """Without hysteresis a sine V sin ωt comes out as d V/√(1 + (ωτ)²) sin(ωt − φ), tan φ = ωτ.
 
-    So the loop opens by 2 d V ωτ/(1 + (ωτ)²) at zero and ranges over 2 d V/√(1 + (ωτ)²).
+    So each period's loop has the area π d V² ωτ/(1 + (ωτ)²); it ranges over 2 d V/√(1 + (ωτ)²).
     """
     samples, interval, lag, d = 4_000, 1e-3, 0.02, 0.7
     time = interval * np.arange(samples)
@@ -148,8 +148,9 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     experiment = Experiment(posterior, PLAN)
     known = {"d": d, "alpha": 1e-9, "beta": 0.02, "exponent": 1.0, "lag": lag, "sensor_sd": 1.0}
     theta = np.array([[known.get(name, 0.0) for name in posterior.prior.names]])
-    _, opening, extent = experiment.measures(posterior, theta)[0]
+    _, area, extent = experiment.measures(posterior, theta)[0]
     turn = 2 * np.pi * lag
-    np.testing.assert_allclose(2 * d * 100 * turn / (1 + turn**2), opening, rtol=1e-3)
+    periods = samples * interval
+    np.testing.assert_allclose(periods * np.pi * d * 100**2 * turn / (1 + turn**2), area, rtol=1e-2)
     # The crest that it starts from is the range's upper end.
     np.testing.assert_allclose(d * 100 * (1 + 1 / np.sqrt(1 + turn**2)), extent, rtol=1e-3)
