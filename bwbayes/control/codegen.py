@@ -13,33 +13,44 @@ import re
 import textwrap
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import FunctionType
+from types import FunctionType, MappingProxyType
 from typing import Any
 
 from bwbayes.errors import InputError
 
+# Arguments of functions that are arrays to be written to.
+WRITTEN = ("after", "rested", "filtered")
 
-def c_functions(function: Callable[..., Any], lengths: Mapping[str, int], prefix: str) -> str:
-    """Return a function and those that it calls as static functions of C, callees first.
+
+def c_functions(
+    functions: Sequence[Callable[..., Any]],
+    shapes: Mapping[str, tuple[int, ...]],
+    prefix: str,
+    given: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
+) -> str:
+    """Return functions and those that they call as static functions of C, callees first.
 
     Parameters
     ----------
-    function
-        Of numbers, and of arrays called ``parameters``, ``memory`` and ``after``. C returns the
-        first number that it returns, and writes the others through pointers.
-    lengths
-        Lengths of the arrays, by name.
+    functions
+        Of numbers, and of arrays. C returns the first number that they return, and writes the
+        others through pointers.
+    shapes
+        Shapes of the arrays by the names of arguments; those in ``WRITTEN`` are written to.
     prefix
         Beginning of the functions' names.
+    given
+        What arguments stand for that are functions: C has these by their names.
 
     Raises
     ------
     InputError
         An expression or statement that has no counterpart here.
     """
-    assert inspect.isfunction(function)
     printed: dict[FunctionType, str] = {}
-    _Printer(function, lengths, prefix, printed)
+    for function in functions:
+        assert inspect.isfunction(function)
+        _Printer(function, shapes, prefix, given, printed)
     return "\n".join(printed.values())
 
 
@@ -65,11 +76,13 @@ class _Printer(ast.NodeTransformer):
     def __init__(
         self,
         function: FunctionType,
-        lengths: Mapping[str, int],
+        shapes: Mapping[str, tuple[int, ...]],
         prefix: str,
+        given: Mapping[str, Callable[..., Any]],
         printed: dict[FunctionType, str],
     ) -> None:
-        self.function, self.lengths, self.prefix, self.printed = function, lengths, prefix, printed
+        self.function, self.shapes, self.prefix = function, shapes, prefix
+        self.given, self.printed = given, printed
         self.tables: dict[str, Sequence[float]] = {}
         self.variables = set(function.__code__.co_varnames)
         tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
@@ -89,9 +102,8 @@ class _Printer(ast.NodeTransformer):
         returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
         results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
         names = [argument.arg for argument in tree.args.args]
-        # Arguments of these names are arrays; all others are numbers.
-        kinds = {"parameters": "const double *", "memory": "const double *", "after": "double *"}
-        arguments = [f"{kinds.get(name, 'double ')}{name}" for name in names]
+        kinds = dict.fromkeys(self.shapes, "const double *") | dict.fromkeys(WRITTEN, "double *")
+        arguments = [f"{kinds.get(n, 'double ')}{n}" for n in names if n not in self.given]
         arguments += [f"double *result_{number}" for number in range(1, results)]
         return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"
 
@@ -180,6 +192,9 @@ class _Printer(ast.NodeTransformer):
         name = ast.unparse(node.value)
         if name not in self.variables:
             self.tables[name] = self.function.__globals__[name]
+        if isinstance(node.slice, ast.Tuple):
+            row, column = self.whole(*node.slice.elts)
+            return ast.Name(f"{name}[{self.shapes[name][1]} * {row} + {column}]")
         return ast.Name(f"{name}[{self.whole(node.slice)[0]}]")
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
@@ -217,7 +232,7 @@ class _Printer(ast.NodeTransformer):
             case ast.Call(func=ast.Name(id="look_up"), args=[table, index]):
                 return ast.Name(f"{self.text(table)}[{self.whole(index)[0]}]")
             case ast.Call(func=ast.Name(id="len"), args=[ast.Name(id=array)]):
-                return ast.Name(to_c_number(self.lengths[array]))
+                return ast.Name(to_c_number(self.shapes[array][0]))
             case ast.Call(func=ast.Name(id="select"), args=choice):
                 test, yes, no = map(self.text, choice)
                 return ast.Name(f"({test} ? {yes} : {no})")
@@ -225,17 +240,18 @@ class _Printer(ast.NodeTransformer):
 
     def call(self, node: ast.Call, pointers: Sequence[str]) -> str:
         """Return a call of a function of math.h, or of one that is printed before this one."""
-        arguments = ", ".join([*map(self.text, node.args), *pointers])
+        texts = [self.text(x) for x in node.args if ast.unparse(x) not in self.given]
+        arguments = ", ".join([*texts, *pointers])
         match node.func:
             case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
                 # What math.h calls otherwise.
                 others = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
                 return f"{others.get(name, name)}({arguments})"
             case ast.Name(id=name):
-                function = self.function.__globals__.get(name)
+                function = self.given.get(name, self.function.__globals__.get(name))
                 if inspect.isfunction(function):
                     if function not in self.printed:
-                        _Printer(function, self.lengths, self.prefix, self.printed)
+                        _Printer(function, self.shapes, self.prefix, self.given, self.printed)
                     return f"{self.prefix}{name}({arguments})"
         raise self.refused(node)
 

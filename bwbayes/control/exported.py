@@ -1,14 +1,14 @@
 """A model for a controller: its coefficients with units, and a C file that does a sample a call.
 
-The C file needs no library but ``math.h`` and allocates nothing. It holds the same recursions as
-:class:`~bwbayes.control.sampled.SampledModel`, forward and, where the model has one, inverse; both
-take a bounded time.
+The C file needs no library but ``math.h`` and allocates nothing. It holds the very functions of
+:mod:`bwbayes.control.sampled`, forward and, where the model has one, inverse; both take a bounded
+time.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -21,11 +21,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from bwbayes.arrays import FloatArray
 from bwbayes.control.codegen import c_functions, to_ascii, to_c_number
 from bwbayes.control.sampled import (
-    BISECTION_ROUNDS,
-    NEWTON_ROUNDS,
     SampledModel,
+    advance,
     require_inverse,
     resolution,
+    search,
+    settle,
 )
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
@@ -103,7 +104,7 @@ class Exported:
                 for name, (value, unit) in self.model.step.coefficients().items()
             },
             "gain": self._gain,
-            "creep_growth_per_V": float(self.model.creep_growth[0]),
+            "creep_growth_per_V": float(self.model.curve[4, 0]),
             "zero": {
                 "value": float(self.model.zero[0]),
                 "unit": "um",
@@ -144,11 +145,19 @@ class Exported:
         )
         # What ends no comment of C.
         environment.filters["plain"] = partial(re.sub, r"[^\w .,:;=+()%-]", "_", flags=re.ASCII)
-        actuator, step = self.model.actuator, self.model.step
+        model, actuator, step = self.model, self.model.actuator, self.model.step
         remembered = step.demagnetized()[0].tolist()
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] * bool(actuator.gain) + ["creep"] * bool(actuator.creep)
-        lengths = {"parameters": step.parameters.shape[1], "memory": len(remembered)}
+        tables = {"parameters": step.parameters[0], "curve": model.curve[:, 0]}
+        tables["taps"] = model.taps[:, :, 0]
+        sections = len(tables["taps"])
+        shapes = {name: values.shape for name, values in tables.items()}
+        shapes |= dict.fromkeys(("memory", "after"), (len(remembered),))
+        shapes |= dict.fromkeys(("rest", "rested"), (sections,))
+        shapes |= dict.fromkeys(("filters", "filtered"), (sections, 2))
+        functions: list[Callable[..., Any]] = [settle, advance]
+        functions += [search] * (self.without_inverse is None)
         return environment.get_template("actuator.c.j2").render(
             **self.numbers(),
             parts_line=f"Parts: {', '.join(parts)}.",
@@ -156,12 +165,10 @@ class Exported:
             held=actuator.hold == "zero",
             hysteresis_is=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
             parameters_are=to_ascii(step.ROW),
-            parameter_row=[*map(to_c_number, step.parameters[0].tolist())],
+            tables={name: [*map(to_c_number, x.ravel())] for name, x in tables.items()},
             remembered=remembered,
-            functions=c_functions(type(step).move, lengths, "actuator_"),
+            functions=c_functions(functions, shapes, "actuator_", {"move": type(step).move}),
             close=resolution(self.limits),
-            newton=NEWTON_ROUNDS,
-            bisection=BISECTION_ROUNDS,
         )
 
     @property

@@ -1,9 +1,15 @@
 """A fitted model at a controller's pace: one sample in, one sample out, forward or inverse.
 
-:class:`SampledModel` is what ``bwbayes export`` writes as C and what ``bwbayes track`` closes the
-loop around. It is the actuator's own recursion, with a voltage for each model. The inverse is a
-safeguarded Newton iteration with a bounded number of rounds. What follows the hysteresis is linear,
+:class:`SampledModel` is what ``bwbayes track`` closes the loop around, and what ``bwbayes export``
+writes as C: :func:`settle`, :func:`advance` and :func:`search` are the actuator's own recursion,
+with a voltage for each model, and are printed as they are. What follows the hysteresis is linear,
 and is given as a system of ``scipy.signal`` too.
+
+These functions take the model in arrays: ``move`` and ``parameters`` of the hysteresis' step;
+``curve``, the coefficients of 1, u, u² and u³ that the gain adds, and κ/U, by which the creep's
+drive w (1 + κ |u| / U) grows; and ``taps`` of each section, b₀, b₁, b₂, a₁, a₂ and the gain, then b
+of the sample that a voltage acts on first, and how its two states carry over to that sample. A
+state is ``memory``, the ``rest`` of each section, um, and two ``filters`` of each.
 """
 
 from __future__ import annotations
@@ -18,9 +24,11 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.linear import Taps
 from bwbayes.model.operator import Span
-from bwbayes.model.step import Gone, HysteresisStep
+from bwbayes.model.step import HysteresisStep
+from bwbayes.prediction.loops import steady_loop
 from bwbayes.shown import brief
 
 # Rounds of the inverse at most: Newton's rule needs a few; if it fails, bisection goes on to the
@@ -28,11 +36,84 @@ from bwbayes.shown import brief
 NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
 
 
+def drive(move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any) -> Any:
+    """Return hysteresis and gain at a voltage, um, and their slope, um/V."""
+    w, slope = move(parameters, memory, voltage, after)
+    w = w + curve[0] + voltage * (curve[1] + voltage * (curve[2] + voltage * curve[3]))
+    return w, slope + curve[1] + voltage * (2.0 * curve[2] + voltage * 3.0 * curve[3])
+
+
+def settle(
+    move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any, rested: Any
+) -> Any:
+    """Return hysteresis and gain at a first voltage, um, where dynamics and creep are at rest."""
+    w, _ = drive(move, parameters, curve, memory, voltage, after)
+    for i in range(len(rested)):
+        rested[i] = select(i > 0, w * (1.0 + curve[4] * np.abs(voltage)), w)
+    return w
+
+
+def advance(
+    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, rest: Any, filters: Any,
+    voltage: Any, after: Any, filtered: Any,
+) -> Any:  # fmt: skip
+    """Return the displacement at a sample with this voltage, um, and write the state after it."""
+    w, _ = drive(move, parameters, curve, memory, voltage, after)
+    creeping, displacement = w * (1.0 + curve[4] * np.abs(voltage)), 0.0
+    for i in range(len(rest)):
+        driven = select(i > 0, creeping, w) - rest[i]
+        moved = taps[i, 0] * driven + filters[i, 0]
+        filtered[i, 0] = taps[i, 1] * driven - taps[i, 3] * moved + filters[i, 1]
+        filtered[i, 1] = taps[i, 2] * driven - taps[i, 4] * moved
+        displacement = displacement + taps[i, 5] * (rest[i] + moved)
+    return displacement
+
+
+def within(voltage: Any, lowest: Any, highest: Any) -> Any:
+    """Return a voltage within limits, V."""
+    return select(voltage < lowest, lowest, select(voltage > highest, highest, voltage))
+
+
+def search(
+    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, rest: Any, filters: Any,
+    voltage: Any, displacement: Any, lowest: Any, highest: Any, close: Any, after: Any,
+) -> Any:  # fmt: skip
+    """Return the voltage that brings the displacement there, or the limit that is nearest, V.
+
+    With (direct + creeping (1 + κ |u| / U)) w(u) = demand, whose left side rises with u: Newton's
+    rule between bounds, and bisection should that not do, until a step is as small as ``close``.
+    """
+    direct, creeping, demand = 0.0, 0.0, displacement
+    for i in range(len(rest)):
+        weight = taps[i, 5] * taps[i, 6]
+        carried = taps[i, 7] * filters[i, 0] + taps[i, 8] * filters[i, 1]
+        demand = demand - taps[i, 5] * (rest[i] + carried) + weight * rest[i]
+        direct = select(i > 0, direct, weight)
+        creeping = select(i > 0, creeping + weight, 0.0)
+    low, high = lowest, highest
+    voltage = within(voltage, lowest, highest)
+    change, rounds = 2.0 * close, 0.0
+    while anywhere(change > close) and rounds < NEWTON_ROUNDS + BISECTION_ROUNDS:
+        w, slope = drive(move, parameters, curve, memory, voltage, after)
+        growth = select(voltage < 0.0, -curve[4], curve[4])
+        factor = direct + creeping * (1.0 + growth * voltage)
+        excess = factor * w - demand
+        low = select(excess < 0.0, voltage, low)
+        high = select(excess < 0.0, high, voltage)
+        newton = voltage - excess / (factor * slope + creeping * growth * w)
+        newton = within(newton, lowest, highest)
+        inside = (newton >= low) & (newton <= high) & (rounds < NEWTON_ROUNDS)
+        better = select(inside, newton, (low + high) / 2.0)
+        change, voltage = np.abs(better - voltage), better
+        rounds = rounds + 1.0
+    return voltage
+
+
 class SteppedState(NamedTuple):
     """State of the models between two samples.
 
-    ``memory`` (models, any) is that of the hysteresis, ``voltage`` (models,) the last one, V,
-    ``rest`` (models, sections) the drives at the start, um, and ``filters`` (models, sections, 2)
+    ``memory`` (any, models) is that of the hysteresis, ``voltage`` (models,) the last one, V,
+    ``rest`` (sections, models) the drives at the start, um, and ``filters`` (sections, 2, models)
     the states of the recursions.
     """
 
@@ -88,46 +169,59 @@ class SampledModel:
         return int(self.sections.gains.shape[0])
 
     @cached_property
-    def creep_growth(self) -> FloatArray:
-        """κ / U (models,), 1/V, by which the creep's drive w (1 + κ |u| / U) grows."""
-        creep = self.actuator.creep
-        if creep is None or not creep.growing:
-            return np.zeros(self.models)
-        return np.asarray(self.column["creep_growth"] * creep.size(np.array(1.0)))
+    def curve(self) -> FloatArray:
+        """What gain and growing creep add, (5, models): um/Vᵏ for k from 0 to 3, then κ/U, 1/V."""
+        gain, creep = self.actuator.gain, self.actuator.creep
+        curve = np.zeros((5, self.models))
+        if gain is not None:
+            curve[:4] = gain.powers(self.column)
+        if creep is not None and creep.growing:
+            curve[4] = self.column["creep_growth"] * creep.size(np.array(1.0))
+        return curve
+
+    @cached_property
+    def taps(self) -> FloatArray:
+        """Taps of the sections, (sections, 9, models)."""
+        numerator, denominator, gains = (np.moveaxis(values, 0, -1) for values in self.sections)
+        held = self.actuator.hold == "zero"
+        one, first = np.ones_like(gains), denominator[:, 1]
+        # A voltage that is held acts on the next sample; this one is out of reach.
+        reach = [numerator[:, 1], -first, one] if held else [numerator[:, 0], one, 0 * one]
+        rows = [*np.moveaxis(numerator, 1, 0), first, denominator[:, 2], gains, *reach]
+        return np.stack(rows, axis=1)
+
+    @property
+    def hysteresis(self) -> tuple[Any, FloatArray, FloatArray]:
+        """What all functions of a sample begin with: ``move``, ``parameters`` and ``curve``."""
+        return type(self.step).move, self.step.parameters.T, self.curve
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        w, _, memory = self.drive(self.step.demagnetized(), voltage)
-        filters = np.zeros((*self.sections.gains.shape, 2))
-        return SteppedState(memory, voltage, self._section_drives(w, voltage), filters)
+        memory, rest = self.step.demagnetized().T, np.empty(self.taps[:, 0].shape)
+        after = np.empty_like(memory)
+        settle(*self.hysteresis, memory, voltage, after, rest)
+        return SteppedState(after, voltage, rest, np.zeros((len(rest), 2, self.models)))
 
     @cached_property
     def zero(self) -> FloatArray:
         """What dynamics and creep make of the drive at zero volts, where 0 um is, (models,), um."""
-        return self._weigh(self.begin(np.zeros(self.models)).rest)
-
-    def level(self, state: SteppedState) -> FloatArray:
-        """Return the displacement (models,) at which they began, um."""
-        return self._weigh(state.rest) - self.zero
+        return np.asarray(np.sum(self.taps[:, 5] * self.begin(np.zeros(self.models)).rest, axis=0))
 
     def displacement(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,), um, that a held voltage has led to."""
-        return self.level(state) + self._weigh(state.filters[..., 0])
+        return np.sum(self.taps[:, 5] * (state.rest + state.filters[:, 0]), axis=0) - self.zero
 
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
         """Return the displacement (models,), um, at a sample with this voltage, and the state.
 
         If the voltage is held, the displacement is that just before it changes.
         """
-        numerator, denominator, _ = self.sections
-        w, _, memory = self.drive(state.memory, voltage)
-        drives = self._section_drives(w, voltage) - state.rest
-        moved = numerator[..., 0] * drives + state.filters[..., 0]
-        filters = numerator[..., 1:] * drives[..., np.newaxis]
-        filters -= denominator[..., 1:] * moved[..., np.newaxis]
-        filters[..., 0] += state.filters[..., 1]
-        displacement = self.level(state) + self._weigh(moved)
-        return displacement, state._replace(memory=memory, voltage=voltage, filters=filters)
+        memory, _, rest, filters = state
+        after, filtered = np.empty_like(memory), np.empty_like(filters)
+        displacement = advance(
+            *self.hysteresis, self.taps, memory, rest, filters, voltage, after, filtered
+        )
+        return displacement - self.zero, SteppedState(after, voltage, rest, filtered)
 
     def inverse(
         self,
@@ -143,57 +237,33 @@ class SampledModel:
         outside of the limits gets the limit. The search starts at a ``guess``, by default the last
         voltage, and ends at a ``tolerance``, V, by default the last bits.
         """
-        numerator, denominator, gains = self.sections
-        carried, now = state.filters[..., 0], numerator[..., 0]
-        if self.actuator.hold == "zero":
-            # The next sample; this one is out of reach.
-            carried = state.filters[..., 1] - denominator[..., 1] * carried
-            now = numerator[..., 1]
-        weights = gains * now
-        direct, creeping = weights[:, 0], weights[:, 1:].sum(axis=1)
-        demand = displacement - self.level(state) - self._weigh(carried)
-        demand += (weights * state.rest).sum(axis=1)
-        tolerance = resolution(limits) if tolerance is None else tolerance
-
-        # (direct + creeping (1 + κ |u| / U)) w(u) = demand, where the left side rises with u.
-        voltage = np.clip(state.voltage if guess is None else guess, *limits)
-        low, high = np.full_like(demand, limits.low), np.full_like(demand, limits.high)
-        for iteration in range(NEWTON_ROUNDS + BISECTION_ROUNDS):
-            w, slope, _ = self.drive(state.memory, voltage)
-            factor = direct + creeping * (1 + self.creep_growth * np.abs(voltage))
-            excess = factor * w - demand
-            steepness = factor * slope + creeping * w * self.creep_growth * np.sign(voltage)
-            low = np.where(excess < 0, voltage, low)
-            high = np.where(excess < 0, high, voltage)
-            better = (low + high) / 2
-            if iteration < NEWTON_ROUNDS:
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    newton = np.clip(voltage - excess / steepness, limits.low, limits.high)
-                better = np.where((newton >= low) & (newton <= high), newton, better)
-            change, voltage = np.abs(better - voltage), better
-            if np.all(change <= tolerance):
-                break
+        memory, last, rest, filters = state
+        begin, aim = last if guess is None else guess, displacement + self.zero
+        close, after = tolerance or resolution(limits), np.empty_like(memory)
+        model = *self.hysteresis, self.taps
+        with np.errstate(divide="ignore", invalid="ignore"):
+            voltage = search(*model, memory, rest, filters, begin, aim, *limits, close, after)
         return voltage, self.forward(state, voltage)[1]
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
         """Return bounds (models,) of the drive's slope dw/du within limits, um/V."""
         smallest, largest = self.step.slopes(limits)
         # q₂ and q₃ leave a slope that is a parabola: its extremes are at the ends or its vertex.
-        _, added = self._added(np.linspace(*limits, 1001)[:, np.newaxis])
+        voltage, (_, first, second, third, _) = (
+            np.linspace(*limits, 1001)[:, np.newaxis],
+            self.curve,
+        )
+        added = first + voltage * (2 * second + voltage * 3 * third)
         return smallest + added.min(axis=0), largest + added.max(axis=0)
 
-    def drive(self, memory: FloatArray, voltage: FloatArray) -> Gone:
-        """Return hysteresis and gain, um, once the voltages (models,) have gone there."""
-        gone, (level, slope) = self.step.go(memory, voltage), self._added(voltage)
-        return Gone(gone.w + level, gone.slope + slope, gone.memory)
+    def reach(self, limits: Span) -> Span:
+        """Return the displacements of the first model, um, that slow sweeps of the voltage end at.
 
-    def _added(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the gain adds at voltages (models,) or (any, 1), um, and its slope, um/V."""
-        if self.actuator.gain is None:
-            return np.zeros_like(voltage), np.zeros_like(voltage)
-        level, first, second, third = self.actuator.gain.powers(self.column)
-        added = level + voltage * (first + voltage * (second + voltage * third))
-        return added, first + voltage * (2 * second + voltage * 3 * third)
+        Without dynamics and creep, between limits, V.
+        """
+        loop = steady_loop(self.actuator, self.column, *limits, points=3)
+        at_zero = self.begin(np.zeros(self.models)).rest[0, 0]
+        return Span(float(loop.falling[0, 0] - at_zero), float(loop.rising[0, -1] - at_zero))
 
     def frequency_response(self, angles: FloatArray) -> FloatArray:
         """Return the complex response (models, frequencies) of dynamics and creep together.
@@ -234,18 +304,6 @@ class SampledModel:
         return scipy.signal.StateSpace(
             scipy.linalg.block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
         )
-
-    def _section_drives(self, w: FloatArray, voltage: FloatArray) -> FloatArray:
-        """Return what drives each section, (models, sections), um."""
-        drives = np.empty_like(self.sections.gains)
-        drives[:, 0] = w
-        drives[:, 1:] = (w * (1 + self.creep_growth * np.abs(voltage)))[:, np.newaxis]
-        return drives
-
-    def _weigh(self, values: FloatArray) -> FloatArray:
-        """Return the sum of the sections' values (models, sections), each times its gain."""
-        total: FloatArray = (self.sections.gains * values).sum(axis=1)
-        return total
 
 
 def require_inverse(model: SampledModel, limits: Span) -> None:

@@ -25,7 +25,6 @@ from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operator import Span
 from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
@@ -306,7 +305,7 @@ def track(
     mean = SampledModel.of(actuator, mean_theta[np.newaxis])
     require_inverse(mean, limits)
     frequencies = _frequencies(mean, frequencies)
-    ends = _reach(mean, limits)
+    ends = mean.reach(limits)
     if amplitude is None:
         amplitude = 0.8 * ends.half
     elif not 0 < amplitude <= ends.half:
@@ -335,16 +334,6 @@ def track(
         gains, margins, robustness, stand, frequencies, signals, center, amplitude,
         rise * actuator.interval, rms, largest, limited,
     )  # fmt: skip
-
-
-def _reach(mean: SampledModel, limits: Span) -> Span:
-    """Return the displacements, um, that slow sweeps between the limits end at."""
-    memory = mean.step.demagnetized()
-    ends = []
-    for voltage in (0.0, limits.high, limits.low, limits.high, limits.low):
-        w, _, memory = mean.drive(memory, np.array([voltage]))
-        ends.append(float(w[0]))
-    return Span(ends[4] - ends[0], ends[3] - ends[0])
 
 
 def _rise(mean: SampledModel) -> int:

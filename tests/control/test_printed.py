@@ -70,16 +70,15 @@ def test_greek_and_signs_have_names() -> None:
 @pytest.mark.parametrize("function", [swaps, divides, unknown])
 def test_what_c_does_not_have_is_refused(function: Callable[..., Any]) -> None:
     with pytest.raises(InputError, match=rf"^{function.__name__}: `.*` has no counterpart in C"):
-        c_functions(function, {}, "c_")
+        c_functions([function], {}, "c_")
 
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``everything`` as a function of C."""
     folder: Path = tmp_path_factory.mktemp("printed")
-    code = c_functions(everything, {"parameters": 3}, "c_").replace(
-        "static double c_everything", "X"
-    )
+    shapes = {"parameters": (3,), "memory": (2,), "after": (2,)}
+    code = c_functions([everything], shapes, "c_").replace("static double c_everything", "X")
     code = f"#include <math.h>\n{code.replace('X(', 'double c_everything(', 1)}"
     (folder / "printed.c").write_text(code, encoding="ascii")
     command = [needs("cc"), *STRICT, "-Wno-unused", "-shared", "-fPIC", "printed.c", "-o", "c.so"]
