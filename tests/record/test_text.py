@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +178,33 @@ def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> Non
 def test_a_text_packed_by_gzip_is_the_text(tmp_path: Path) -> None:
     assert read(tmp_path, gzip.compress(GOOD.encode())).sha256 == read(tmp_path, GOOD).sha256
     assert "damaged" in fault(tmp_path, gzip.compress(GOOD.encode())[:-20])
+
+
+@given(
+    separator=st.sampled_from([";", "\t", "|", ","]),
+    empty=st.lists(st.integers(0, 3), min_size=1, max_size=6),
+    names=st.sampled_from([HEADER, "time (s),drive voltage (V),gauge (um)"]),
+    commas=st.booleans(),
+)
+def test_empty_columns_are_none(
+    tmp_path_factory: pytest.TempPathFactory,
+    separator: str,
+    empty: list[int],
+    names: str,
+    commas: bool,
+) -> None:
+    """However many there are, and wherever: names and units stay above their numbers."""
+    rows = [row.split(",") for row in (names, *ROWS)]
+    if commas and separator != ",":
+        rows[1:] = [[cell.replace(".", ",") for cell in row] for row in rows[1:]]
+    for position in empty:
+        rows = [[*row[:position], "", *row[position:]] for row in rows]
+    text = lines(*(separator.join(row) for row in rows))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        record = read(tmp_path_factory.getbasetemp(), text)
+        good = read(tmp_path_factory.getbasetemp(), GOOD)
+    assert record.sha256 == good.sha256
 
 
 def test_columns_of_other_quantities_are_ignored_with_a_remark(tmp_path: Path) -> None:

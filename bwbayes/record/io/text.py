@@ -168,10 +168,11 @@ def _layout(path: Path, lines: Sequence[str]) -> _Layout:
         width = Counter(map(len, split)).most_common(1)[0][0]
         if width < 2:
             continue
-        numeric = np.array(
-            [[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in split if len(row) == width]
-        )
-        share = float(numeric.sum()) / (width * len(split))
+        whole = [row for row in split if len(row) == width]
+        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in whole])
+        # An empty cell speaks for no separator, nor against one.
+        filled = sum(bool(cell) for row in whole for cell in row)
+        share = float(numeric.sum()) / max(filled, 1) * len(whole) / len(split)
         numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
         if share > best and numeric_columns:
             best, separator, fields, columns = share, candidate, width, numeric_columns
