@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -88,6 +88,47 @@ def test_what_is_done_is_said() -> None:
         pytest.warns(InputWarning, match=r"\d+ samples are missing, .* is interpolated there"),
     ):
         Record.from_arrays(np.sin(time), np.sin(time), time=time)
+
+
+@given(
+    st.integers(200, 3000),
+    st.sampled_from([1e-6, 1e-3, 0.01, 1 / 64]),
+    st.floats(-1.5, 1),
+    st.sampled_from([np.rint, np.floor]),
+    st.integers(0, 10**6),
+)
+@settings(max_examples=60, deadline=None)
+def test_samples_are_uniform_whose_clock_ticks_too_slowly(
+    samples: int, tick: float, ratio: float, rounded: np.ufunc, start: int
+) -> None:
+    """As written in milliseconds, or by Windows: nothing is left out or moved, nothing missing."""
+    interval = tick * 10**ratio
+    ticks = rounded(np.arange(samples) * 10**ratio)
+    steps = np.diff(ticks)
+    assume(np.count_nonzero(steps != np.median(steps)) >= 10)
+    voltage = np.random.default_rng(start).standard_normal(samples)
+    record = uneven(tick * (start + ticks), voltage, 0.3 * voltage)
+    np.testing.assert_array_equal(record.voltage, voltage)
+    assert samples == record.readings
+    # The times of both ends are uncertain by a tick.
+    length = record.interval * (samples - 1)
+    assert length == pytest.approx(interval * (samples - 1), abs=1.1 * tick)
+
+
+def test_a_slow_clock_is_named_and_samples_may_be_missing_beside_it() -> None:
+    index = np.arange(1000)
+    voltage = np.sin(index / 100)
+    with pytest.warns(InputWarning, match=r"in ticks of 0.001 s; .* uniform, every 0.0004 s"):
+        Record.from_arrays(voltage, voltage, time=np.floor(0.4 * index) * 1e-3)
+    kept = np.sort(np.random.default_rng(1).permutation(index[1:-1])[20:])
+    with pytest.warns(InputWarning, match=r"20 samples are missing"):
+        record = Record.from_arrays(voltage[kept], voltage[kept], time=kept * 1e-3)
+    assert 1e-3 == record.interval
+    # A single one that is repeated is no clock's doing, nor are many at once.
+    for repeated in ([500], range(200, 600)):
+        time = 1e-3 * np.sort(np.concatenate([index, repeated]))[:1000]
+        with pytest.raises(InputError, match=r"is repeated; remove one .*, or give `fs=HZ`"):
+            Record.from_arrays(voltage, voltage, time=time)
 
 
 @pytest.mark.parametrize(

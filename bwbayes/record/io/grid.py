@@ -2,7 +2,8 @@
 
 Times count as uniform as far as their digits can tell. Where samples are missing, the others stay
 at their places. Where times scatter, as those of a loop in a program do, samples move to the
-nearest times of the grid, along the columns' slopes. Time stamps of a clock count from the first.
+nearest times of the grid, along the columns' slopes. Time stamps of a clock count from the first;
+those of a coarse one, whose ticks are longer than an interval, may repeat.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import InputWarning
+from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.series import MAXIMUM_SAMPLES
 
@@ -85,31 +86,77 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
     elapsed = column.scaled((raw - raw[0]).astype(np.float64), "time")
     start = float(stamps[0])
     offset = start if abs(start) > 1e6 else 0.0
-    steps = np.diff(elapsed)
-    typical = float(np.median(steps))
-    if (steps <= 0).any():
-        sample = int(np.argmax(steps <= 0)) + 1
-        digits = decimals_of(float(np.median(np.abs(steps))))
-        before, after = (f"{t + start - offset:.{digits}f} s" for t in elapsed[sample - 1 :][:2])
-        problem = f"{after} is repeated; remove one of the two samples"
-        if elapsed[sample] < elapsed[sample - 1]:
-            problem = f"time goes back from {before} to {after}; sort them"
-        raise table.error(problem, "time", sample)
-    if typical < 1e-12:
-        problem = f"steps of {typical:.3g} s are absurdly small; check the unit"
+    steps, samples = np.diff(elapsed), np.arange(elapsed.size)
+    interval = float(elapsed[-1]) / steps.size
+    if (steps < 0).any() or interval == 0:
+        raise _repeated(table, elapsed + start - offset)
+    if interval < 1e-12:
+        problem = f"steps of {interval:.3g} s are absurdly small; check the unit"
         raise table.error(problem, "time")
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
-    samples = np.arange(elapsed.size)
-    for positions in (samples, _with_gaps(table, steps)):
-        interval = float(elapsed[-1] / positions[-1])
-        tolerance = _tolerance(stamps, interval, rounding)
-        if (np.abs(elapsed - interval * positions) <= tolerance).all():
-            interval = _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
-            grid = Grid(start - offset, interval, offset)
-            is_whole = positions[-1] < elapsed.size
-            return grid if is_whole else grid._replace(positions=positions, sources=samples)
+    uniform = _uniform_interval(table, stamps, elapsed, samples, rounding)
+    if uniform := uniform or _rounded_interval(table, elapsed):
+        return Grid(start - offset, uniform, offset)
+    if (steps == 0).any():
+        raise _repeated(table, elapsed + start - offset)
+    positions = _with_gaps(table, steps)
+    if uniform := _uniform_interval(table, stamps, elapsed, positions, rounding):
+        return Grid(start - offset, uniform, offset, positions, samples)
     return _nearest_grid(table, elapsed, positions, start - offset, offset)
+
+
+def _repeated(table: ColumnTable, times: FloatArray) -> InputError:
+    """Return the error of times (samples,), s, of which one is repeated or goes back."""
+    steps = np.diff(times)
+    sample = int(np.argmax(steps < 0 if (steps < 0).any() else steps == 0))
+    digits = decimals_of(float(np.mean(np.abs(steps))))
+    before, after = (f"{time:.{digits}f} s" for time in times[sample : sample + 2])
+    problem = f"{after} is repeated; remove one of the two samples, or give `fs=HZ` for the times"
+    if steps[sample] < 0:
+        problem = f"time goes back from {before} to {after}; sort them"
+    return table.error(problem, "time", sample + 1)
+
+
+def _uniform_interval(
+    table: ColumnTable,
+    stamps: FloatArray,
+    elapsed: FloatArray,
+    positions: IntArray,
+    rounding: float,
+) -> float | None:
+    """Return the interval, s, of a grid on which samples are at these positions, if they are."""
+    interval = float(elapsed[-1] / positions[-1])
+    tolerance = _tolerance(stamps, interval, rounding)
+    if (np.abs(elapsed - interval * positions) > tolerance).any():
+        return None
+    return _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
+
+
+def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
+    """Return the interval, s, of a uniform grid whose times a coarse clock rounded to its ticks.
+
+    Times of whole ticks, about as long as the interval or longer, are within a tick along a line.
+    Missing samples make such times too, if they are evenly spread: ten at random, once in 3000.
+    """
+    steps = np.diff(elapsed)
+    shortest = float(steps[steps > 0].min())
+    differences = np.diff(np.sort(steps))
+    tick = float(np.min(differences[differences > 1e-3 * shortest], initial=shortest))
+    counts = steps / tick
+    samples = np.arange(elapsed.size)
+    _, interval = np.polynomial.polynomial.polyfit(samples, elapsed, 1)
+    # A tenth for the line, whose ends are uncertain too.
+    is_rounded = np.ptp(elapsed - interval * samples) <= 1.1 * tick
+    is_whole = np.abs(counts - np.rint(counts)).max() < 1e-3
+    others = np.count_nonzero(np.rint(counts) != np.rint(np.median(counts)))
+    if not is_rounded or not is_whole or others < 10:
+        return None
+    unsure = 1.5 * tick / math.sqrt(elapsed.size)
+    interval = _exact_interval(table, float(interval), tick, unsure, steps.size)
+    remark = f"in ticks of {tick:.4g} s; samples are taken as uniform, every {interval:.6g} s"
+    warnings.warn(str(table.error(remark, "time")), InputWarning, stacklevel=6)
+    return interval
 
 
 def _nearest_grid(
