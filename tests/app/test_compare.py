@@ -15,8 +15,8 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.commands.studies import compare as compare_command
+from bwbayes.app.config import USUAL_MODELS
 from bwbayes.app.config.keywords import config_of, models_of
-from bwbayes.app.config.limits import USUAL_MODELS
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import resolve
 from bwbayes.errors import InputError, InputWarning
@@ -168,11 +168,12 @@ def test_other_readings_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["a"], "give two runs or more, or a CONFIG"),
+        (["a"], "a: No such file or directory"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
-        (["a", "b", "--models", "linear"], "goes with one CONFIG"),
-        (["a", "a"], "the same run is there twice"),
-        (["a", "b"], "a: no run here"),
+        ([".", "b", "--models", "linear"], "models: fits are compared as they are; leave it out"),
+        ([".", "."], "the same run is there twice"),
+        ([".", "b"], "no run here"),
+        (["."], "one fit alone; give two or more"),
         (["c.toml", "--models", "linear; linear"], "is there twice"),
     ],
 )
