@@ -81,7 +81,8 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
     environment.globals |= {"pictures": pictures, "plots": plots.drawn}
     environment.filters |= {
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
-        "pixels": _pixels,
+        # A picture's width and height, if it is a whole one.
+        "pixels": lambda png: struct.unpack(">2I", png[16:24]) if len(png) > 24 else None,
         "csv_link": csv_link,
         # Whether each column holds words, which go to the left.
         "is_wordy": lambda rows: [
@@ -94,14 +95,6 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
         ],
     }
     return environment
-
-
-def _pixels(png: bytes) -> tuple[int, int] | None:
-    """Return a picture's width and height, or None if it is no whole PNG."""
-    if not png.startswith(b"\x89PNG\r\n\x1a\n") or len(png) < 24:
-        return None
-    width, height = struct.unpack(">2I", png[16:24])
-    return width, height
 
 
 def csv_link(table: Table) -> str:

@@ -28,7 +28,14 @@ def show(report: Report, console: Console) -> None:
             _say(line, console)
     for block in report.all_blocks():
         if isinstance(block, Table) and block.on != "page" and block.rows:
-            console.print(_grid(block))
+            columns, rows = block.cells("screen")
+            grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+            for i, column in enumerate(columns):
+                title = f"{column.group}: {column.title}" if column.group else column.title
+                grid.add_column(escape(_plain(title)), no_wrap=i == 0)
+            for row in rows:
+                grid.add_row(*(escape(_plain(text)) for text in row))
+            console.print(grid)
         elif isinstance(block, Text) and block.on != "page":
             _say(escape(_plain(block.text)), console)
 
@@ -38,17 +45,6 @@ def as_text(report: Report, width: int = 110) -> str:
     text = StringIO()
     show(report, Console(file=text, width=width, force_jupyter=False, color_system=None))
     return text.getvalue().rstrip()
-
-
-def _grid(table: Table) -> Grid:
-    columns, rows = table.cells("screen")
-    grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for i, column in enumerate(columns):
-        title = f"{column.group}: {column.title}" if column.group else column.title
-        grid.add_column(escape(_plain(title)), no_wrap=i == 0)
-    for row in rows:
-        grid.add_row(*(escape(_plain(text)) for text in row))
-    return grid
 
 
 def _say(text: str, console: Console) -> None:
