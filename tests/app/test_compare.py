@@ -168,7 +168,7 @@ def test_other_readings_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["a"], "a: No such file or directory"),
+        (["a"], "a: does not exist; check the path"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
         ([".", "b", "--models", "linear"], "models: fits are compared as they are; leave it out"),
         ([".", "."], "the same run is there twice"),
