@@ -1,7 +1,7 @@
 """Every example that people are shown is run: in README, help texts and notebooks.
 
 They are collected from these texts, so that a new one is run by itself. What the README does in
-Python is in ``test_readme.py``, docstrings are run by ``test_top_level.py``, and the notebooks'
+Python is in ``test_readme.py``, docstrings are run by ``test_public_names.py``, and the notebooks'
 cells by ``test_notebooks.py``. Each command is run once; ``-m slow`` runs every line and config.
 """
 

@@ -148,7 +148,7 @@ FIGURES: dict[str, list[str]] = {
         "closed loop/draws",
         "closed loop/seeds",
     ],
-    "-m slow tests/prediction/test_forecasts_calibrated.py": [
+    "-m slow tests/prediction/test_forecast.py": [
         "forecasts from posteriors/records",
         "extent 100 forecasts from posteriors/95 % bands cover/*",
     ],

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.problem.problem import resolve
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.record import read_record, write_record
+from bwbayes.record import Record, read_record, write_record
 from tests.app import small
 from tests.app.conftest import Type
 
@@ -118,31 +117,6 @@ def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
     assert "550 samples" in bwbayes("check", "small.toml", "--record", "a.csv").out
 
 
-def test_check_says_what_is_wrong_and_what_to_do(
-    bwbayes: Type, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    # Explanations, which take long where there is something odd, are tested by themselves.
-    monkeypatch.setattr("bwbayes.app.jobs.check.explained", lambda *_, **__: ())
-    record = resolve(small.config(), tmp_path).record
-    assert record.displacement is not None
-    spoilt = record.displacement.copy()
-    spoilt[120] += 60.0
-    write_record(replace(record, displacement=spoilt), tmp_path / "a.h5")
-    parameters = "[parameters]\ninitial = { fixed = 0.0 }\ngamma = { fixed = 0.0172 }\n"
-    model = '[model]\ndynamics = "none"\nnoise = "white"\n'
-    (tmp_path / "a.toml").write_text(f'[record]\nfile = "a.h5"\n{model}{parameters}')
-    said = bwbayes("check", "a.toml", "--out", "page")
-    assert 0 == said.status
-    assert "spikes: 1 isolated outlier" in said.out
-    assert "Fix: outliers = true under [model]" in said.out
-    page = (tmp_path / "page" / "check.html").read_text()
-    assert "<b>spikes</b>: 1 isolated outlier " in page
-    assert page.count("data:image/png;base64,") == 3
-    assert {"time.png", "loop.png", "drive.png"} == {
-        path.name for path in (tmp_path / "page" / "figures").iterdir()
-    }
-
-
 @pytest.mark.parametrize("suffix", ["csv", "mat"])
 def test_simulate_writes_record_and_truth(bwbayes: Type, tmp_path: Path, suffix: str) -> None:
     said = bwbayes("simulate", f"a.{suffix}", "--signal", "sine", "--duration", "4", "--rate", "50")
@@ -226,23 +200,6 @@ def test_no_file_is_replaced_unless_that_is_asked_for(
     bwbayes("simulate", "new.csv").assert_refused("new.truth.csv: exists")
 
 
-def test_lead_in_longer_than_the_record_is_refused(
-    bwbayes: Type, run: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "new.csv").write_text(lines(HEADER, *ROWS))
-    predict = "predict", run, "--record", "new.csv", "--out", "bands.csv"
-    for length, text in (
-        ("1", "lead-in of 1 s from 0 s on leaves nothing of the record from 0 to 0.6 s"),
-        ("nan", "not a positive length of time"),
-        ("-1", "not a positive length of time"),
-    ):
-        bwbayes(*predict, "--lead-in", length).assert_refused(text)
-    assert not (tmp_path / "bands.csv").exists()
-    # By itself it is a quarter of the record.
-    assert 2 != bwbayes(*predict).status
-    assert 60 == len(columns(tmp_path / "bands.csv")[1])
-
-
 def test_existing_run_is_kept_with_a_hint(bwbayes: Type, tmp_path: Path) -> None:
     """An impossible target and a damaged chain leave it as it is, too."""
     (tmp_path / "small.toml").write_text(small.TEXT)
@@ -259,3 +216,61 @@ def test_existing_run_is_kept_with_a_hint(bwbayes: Type, tmp_path: Path) -> None
     (folder.chain / "start.npz").write_bytes(b"PK" + bytes(1000))
     bwbayes("resume", "results/small").assert_refused("chain: the chain cannot be read")
     assert before == folder.config.read_bytes()
+
+
+# A prediction leaves bands, scores and a picture, says what does not hold, replaces nothing
+
+
+@pytest.fixture
+def record(run: Path) -> Record:
+    return read_record(run / "records/sine.h5")
+
+
+def test_scores_and_a_picture_lie_beside_the_bands(
+    bwbayes: Type, run: Path, record: Record, tmp_path: Path
+) -> None:
+    write_record(record, tmp_path / "sine.h5")
+    predict = "predict", run, "--record", "sine.h5", "--from-rest", "--out"
+    assert 0 == bwbayes(*predict, "new/bands.csv", "--window", 2.0, 3.5).status
+    bands = tmp_path / "new/bands.csv"
+    result = json.loads(bands.with_suffix(".json").read_text())
+    assert (2.0, 3.5) == pytest.approx((result["from_s"], result["to_s"]))
+    assert 75 == result["samples"]
+    assert 0 < result["scores"]["nrmse"]
+    assert result["holds"] in (True, None)
+    assert bands.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    bands.unlink()
+    bwbayes(*predict, "new/bands.csv").assert_refused("bands.json: exists", "give `--overwrite`")
+    assert not bands.exists()
+    bwbayes(*predict, "bands.png").assert_refused("give a name that ends in .csv")
+
+
+def test_record_that_goes_the_other_way_ends_with_status_3(
+    bwbayes: Type, run: Path, record: Record, tmp_path: Path
+) -> None:
+    assert record.displacement is not None
+    write_record(replace(record, displacement=-record.displacement), tmp_path / "turned.h5")
+    said = bwbayes("predict", run, "--record", "turned.h5", "--from-rest", "--out", "bands.csv")
+    assert 3 == said.status
+    assert said.out.startswith(
+        "VALIDATION FAILED: turned (separate record): the readings fall where the voltage rises"
+    )
+    assert "Likely cause: reversed sign of the displacement. Fix: change" in said.out
+    result = json.loads((tmp_path / "bands.json").read_text())
+    assert (False, "sign") == (result["holds"], result["cause"])
+
+
+def test_a_files_own_columns_are_recognized(
+    bwbayes: Type, run: Path, record: Record, tmp_path: Path
+) -> None:
+    """As by `bwbayes run`: a user's next file has the columns of the first."""
+    assert record.displacement is not None
+    rows = zip(1e3 * record.time, record.voltage, record.displacement, strict=True)
+    lines = ["# voltage: command", "t [ms],drive (V),pos_um"]
+    lines += [f"{t:.9g},{v:.12g},{y:.12g}" for t, v, y in rows]
+    (tmp_path / "sine.csv").write_text("\n".join(lines) + "\n")
+    said = bwbayes("predict", run, "--record", "sine.csv", "--from-rest", "--out", "bands.csv")
+    assert 0 == said.status
+    result = json.loads((tmp_path / "bands.json").read_text())
+    assert record.samples == result["samples"]
+    assert result["holds"] in (True, None)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.config.keywords import config_of
+from bwbayes.app.config.keywords import config_of, models_of
+from bwbayes.app.config.settings import ModelConfig
 from bwbayes.errors import InputError
 from bwbayes.record.record import Record
 from tests.app import small
@@ -157,15 +158,6 @@ def test_text_that_is_no_toml_is_refused(text: str) -> None:
     assert refused(text).startswith("invalid TOML")
 
 
-def test_unknown_key_of_any_length_is_one_short_line() -> None:
-    """And many windows in one line are not taken for one."""
-    windows = ", ".join(f"[{i}.0, {i}.5]" for i in range(1000))
-    assert 1000 == len(parse(f"{RECORD}train = [{windows}]\n", "").records["record"].train or [])
-    text = refused(f"{RECORD}{'x' * 100_000} = 1\n")
-    assert "unknown key; known are " in text
-    assert len(text) < 700
-
-
 def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "utf16.toml").write_bytes(b"\xff\xfe[\0r\0")
@@ -199,3 +191,43 @@ def test_dumped_config_is_the_same_config(result: Config) -> None:
 def test_the_runs_that_come_with_the_package_can_be_read(path: Path) -> None:
     config = load(path)
     assert parse(dump(config), "again") == config
+
+
+# Models in a line are what a config would say of them, and what cannot be read is one line
+
+BASE = ModelConfig(gain=["cubic"], creep=True, dynamics="none", hold="first", passive=False)
+
+
+def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
+    text = "bouc-wen; maxwell-slip(thresholds=4)+quadratic +cubic; linear + creep + lag + white;"
+    models = models_of(text, BASE)
+    assert list(models) == [
+        "bouc-wen",
+        "maxwell-slip(thresholds=4) + quadratic + cubic",
+        "linear + creep + lag + white",
+    ]
+    first, second, third = models.values()
+    assert first == ModelConfig(dynamics="none", hold="first")
+    assert (second.hysteresis, second.thresholds) == ("maxwell-slip", 4)
+    assert second.gain == ["quadratic", "cubic"]
+    assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("bouc-wenn", "did you mean bouc-wen?"),
+        ("bouc-wen + quadratik", "did you mean quadratic?"),
+        ("plays(treshold=4)", "treshold is unknown"),
+        ("plays(thresholds=)", "write options as in thresholds=4"),
+        ("plays(thresholds='x')", "thresholds"),
+        ("bouc-wen; bouc-wen", "is there twice"),
+        (" ; ", "names no model"),
+        ("+ quadratic", "begin with an operator"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_in_a_line(text: str, said: str) -> None:
+    with pytest.raises(InputError, match="models: ") as refused:
+        models_of(text, BASE)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)

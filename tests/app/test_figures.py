@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
 
 import hypothesis.strategies as st
 import matplotlib as mpl
@@ -16,11 +20,14 @@ from hypothesis import given, settings
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bwbayes.app.running.figure_worker import Artist, artist_of
 from bwbayes.inference.parameters import Parameter
-from bwbayes.report.figures import interactive
+from bwbayes.report.figures import interactive, picture_of, plots_of, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
+from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
 from bwbayes.report.figures.style import Color, envelope, zigzag
+from bwbayes.report.page import NO_PLOTS
 from tests.app import example
 
 
@@ -151,16 +158,6 @@ def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
     assert all(np.ptp(time) < 1 for time in times)
 
 
-def test_file_time_stands_beside_the_time_axis() -> None:
-    """The time stamp of time zero, whole; the axis counts from there."""
-    stamped = dataclasses.replace(example.bands(), time_offset=1.7e9)
-    assert "time after 1700000000 s (s)" == draw_bands(stamped).axes[4].get_xlabel()
-    assert (
-        "time after 1700000000 s (s)"
-        in interactive.draw(example.run(every=(stamped,)))["bands_held-out"]
-    )
-
-
 def test_ranks_of_independent_draws_keep_inside_the_gray_band() -> None:
     """Ninety-five percent of them, whatever the distribution."""
     ensembles, bins = 4, 20
@@ -215,3 +212,48 @@ def test_plots_are_the_same_whenever_they_are_drawn_and_end_no_element() -> None
     assert ["bands_</script><b>", "loop"] == list(plots)
     assert not any("<" in text for text in plots.values())
     assert {} == interactive.draw(example.run(converged=False))
+
+
+# Pictures that another process draws are those that this one draws, whatever comes of it
+
+
+class Broken(Executor):
+    """Loses its processes at every call."""
+
+    def submit(self, _: Callable[..., Any], /, *__: Any, **___: Any) -> Future[Any]:
+        """Return what has failed already."""
+        future: Future[Any] = Future()
+        future.set_exception(BrokenProcessPool())
+        return future
+
+
+def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
+    run = example.run()
+    with artist_of(2) as artist:
+        if artist.pool is None:
+            pytest.skip("this machine has one core")
+        artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
+        artist.draw(dataclasses.replace(run, scores={}))
+        drawn, plots = artist.drawn(run, tmp_path / "apart")
+    here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
+    save_pictures(here, tmp_path / "here")
+    assert list(here.items()) == list(drawn.items())
+    assert plots_of(run).drawn == plots.drawn
+    assert {path.name: path.read_bytes() for path in (tmp_path / "here").iterdir()} == {
+        path.name: path.read_bytes() for path in (tmp_path / "apart").iterdir()
+    }
+
+
+def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
+    """Also where the process that was to draw them has died, and nothing was begun."""
+    artist, run = Artist(Broken()), example.run(converged=False)
+    drawn, plots = artist.drawn(run, tmp_path)
+    assert plots == NO_PLOTS
+    assert ["trace", "ranks"] == list(drawn)
+    assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_pictures_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
+    artist, run = Artist(Broken()), example.run()
+    artist.draw(run)
+    assert list(pictures(run)) == list(artist.drawn(run, tmp_path)[0])

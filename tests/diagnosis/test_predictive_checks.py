@@ -6,12 +6,16 @@ less here, since the posterior has seen the record.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.innovations import Innovations, departures, innovations
 from bwbayes.diagnosis.predictive_checks import STATISTICS, Replicated, replicated
 from bwbayes.inference.posterior import Posterior
+from tests.inference import problems
 from tests.inference.problems import INTERVAL, TRUE_NOISE, short_posterior, truth
 
 SAMPLES = 400
@@ -70,3 +74,64 @@ def test_readings_that_are_missing_are_missing_in_all() -> None:
     made = looked_at(posterior.altered(displacement=displacement))
     assert all(np.isfinite(one.observed) for one in made.statistics.values())
     assert not made.statistics["residual_sd_um"].odd
+
+
+# Innovations: silent on what the noise model describes, and a remark on each departure
+
+
+def along(white: FloatArray) -> Innovations:
+    """Return innovations along a sine of 1 Hz at 200 Hz."""
+    time = 0.005 * np.arange(white.size, dtype=np.float64)
+    voltage = 100 * np.sin(2 * np.pi * time)
+    rate = np.gradient(voltage) / 0.005
+    return Innovations(time, white, voltage, rate, 0.5 * white, 0.005)
+
+
+def test_innovations_of_the_right_model_raise_no_remark() -> None:
+    """At most 4 false alarms of 400, 1 %; of 1,000 others there were three."""
+    generator = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(400):
+        result = along(generator.normal(size=int(generator.choice([200, 1000, 4000]))))
+        alarms += bool(departures(result))
+    assert alarms <= 4
+
+
+def colored(white: FloatArray, _: Innovations) -> FloatArray:
+    return white + 0.3 * np.concatenate([[0.0], white[:-1]])
+
+
+def rising(white: FloatArray, result: Innovations) -> FloatArray:
+    return white + 0.3 * (result.rate > 0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "part"),
+    [
+        (colored, "innovations 0.005 s apart correlate by 0."),
+        (rising, "SD where the voltage is rising"),
+    ],
+)
+def test_each_departure_is_remarked_on(
+    spoil: Callable[[FloatArray, Innovations], FloatArray], part: str
+) -> None:
+    """In 20 of 20 records of 2,000 readings."""
+    for seed in range(20):
+        white = np.random.default_rng([2, seed]).normal(size=2000)
+        lines = [*map(str, departures(along(spoil(white, along(white)))))]
+        assert any(part in line for line in lines), (seed, lines)
+        assert all(line.startswith("noise model: ") for line in lines)
+
+
+def test_innovations_of_a_simulated_record_are_standard_normal() -> None:
+    """At the truth: mean within 4.5 standard errors of 0, sd of 1, and no remark."""
+    posterior = problems.short_posterior(samples=3000, seed=4)
+    theta = problems.truth(posterior)[0]
+    free = np.array([theta[posterior.prior.names.index(n)] for n in posterior.names])
+    result = innovations(posterior, free, begin=7.0)
+    assert 7.0 == result.time[0]
+    assert abs(np.mean(result.white)) < 4.5 / np.sqrt(3000)
+    assert abs(np.std(result.white) - 1) < 4.5 / np.sqrt(6000)
+    assert () == departures(result)
+    assert 3000 == result.numbers["readings"]
+    assert {"rate", "voltage", "direction"} == set(result.numbers["by"])  # type: ignore[call-overload]

@@ -9,7 +9,10 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import DiscrepancyNoise, WhiteNoise
+from bwbayes.inference.outliers import outliers, surprise
+from bwbayes.inference.posterior import Posterior
 from tests.inference.problems import INTERVAL, short_posterior, single
 
 
@@ -66,3 +69,45 @@ def test_parameters_must_be_those_of_the_model() -> None:
     offset = single("offset", sound.prior.free[-2].prior or pytest.fail("has a prior"))
     with pytest.raises(InputError, match="in this order"):
         replace(sound, prior=offset)
+
+
+# Isolated outliers are found, all of them and nothing else, and what is left is as without them
+
+
+def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
+    displacement = posterior.only.displacement.copy()
+    displacement[rows] += size * (-1.0) ** np.arange(len(rows))
+    return posterior.altered(displacement=displacement)
+
+
+def test_a_reading_is_set_aside_from_six_sds_on() -> None:
+    """One that is moved to nine sds from what the others predict is, one at four is not."""
+    good = short_posterior(samples=400)
+    place = pointfit.fit(good, np.random.default_rng(9)).mode
+    before, after = (surprise(p, place)[300] for p in (good, spoilt(good, [300], 1.0)))
+    for sds, aside in ((9.0, [300]), (4.0, [])):
+        moved = spoilt(good, [300], (sds - before) / (after - before))
+        assert aside == outliers(moved.without, np.random.default_rng(9))["record"].tolist()
+
+
+def test_what_is_left_is_the_posterior_without_those_readings() -> None:
+    """The same posterior as that of the good record with these readings missing, exactly."""
+    good = short_posterior(samples=600)
+    rows = [40, 41, 300, 599]
+    spiky = spoilt(good, rows)
+    aside = outliers(spiky.without, np.random.default_rng(4))["record"]
+    assert rows == aside.tolist()
+    cleaned, missing = (p.only.displacement.copy() for p in (spiky, good))
+    cleaned[aside] = missing[rows] = np.nan
+    z = good.prior.unconstrain(good.prior.draw(np.random.default_rng(5), 5))
+    np.testing.assert_array_equal(
+        spiky.altered(displacement=cleaned).log_density(z),
+        good.altered(displacement=missing).log_density(z),
+    )
+
+
+def test_a_record_full_of_outliers_is_refused() -> None:
+    posterior = short_posterior(samples=400)
+    noisy = spoilt(posterior, list(range(0, 400, 12)), 30.0)
+    with pytest.raises(InputError, match="too many for isolated outliers"):
+        outliers(noisy.without, np.random.default_rng(8))

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
+from bwbayes.prediction.bands import Bands
+from bwbayes.report.outputs import write_bands
 from bwbayes.report.result import summary
+from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
+from tests.app.example import bands
 
 
 def parameters(draws: FloatArray) -> dict[str, dict[str, float]]:
@@ -46,3 +53,48 @@ def test_the_means_error_is_that_of_a_known_process() -> None:
     expected = 3.0 * np.sqrt((1 + kept) / (1 - kept) / (600 * 4 * 16))
     for row in parameters(draws).values():
         assert expected == pytest.approx(row["mcse_mean"], rel=0.2)
+
+
+# What a run's files hold is what was computed, to the digits that matter
+
+
+def moved(one: Bands, offset: float, factor: float) -> Bands:
+    """Return bands of a displacement in other proportions, one reading of which is missing."""
+
+    def change(values: FloatArray) -> FloatArray:
+        return factor * values + offset
+
+    assert one.measured is not None
+    measured = change(one.measured)
+    measured[7] = np.nan
+    return replace(
+        one,
+        mean=change(one.mean),
+        measured=measured,
+        lower={key: change(edge) for key, edge in one.lower.items()},
+        upper={key: change(edge) for key, edge in one.upper.items()},
+    )
+
+
+@pytest.mark.parametrize(
+    ("offset", "factor"), [(0.0, 1.0), (12_345.6, 0.01), (-9e7, 1e-3), (5.0, 0.0)]
+)
+def test_bands_have_the_digits_of_their_range(tmp_path: Path, offset: float, factor: float) -> None:
+    """A sensor that reads 12,345.6 um while the displacement moves by 1.2 um."""
+    made = moved(bands(samples=400, lead_in=10), offset, factor)
+    write_bands(tmp_path / "bands.csv", [made])
+    table = np.genfromtxt(tmp_path / "bands.csv", delimiter=",", names=True)
+    for name, column in made.columns():
+        span = np.nanmax(column) - np.nanmin(column)
+        atol = max(1e-6 * span, 1e-7 * abs(offset) * (span == 0), 1e-15 * abs(offset))
+        np.testing.assert_allclose(table[name], column, rtol=0, atol=atol, err_msg=name)
+
+
+# Numbers as texts: with the digits that tell something, at any size
+
+
+@given(st.floats(1e-9, 1e5))
+def test_a_length_keeps_three_digits_at_any_size(um: float) -> None:
+    text = length_text(um)
+    assert text.endswith(" µm")
+    np.testing.assert_allclose(float(text[:-3]), um, rtol=0.0051)
