@@ -92,7 +92,6 @@ def _measured(*, quick: bool) -> Iterator[tuple[str, Table]]:
     rounds = 2 if quick else 7
     posterior = models.paper_record().posterior
     yield "engines", models.engines(posterior, rounds)
-    yield "parts", models.parts(posterior, rounds)
     yield "threads", models.threads(posterior, rounds)
     yield from runs.sampling(rounds, 800 if quick else 6000)
     yield "inversion", models.inversion(rounds)

@@ -1,8 +1,7 @@
-"""What a sample of a model costs: by engine and by part, in two threads, forward and backward."""
+"""What a sample of a model costs: by engine, in two threads, forward and backward."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -17,24 +16,20 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
-from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.record.waveforms import signal
 from tests.benchmarks.measuring import ROOT, Call, Cell, Table, interleaved
 from tests.benchmarks.stock import stock
 from tests.control import cases
-from tests.inference.problems import posterior_of, truth
+from tests.inference.problems import truth
 
-# Models of a batch, effective draws that our runs go on to, and times of four creep lags, s.
+# Models of a batch, and effective draws that our runs go on to.
 MODELS, ESS = 64, 4000.0
-LAGS = (0.1, 1.0, 10.0, 100.0)
-CREEPING = "bouc-wen, gain, four creep lags"
-STARTS = {"from rest": True, "in motion": False}
 
 # Samples and draws of what is read backwards.
 SAMPLES, DRAWS = 500, 1000
@@ -71,46 +66,6 @@ def engines(posterior: Posterior, rounds: int) -> Table:
     row: dict[str, Cell] = {name: 1e9 * cost[name].wall / work for name in calls}
     text = "ns per sample and model on one core, best of several; stock: a loop over the samples"
     return Table(f"Likelihood of the paper's record, {MODELS} models", text, [row])
-
-
-def parts(posterior: Posterior, rounds: int) -> Table:
-    """Measure every operator, gain and creep on the compiled engine, and as times Bouc-Wen.
-
-    Models are draws of the default priors. In motion, the start is unknown.
-    """
-    calls: dict[str, Call] = {}
-    for start, from_rest in STARTS.items():
-        for name, variant in _with_parts(posterior, from_rest=from_rest):
-            theta = variant.prior.theta(variant.prior.draw(np.random.default_rng(1), MODELS))
-            variant.log_likelihood(theta[:1])
-            calls[f"{name}, {start}"] = partial(variant.log_likelihood, theta)
-    costs = interleaved(calls, rounds)
-    usual = costs["bouc-wen, from rest"].wall
-    work = MODELS * posterior.only.voltage.size
-    rows = [
-        dict[str, Cell](model=name, ns=1e9 * cost.wall / work, times=cost.wall / usual)
-        for name, cost in costs.items()
-    ]
-    text = "ns per sample and model on one core, compiled engine; times Bouc-Wen from rest"
-    return Table(f"Likelihood by part, {MODELS} models", text, rows)
-
-
-def _with_parts(posterior: Posterior, *, from_rest: bool) -> Iterator[tuple[str, Posterior]]:
-    """Yield posteriors of the same record with a lag: each operator, and a model that creeps."""
-    only = posterior.only
-    span = Span(float(np.min(only.voltage)), float(np.max(only.voltage)))
-    plain = Actuator("lag", only.actuator.hold, only.actuator.interval, span=span)
-    actuators = {
-        name: replace(plain, hysteresis=made("hysteresis", name, HYSTERESIS, {}))
-        for name in HYSTERESIS
-    }
-    gain, creep = PolynomialGain(reference=span), Creep(LAGS, reference=span)
-    actuators[CREEPING] = replace(plain, gain=gain, creep=creep)
-    fixed = {"exponent": 1.0} | ({"initial": 0.0} if from_rest else {})
-    record = only.voltage, only.displacement
-    for name, actuator in actuators.items():
-        one = posterior_of(*record, actuator, "discrepancy", fixed, from_rest=from_rest)
-        yield name, replace(one, engine="numba")
 
 
 def speed_up(call: Call, rounds: int, title: str) -> Table:
