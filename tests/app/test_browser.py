@@ -6,23 +6,21 @@ Chromium opens each page as a reader does, on a telephone and on a screen, light
 from __future__ import annotations
 
 from collections.abc import Iterator
-from io import BytesIO, StringIO
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.campaign import STATUSES, Campaign, Row
-from bwbayes.app.running.folder import CampaignFolder
+from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.limits import Limits
 from bwbayes.report.page import render
-from bwbayes.report.result import summary
 from tests.app import example, small
 from tests.programs import needs
 
@@ -189,19 +187,6 @@ def test_intervals_are_seen_on_a_telephone(chromium: Any, pages: dict[str, Path]
         assert "95% interval" in title
 
 
-def test_loops_stand_side_by_side(chromium: Any, pages: dict[str, Path]) -> None:
-    """On a screen; on a telephone one below the other."""
-    for width, beside in ((1400, True), (400, False)):
-        with Opened(chromium, pages["run"], width) as opened:
-            first, second = (
-                box.bounding_box() for box in opened.page.locator("#loop .bk-Figure").all()
-            )
-            assert beside == (first["y"] == second["y"])
-            assert beside == (first["x"] + first["width"] <= second["x"])
-            narrow = opened.page.locator(".scroll:has(#parameters)")
-            assert narrow.evaluate("e => e.scrollWidth <= e.clientWidth")
-
-
 def middle_of(page: Any, name: str) -> tuple[float, float, float]:
     """Return the middle of a plot's displacement panel, and its width."""
     plot = page.locator(f"#{name} .plot")
@@ -228,23 +213,6 @@ def test_dragging_zooms_in_and_reset_goes_back(chromium: Any, pages: dict[str, P
         assert [] == opened.wrong
 
 
-def test_the_wheel_zooms_once_it_is_asked_to(chromium: Any, pages: dict[str, Path]) -> None:
-    """Until then it scrolls the page, whatever is below the pointer."""
-    with Opened(chromium, pages["run"]) as opened:
-        page = opened.page
-        before = page.evaluate(TIME_RANGES)
-        x, y, _ = middle_of(page, "bands_held-out")
-        page.mouse.move(x, y)
-        page.mouse.wheel(0, -120)
-        assert before == page.evaluate(TIME_RANGES)
-        page.locator("#bands_held-out [title^='Wheel Zoom']").first.click()
-        x, y, _ = middle_of(page, "bands_held-out")
-        page.mouse.move(x, y)
-        page.mouse.wheel(0, -120)
-        page.wait_for_timeout(300)
-        assert sum(page.evaluate(TIME_RANGES)) < 0.99 * sum(before)
-
-
 def test_hovering_shows_the_sample_below_the_pointer(chromium: Any, pages: dict[str, Path]) -> None:
     bands = example.bands()
     with Opened(chromium, pages["run"]) as opened:
@@ -262,40 +230,6 @@ def test_hovering_shows_the_sample_below_the_pointer(chromium: Any, pages: dict[
     assert bands.voltage[at] == pytest.approx(numbers["voltage"], abs=0.006)
     assert bands.mean[at] == pytest.approx(numbers["mean"], abs=6e-4)
     assert bands.measured[at] == pytest.approx(numbers["measured"], abs=6e-4)
-
-
-@pytest.mark.parametrize("table", ["parameters", "validation"])
-def test_csv_of_a_table_is_the_summary(chromium: Any, pages: dict[str, Path], table: str) -> None:
-    kept: Any = summary(example.run())[table]
-    with Opened(chromium, pages["run"]) as opened:
-        with opened.page.expect_download() as started:
-            opened.page.locator(f"a.csv[download='{table}.csv']").click()
-        text = Path(started.value.path()).read_text(encoding="utf-8")
-    assert f"{table}.csv" == started.value.suggested_filename
-    frame = pd.read_csv(StringIO(text), index_col=0)
-    if table == "parameters":
-        assert list(kept) == list(frame.index)
-        for name, numbers in kept.items():
-            for key, value in numbers.items():
-                assert value == frame.loc[name, key]
-    else:
-        for name, scores in kept.items():
-            assert scores["nrmse"] == float(frame.loc["nrmse", name])
-            assert scores["coverage"]["sensor"]["95"] == float(
-                frame.loc["coverage sensor 95", name]
-            )
-
-
-def test_on_paper_all_is_open_and_still(chromium: Any, pages: dict[str, Path]) -> None:
-    """What was closed is printed, pictures stand for plots, and there are no buttons."""
-    with Opened(chromium, pages["run"]) as opened:
-        page = opened.page
-        page.emulate_media(media="print")
-        seen = "e => e.getBoundingClientRect().height > 0"
-        assert all(page.locator("details table").evaluate_all(f"a => a.map({seen})"))
-        assert all(page.locator("img").evaluate_all(f"a => a.map({seen})"))
-        for hidden in (".csv", ".plot"):
-            assert not any(page.locator(hidden).evaluate_all(f"a => a.map({seen})"))
 
 
 def test_without_scripts_there_are_the_pictures(chromium: Any, pages: dict[str, Path]) -> None:

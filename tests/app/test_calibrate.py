@@ -8,17 +8,13 @@ import shutil
 import signal
 import subprocess
 import time
-from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import pytest
-from rich.console import Console
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import resume, start
 from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import batch
 from bwbayes.errors import InputError
 from bwbayes.prediction.bands import KINDS, LEVELS
 from tests.app import small
@@ -266,22 +262,3 @@ def test_what_no_replicate_can_use_leaves_no_folder(tmp_path: Path) -> None:
 
 
 # Progress
-
-
-def test_progress_tells_rate_and_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    console = Console(record=True, width=200, file=StringIO())
-
-    def work(end: float, short: str) -> str:
-        now[0] = end
-        return short
-
-    counts: dict[str, Any] = {"kind": "replicate", "done": 10, "short": {"not converged": 3}}
-    tasks = [(130.0, ""), (160.0, "not converged")]
-    where: dict[str, Any] = {"console": console, "workers": 1, "backend": "threads"}
-    assert ["", "not converged"] == [*batch(work, tasks, str, **counts, **where)]
-    assert [
-        "replicate 11 of 12   2.0 a minute   ETA 0:30   not converged 3",
-        "replicate 12 of 12   2.0 a minute   ETA 0:00   not converged 4",
-    ] == console.export_text().splitlines()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import shutil
-import subprocess
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -20,17 +18,16 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.running.campaign import Campaign, Row
-from bwbayes.app.running.folder import CampaignFolder
+from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.run import start as begin
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.report.outputs import write_summary
-from bwbayes.report.page import render
 from bwbayes.report.result import summary
 from tests.app import small
 from tests.app.conftest import Type
-from tests.app.specimens import CONFIG, POPULATION, record, specimens
+from tests.app.specimens import CONFIG, record, specimens
 
 COUNT = 3
 FILES = ("campaign.json", "campaign.csv", "campaign.html", "figures/parameters.png")
@@ -174,25 +171,6 @@ def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_pa
     assert means[1]["s000"] == means[1]["broken"]
 
 
-@pytest.mark.slow
-def test_a_run_that_was_resumed_by_itself_is_looked_at_again(given: Path, tmp_path: Path) -> None:
-    """One that has not converged says how to go on, and counts once it has."""
-    text = CONFIG.replace("ess = 200", "ess = 200\nsteps = 40")
-    (tmp_path / "short.toml").write_text(text)
-    (tmp_path / "records").mkdir()
-    shutil.copyfile(given / "records/s000.csv", tmp_path / "records/s000.csv")
-    config = config_text(tmp_path / "short.toml")
-    folder = start(tmp_path / "records", config, tmp_path, tmp_path / "batch", pictures=False)
-    (row,) = ended(folder).rows
-    assert "not converged" == row.status
-    assert "step limit 40 reached" in row.reason
-    assert "specimen" not in str(list(folder.run("s000").iterdir()))
-    arguments = re.findall(r"`bwbayes (resume .*)`", row.reason)[0].split()
-    subprocess.run(small.command(*arguments[:-1], "2000", "--quiet", "--workers", "1"), check=True)
-    again = ended(folder)
-    assert ("passed", 0) == (again.rows[0].status, again.exit_status)
-
-
 def made_up(*endings: str) -> Campaign:
     rows = tuple(Row(f"<b>{ending}", "x.csv", ending, "<i>why</i>", {}) for ending in endings)
     return Campaign(CampaignFolder(Path("x")), rows, "few")
@@ -213,25 +191,6 @@ def test_another_config_or_folder_is_refused(given: Path, whole: Path, tmp_path:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="has no record"):
         start(tmp_path / "empty", "", given, tmp_path / "batch")
-
-
-def test_the_population_is_that_of_the_truths(whole: Path) -> None:
-    told = json.loads((whole / "campaign.json").read_text())["population"]
-    assert {"d", "alpha"} == set(told)
-    for name, (median, spread) in POPULATION.items():
-        assert told[name]["mean"]["lower_95"] < median < told[name]["mean"]["upper_95"]
-        assert told[name]["spread"]["lower_95"] < spread < told[name]["spread"]["upper_95"]
-        assert told[name]["logarithmic"]
-
-
-def test_the_page_needs_nothing_else_and_escapes(whole: Path) -> None:
-    page = (whole / "campaign.html").read_text(encoding="utf-8")
-    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
-    assert 1 == page.count("data:image/png;base64,")
-    for text in ("broken.csv:2", "3 refused", '<th scope="row">alpha</th>', "Taken for normal"):
-        assert text in page
-    escaped = render(made_up("refused").report(), {})
-    assert not re.search("<b>refused|<i>why", escaped)
 
 
 def test_python_has_table_population_and_the_next_specimen(

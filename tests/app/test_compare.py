@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.studies import compare as compare_command
-from bwbayes.app.config import USUAL_MODELS
-from bwbayes.app.config.keywords import config_of, models_of
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.problem import resolve
 from bwbayes.errors import InputError, InputWarning
@@ -103,33 +101,6 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
     assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
 
 
-@pytest.mark.slow
-def test_models_of_a_record_are_compared(tmp_path: Path) -> None:
-    """Named in one text or in a list, with nothing left or a folder, and its runs: the same."""
-    keys = KEYS | {"seed": 3, "parameters": {"gamma": {"fixed": 0.0172}}}
-    few: dict[str, Any] = {"future": False, "screen": False, "workers": 1, "progress": False}
-    first = bw.compare(measured(), models="linear; bouc-wen", **few, **keys)
-    assert "bouc-wen" == first.recommended
-    assert {"bouc-wen", "linear"} == set(first.to_pandas().index)
-    out = tmp_path / "out"
-    second = bw.compare(measured(), models=["linear", "bouc-wen"], folder=out, **few, **keys)
-    assert first.to_pandas().equals(second.to_pandas())
-    with pytest.raises(InputError, match=r"comparison\.json: exists"):
-        bw.compare(measured(), folder=out, **few, **keys)
-    folders = [out / name for name in ("linear", "bouc-wen")]
-    # The recommended one is finished.
-    assert [False, True] == [(folder / "report.html").is_file() for folder in folders]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # its bands do not hold
-        bw.resume(folders[0], progress=False)
-    third = bw.compare(*folders, future=False, workers=1)
-    assert "failed" == third["linear"].standing.status  # type: ignore[union-attr]
-    without_validation = (c.to_pandas().drop(columns="validation") for c in (first, third))
-    assert next(without_validation).equals(next(without_validation))
-    mixed = bw.compare([str(folders[0]), bw.open_run(folders[1])], future=False, workers=1)
-    assert third.to_pandas().equals(mixed.to_pandas())
-
-
 def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
     record = measured()
     for given, options, line in (
@@ -168,12 +139,11 @@ def test_other_readings_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["a"], "a: does not exist; check the path"),
+        (["a"], "give two runs or more, or a CONFIG"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
-        ([".", "b", "--models", "linear"], "models: fits are compared as they are; leave it out"),
-        ([".", "."], "the same run is there twice"),
-        ([".", "b"], "no run here"),
-        (["."], "one fit alone; give two or more"),
+        (["a", "b", "--models", "linear"], "goes with one CONFIG"),
+        (["a", "a"], "the same run is there twice"),
+        (["a", "b"], "a: no run here"),
         (["c.toml", "--models", "linear; linear"], "is there twice"),
     ],
 )
@@ -182,25 +152,6 @@ def test_a_wrong_command_is_one_line(
 ) -> None:
     (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
     bwbayes("compare", *arguments).assert_refused(text)
-
-
-def test_a_config_alone_is_run_with_the_usual_models(
-    bwbayes: Type, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """With and without hysteresis; the help names each."""
-    (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
-
-    def refused(*given: Any, **_: Any) -> Any:
-        raise InputError(", ".join(given[2]))
-
-    monkeypatch.setattr("bwbayes.app.jobs.compare.compare_models", refused)
-    bwbayes("compare", "c.toml").assert_refused(", ".join(USUAL_MODELS.split("; ")))
-    config, _ = config_of(measured(), {})
-    operators = [model.hysteresis for model in models_of(USUAL_MODELS, config.model).values()]
-    assert len(operators) >= 6
-    assert {"linear", "bouc-wen"} <= {*operators}
-    (models,) = (option for option in compare_command.params if option.name == "models")
-    assert USUAL_MODELS in str(vars(models)["help"])
 
 
 def test_a_config_is_run_with_each_model_and_gone_on_with(bwbayes: Type, tmp_path: Path) -> None:

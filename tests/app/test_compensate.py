@@ -111,20 +111,3 @@ def test_what_is_no_reference_is_one_line(
     with pytest.raises(InputError, match=re.escape(line)) as refused:
         fit.compensate(reference, from_rest=True, voltage=(-100.0, 100.0), **options)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("values", "line"),
-    [
-        ([0.0, 1.0, 2.0], "give one row of 10 samples or more"),
-        ([5000.0] * 50, "is 5 um all along"),
-        (["nan", *range(49)], "not a number; give one at every sample"),
-        ([], "no columns of numbers in it"),
-    ],
-)
-def test_files_that_cannot_be_used_are_one_line(
-    fit: bw.Fit, tmp_path: Path, values: list[Any], line: str
-) -> None:
-    with pytest.raises(InputError, match=line) as refused:
-        fit.compensate(write_reference(tmp_path, values), from_rest=True)
-    assert "\n" not in str(refused.value)

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.comparison.designed import Design, Promise
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.model.limits import Limits
 from bwbayes.record import read_record
-from bwbayes.report.page import render
 from tests.app.conftest import Type
 
 SIGNAL = "[{}]\namplitude = {}\nfrequency = 1.0\nduration = 3.0\ndecay = {}\n"
@@ -60,21 +56,6 @@ def test_the_preset_keeps_to_the_amplifiers_limits(fit: bw.Fit) -> None:
     lefts = [promise.left for promise in ranking if not promise.refused]
     assert lefts == sorted(lefts)
     assert 0 < lefts[0] < 1
-
-
-def test_a_page_names_what_cannot_be_told_apart_and_what_is_refused() -> None:
-    """Two standard errors of the difference; refused signals have a reason, and no promise."""
-    wave = 100 * np.sin(np.arange(200) / 10)
-    promises = [Promise("a", 0.50, 0.01), Promise("b", 0.52, 0.01), Promise("c", 0.60, 0.01)]
-    promises.append(Promise("d", np.nan, np.nan, "is too fast"))
-    limits, waves = Limits(-100, 100, 50.0), dict.fromkeys("abcd", wave)
-    ranking = Design("run", None, "x", limits, waves, 0.01, Standing(), promises)
-    assert ["b"] == ranking.alike
-    page = render(ranking.report(), {})
-    assert "not to be told apart from it: b" in page
-    assert "<li>d is too fast</li>" in page
-    assert "width left of the band along x after one more record of it: 50.0% ± 1.0%" in page
-    assert "at most 50 V/s" in page
 
 
 @pytest.mark.parametrize(

@@ -272,16 +272,6 @@ def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None
     assert "VALIDATION FAILED" in repr(bands)
 
 
-def test_a_drive_beyond_what_was_fitted_is_a_warning(opened: Fit) -> None:
-    made = opened.problem.record
-    plan = replace(made, voltage=5 * made.voltage, displacement=None, truth=None)
-    with pytest.warns(bw.InputWarning, match="plan: voltage .* the bands extrapolate"):
-        bands = opened.predict(plan, from_rest=True, name="plan")
-    assert bands.scores is None
-    assert bands.holds is None
-    assert np.isnan(bands.residuals).all()
-
-
 # Keys
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import io
-import itertools
 import shutil
 import signal
 import sys
@@ -192,18 +191,3 @@ def test_10000_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> Non
     used, refused = (sum(counts[status] for counts in result.values()) for status in (0, 2))
     keep("hostile input", {"used": used, "refused": refused})
     assert ALL == sum(counts.total() for counts in result.values())
-
-
-def test_what_is_used_goes_through_the_whole_check(place: Path) -> None:
-    """With the point fit itself, for the first records that are used."""
-    fitted = 0
-    numbers = (n for n in itertools.count() if not KINDS[n % len(KINDS)].endswith("config"))
-    while fitted < FITTED:
-        one = case(SEED, next(numbers))
-        said = check(one, place)
-        fitted += said.status == 0
-        assert "nan" not in said.out
-        assert said.status in (0, 2)
-        assert (place / "results").exists() == (said.status == 0)
-        shutil.rmtree(place / "results", ignore_errors=True)
-        (place / one.record).unlink()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +11,14 @@ import numpy as np
 import pytest
 
 import bwbayes
-from bwbayes.app.config.config import Config, dump, parse
-from bwbayes.app.config.keywords import config_of, models_of
-from bwbayes.app.jobs.at_work import limits_of
+from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.jobs.compare import compare, compare_models, fits_of
-from bwbayes.app.jobs.design import candidates_of, liveliest
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume, start
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.model.limits import Limits
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures.pictures import pictures
 from tests.app import small
@@ -89,19 +83,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return folder
 
 
-def test_records_have_names_starts_and_truths_of_their_own() -> None:
-    made = problem()
-    assert ["loops", "step"] == [*made.records]
-    fixed = {p.name: p.fixed for p in made.parameters if p.fixed is not None}
-    assert {"initial[loops]": 0.0, "initial[step]": 0.0, "exponent": 1.0, "gamma": 0.0172} == fixed
-    truth = made.config.truth
-    assert truth["offset[loops]"] == truth["offset[step]"] == 0.0
-    (label,) = {p.label for p in made.parameters if p.name == "offset[step]"}
-    assert label == r"y_0^{\mathrm{step}}"
-    assert made.windows("loops") == {"loops": (slice(0, 150),), "later": (slice(150, 200),)}
-    assert made.windows("step") == {"step": (slice(0, 99),)}
-
-
 def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
     """The loop has the widest range and turns; an offset's prior is from its own record."""
     changes = ('dynamics = "none"', 'dynamics = "none"\ngain = ["quadratic"]')
@@ -118,19 +99,6 @@ def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
     spans = {one.actuator.span for one in both.posterior.datasets}
     assert len(spans) == 1
     assert next(iter(spans)).low < -50  # type: ignore[union-attr]
-
-
-def test_a_resolved_config_is_the_same_problem(tmp_path: Path) -> None:
-    first = problem()
-    folder = RunFolder.create(tmp_path / "run", first, overwrite=False)
-    again = folder.problem()
-    assert fingerprint(first.config) == fingerprint(again.config)
-    assert first.sha256 == again.sha256
-    z = np.random.default_rng(0).standard_normal((3, len(first.posterior.names)))
-    np.testing.assert_allclose(
-        first.posterior.log_density(z), again.posterior.log_density(z), rtol=1e-12
-    )
-    assert dump(again.config) == dump(resolve(again.config, folder.path).config)
 
 
 def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
@@ -181,50 +149,6 @@ def test_any_other_record_is_predicted(finished: RunFolder) -> None:
     with pytest.warns(InputWarning, match="inconclusive: prediction"):
         predicted = made.predict(other, from_rest=True)
     np.testing.assert_array_equal(predicted.mean, made.bands["sine"].mean)
-
-
-@pytest.mark.slow
-def test_several_records_are_compared_by_two_models(finished: RunFolder, tmp_path: Path) -> None:
-    """What a model has no parameter for is left out of its scopes; every record has a future."""
-    scoped = config(('dynamics = "none"', 'dynamics = "none"\nper_record = ["gamma"]'))
-    models = models_of("linear", scoped.model)
-    out = tmp_path / "out"
-    made = compare_models(scoped, Path(), models, out, small.quiet(), future=False, workers=1)
-    assert "linear is the only model that has converged" == made.lines[0]
-    assert [] == parse((out / "linear/config.toml").read_text(), "").model.per_record
-    both = [finished.path, out / "linear"]
-    made = compare(fits_of(both), workers=1)
-    assert "run" == made.recommended
-    for one in made.candidates:
-        assert {"later training", "later", "sine"} == one.parts.keys()
-        half = sum(-(-d.readings.rows.size // 2) for d in finished.problem().posterior.datasets)
-        assert one.parts["later training"].readings == half
-        assert [True, False] == [one.parts[name].joint for name in ("later", "sine")]
-    assert {"later", "sine"} == made["linear"].scores.keys() == made["run"].scores.keys()
-
-
-def test_what_to_measure_next_does_not_hang_on_the_order_of_records(finished: RunFolder) -> None:
-    """Voltages are those of all records, the pattern that of the one that turns most."""
-    made = finished.problem()
-    flipped = replace(made, records=dict(reversed(list(made.records.items()))))
-    assert ["step", "loops"] == [*flipped.records]
-    signals = []
-    for one in (made, flipped):
-        assert "loops" == liveliest(one)
-        amplifier = Limits(*limits_of(one, None))
-        assert made.records["loops"].range_voltage == (amplifier.low, amplifier.high)
-        signals.append(candidates_of("standard", one.records["loops"], amplifier))
-    assert signals[0].keys() == signals[1].keys()
-    for name, voltage in signals[0].items():
-        np.testing.assert_array_equal(voltage, signals[1][name])
-    with pytest.warns(InputWarning, match="Validation inconclusive"):
-        best = bwbayes.open_run(finished.path).design("alpha")[0]
-    assert 0 < best.left < 1
-    with (
-        pytest.warns(InputWarning, match="Validation inconclusive"),
-        pytest.raises(InputError, match=r"'offset\[step\]' is not a free parameter of the act"),
-    ):
-        bwbayes.open_run(finished.path).design("offset[step]")
 
 
 def test_replicates_make_all_records_anew() -> None:

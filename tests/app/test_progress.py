@@ -61,15 +61,6 @@ def test_the_eta_counts_down_between_checks_and_does_not_climb_at_them(watched: 
     assert [120 - 10 * i for i in range(len(seen))] == seen
 
 
-def test_while_ensembles_disagree_there_is_no_eta(watched: Watched) -> None:
-    """More draws may not cure that: a time that is put off at each check would climb."""
-    for _ in range(4):
-        watched.block(10.0)
-    assert np.inf == watched.check(200, 2500, rhat=1.2)
-    assert 120 == watched.check(200, 500)
-    assert np.inf == watched.check(200, 500, stuck=1)
-
-
 def test_each_step_after_the_sampling_counts_down_by_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

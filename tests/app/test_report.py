@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from base64 import b64encode
 from typing import Any
 
 import hypothesis.strategies as st
@@ -104,13 +103,6 @@ def test_chains_without_a_spread_can_be_reported(value: float) -> None:
     assert "nan" == rows(page(run), "sampling")["stiff, k"][2]
 
 
-def test_pictures_are_inside_the_page_answer_before_evidence_before_details() -> None:
-    sources = re.findall(r'<img [^>]*src="(.*?)"', page(example.run()))
-    order = ("loop", "bands_held-out", "bands_training", "coverage", "corner", "trace", "ranks")
-    expected = [b64encode(PICTURES[name]).decode() for name in order]
-    assert [f"data:image/png;base64,{text}" for text in expected] == sources
-
-
 @pytest.mark.parametrize("converged", [True, False])
 def test_page_needs_nothing_from_elsewhere(converged: bool) -> None:
     """Nor does it run any script but its own, which is there only if there are plots."""
@@ -125,16 +117,6 @@ def test_page_needs_nothing_from_elsewhere(converged: bool) -> None:
         assert outside not in text.replace("base64,//", "")
     assert all(s.startswith("data:") for s in re.findall(r'src="(.*?)"', text))
     assert all(s.startswith(("#", "data:text/csv")) for s in re.findall(r'href="(.*?)"', text))
-
-
-def test_remarks_facts_and_circumstances_are_shown() -> None:
-    run = example.run()
-    more = {"seed": 7, "wall_s": 61.4, "data_sha256": "abc", "versions": {"numpy": "2.5"}}
-    text = example.page(run, {**summary(run), **more})
-    assert "<li>the sensor was clipped</li>" in text
-    facts = {"record": ["made up"], "seed": ["7"], "wall time": ["61 s"]}
-    facts |= {"data, SHA-256": ["abc"], "versions": ["numpy 2.5"]}
-    assert facts == rows(text, "facts")
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign import Row
-from bwbayes.app.running.folder import CampaignFolder
+from bwbayes.app.running.campaign_folder import CampaignFolder
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.population.population import population
-from bwbayes.shown import LONGEST, MOST_LINES, brief, head
+from bwbayes.shown import LONGEST, MOST_LINES, brief
 from tests.control import cases
 from tests.population.populations import drawn
 
@@ -130,13 +130,6 @@ def test_anything_is_shown_shortly(one: Any, another: Any) -> None:
     for thing in (Anything(one, another), Anything(Anything(one, another), [one] * 50)):
         assert repr(thing).count("\n") < MOST_LINES
         assert len(repr(thing)) <= LONGEST
-
-
-@given(st.text(st.characters(codec="utf-8")))
-def test_the_head_of_any_text_is_short(text: str) -> None:
-    for whole in (text, "\n".join([text] * 20), 2000 * text):
-        assert head(whole).count("\n") < MOST_LINES
-        assert len(head(whole)) <= LONGEST
 
 
 def test_dir_has_public_names_alone() -> None:

@@ -137,14 +137,3 @@ def test_a_spike_of_a_small_record_is_seen_and_hides_nothing(row: int, size: flo
     assert [*expected, "spikes"] == [one.kind for one in found]
     assert found[-1].start == good.time[row]
     assert "outliers = true under [model]" == found[-1].fix
-
-
-def test_the_resolved_config_is_the_same_problem(tmp_path: Path) -> None:
-    """Its explicit priors and outliers, and what the defaults would be."""
-    good = measured(100, 20.0, np.random.default_rng(3))
-    spoiled = with_spikes(good, np.array([33]), np.array([1e4]), np.array([1.0]))
-    first = resolved(spoiled.record, "outliers = true")
-    again = resolve(first.config, tmp_path, {"record": spoiled.record})
-    assert set_aside(first) == set_aside(again) == [33]
-    assert first.defaults == again.defaults
-    assert first.parameters == again.parameters

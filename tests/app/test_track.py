@@ -9,7 +9,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import bwbayes as bw
@@ -28,7 +27,7 @@ def test_numbers_table_and_picture_agree(
         asked.update(options)
         return tracking
 
-    monkeypatch.setattr("bwbayes.app.jobs.control.track", track)
+    monkeypatch.setattr("bwbayes.app.jobs.track.track", track)
     shutil.copytree(run, tmp_path / "run")
     command = "track", "run", "--frequency", "5", "--draws", "5"
     said, folder = bwbayes(*command), tmp_path / "run/track"
@@ -77,11 +76,3 @@ def test_options_that_make_no_sense_are_one_line(
     with pytest.raises(InputError, match=line) as error:
         fit.track(**options)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.slow
-def test_rate_and_delay_are_the_controllers(fit: bw.Fit) -> None:
-    tracking = fit.track(frequencies=(5.0,), draws=4, rate=500.0, delay=2)
-    assert (4, 4) == tracking.rms.shape[2:]
-    assert (2e-3, 2) == (tracking.gains.interval, tracking.stand.delay)
-    assert np.isfinite(tracking.rms).all()

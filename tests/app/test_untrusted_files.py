@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.record import Record, read_record, write_record
@@ -31,7 +29,7 @@ from bwbayes.report.screen import as_text
 from bwbayes.report.tables import priors_table
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
-from tests.app.mutations import CONFIGS, GOOD, QUICK, good_arrays, stored
+from tests.app.mutations import QUICK, good_arrays, stored
 from tests.sampling.chains import finish, new
 
 # Code in data files
@@ -278,18 +276,3 @@ def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
 def test_a_validation_may_not_be_called_like_a_path(name: str) -> None:
     with pytest.raises(InputError):
         parse(f'{QUICK}[validation."{name}"]\nwindow = [0.1, 0.2]\n', "my.toml")
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Path:
-    (tmp_path / "record.csv").write_text("\n".join([*GOOD, ""]))
-    return tmp_path
-
-
-@pytest.mark.parametrize("name", ["a", "-", "_", "x" * 100, "con", "-rf"])
-def test_whatever_a_validation_is_called_all_stays_in_the_folder(bench: Path, name: str) -> None:
-    text = CONFIGS[1].replace("other", name)
-    RunFolder.create(bench / "out", resolve(parse(text, "my.toml"), bench), overwrite=False)
-    assert {"record.csv", "out"} == {path.name for path in bench.iterdir()}
-    outcome = {str(path.relative_to(bench / "out")) for path in (bench / "out").rglob("*")}
-    assert {"config.toml", "records", "records/record.h5", f"records/{name}.h5"} == outcome

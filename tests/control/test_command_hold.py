@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.jobs.control import export
+from bwbayes.app.jobs.export import export
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference, shaped
-from bwbayes.errors import InputError
-from bwbayes.model.linear import Hold, parse_hold
+from bwbayes.model.linear import Hold
 from bwbayes.record.teststand import VirtualTestStand
 from tests.control.commands import (
     about,
@@ -118,12 +117,6 @@ def test_a_model_is_exported_for_a_dac(measured: Problem, tmp_path: Path) -> Non
     held = export(fit_of(measured, flat), tmp_path / "held")
     straight = export(fit_of(measured, flat), tmp_path / "straight", hold="foh")
     assert ["zero", "first"] == [one.model.actuator.hold for one in (held, straight)]
-
-
-def test_holds_have_names() -> None:
-    assert ("zero", "first") == (parse_hold("zoh"), parse_hold("foh"))
-    with pytest.raises(InputError, match="hold: 'held' is unknown; give zoh"):
-        parse_hold("held")
 
 
 def parts(seed: int) -> dict[tuple[str, int], float]:

@@ -75,27 +75,6 @@ def test_engines_agree_along_records_that_are_long_for_the_filter(
         assert np.max(np.abs(one.mean - other.mean) / np.max(sd, axis=1)[:, np.newaxis]) < 1e-6
 
 
-def test_creep_after_a_step_is_that_of_its_lags() -> None:
-    """Σ cᵢ (1 − exp(−t/Tᵢ)) of the step, without hysteresis, dynamics or growth."""
-    posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": CREEP})
-    actuator, names = posterior.only.actuator, posterior.only.actuator.parameters
-    value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0}
-    strength = {"creep_1": 0.01, "creep_2": 0.02, "creep_3": 0.03}
-    theta = [[(value | strength).get(name, 0.0) for name in names]]
-    voltage = np.full(500, 50.0)
-    voltage[:100] = 0.0
-    time = actuator.interval * np.arange(400)
-    # The drive goes straight from sample to sample, so the step is a ramp of one interval.
-    ramp = actuator.interval
-    expected = 50.0 + sum(
-        50.0 * c * (1 - np.exp(-time / T) * T / ramp * np.expm1(ramp / T) * np.exp(-ramp / T))
-        for c, T in zip(strength.values(), CREEP.times, strict=True)
-    )
-    x = actuator.displacement(theta, voltage)[0]
-    np.testing.assert_allclose(x[:100], 0.0, atol=1e-9)
-    np.testing.assert_allclose(x[100:], expected, rtol=1e-9)
-
-
 def test_creep_that_grows_is_as_strong_as_stated_at_the_largest_voltage() -> None:
     posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": GROWING})
     names = posterior.only.actuator.parameters

@@ -73,15 +73,6 @@ def drawn(posterior: Posterior, models: int, seed: int = 1) -> FloatArray:
 LOOPS, SLOW = dataset("loops"), dataset("slow")
 
 
-def test_a_record_has_its_own_columns_named_after_it_and_one_alone_has_plain_names() -> None:
-    both, alone = joint(LOOPS, SLOW), joint(LOOPS)
-    shape, noise = "d alpha beta gamma exponent", "sensor_sd discrepancy_sd discrepancy_time"
-    own = "initial[loops] initial[slow] lag offset[loops] offset[slow]"
-    assert f"{shape} {own} {noise}".split() == [*both.table.names]
-    assert LOOPS.table.names == alone.table.names
-    assert both.alone("slow").table.names == alone.table.names
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> None:
     """Each at its own θ; other intervals, starts, windows and ranges of the voltage."""

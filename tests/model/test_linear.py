@@ -7,15 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
-from scipy.signal import cont2discrete, dlsim
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, second_order
 
 INTERVAL = 1e-3
 HOLDS: tuple[Hold, ...] = ("first", "zero")
-# Mass in kg, damping in N s/m, stiffness in N/m: the paper's, poles at -259.5 and -1.18e6 /s.
-TABLE_1 = (0.00134, 1580.0, 4.10e5)
 
 
 def batch(*parameters: float) -> list[FloatArray]:
@@ -55,25 +52,9 @@ def oscillator_rate(mass: float, damping: float, stiffness: float) -> FloatArray
     return np.array([[0, 1, 0, 0], [-pull, -damping / mass, pull, 0], [0, 0, 0, 1.0], [0] * 4])
 
 
-@pytest.mark.parametrize("hold", HOLDS)
-def test_stiff_poles_of_table_1_agree_with_scipy(hold: Hold) -> None:
-    mass, damping, stiffness = TABLE_1
-    # Time in ms and position with velocity in um/ms keep scipy's matrices well scaled.
-    system = (
-        np.array([[0.0, 1.0], [-stiffness / mass * 1e-6, -damping / mass * 1e-3]]),
-        np.array([[0.0], [stiffness / mass * 1e-6]]),
-        np.array([[1.0, 0.0]]),
-        np.zeros((1, 1)),
-    )
-    discrete = cont2discrete(system, INTERVAL * 1e3, "foh" if hold == "first" else "zoh")
-    expected = dlsim(discrete, walk()[:, np.newaxis])[1][:, 0]
-    got = from_rest(oscillator(TABLE_1, hold), walk())
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
-
-
 @given(
     frequency=st.floats(-2.5, 4.0).map(lambda power: 10.0**power),
-    ratio=st.floats(0.0, 30.0),
+    ratio=st.floats(0.0, 40.0),
     hold=st.sampled_from(HOLDS),
 )
 @settings(deadline=None, max_examples=100)

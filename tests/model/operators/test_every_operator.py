@@ -270,11 +270,6 @@ def test_sweeps_reach_what_they_say(name: str) -> None:
     assert (end.state <= np.max(ends, axis=0) + slack).all()
 
 
-def test_an_option_that_an_operator_does_not_take_is_refused() -> None:
-    with pytest.raises(InputError, match="hysteresis: 'preisach' has no option passive"):
-        made("hysteresis", "preisach", HYSTERESIS, {"passive": False})
-
-
 def test_an_unknown_operator_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(InputError, match="did you mean preisach"):
         made("hysteresis", "presach", HYSTERESIS, {})
