@@ -106,17 +106,17 @@ class OtherRecord:
         self,
         posterior: Posterior,
         draws: FloatArray,
-        record: Record,
+        simulated: Simulated,
         generator: np.random.Generator,
-    ) -> tuple[Bands, slice]:
-        """Predict it, once it is simulated; return the bands, and the samples that are judged."""
+    ) -> tuple[Bands, Simulated, slice]:
+        """Predict it, once it is simulated; return that too, and the samples that are judged."""
+        record, window = simulated.record, slice(0, simulated.model.size)
         if self.record.displacement is None:
             record = replace(record, displacement=None)
-        bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
-        judged_window = slice(0, record.samples)
         if self.window is not None:
-            judged_window = record.window_slice(*self.window)
-        return bands, slice(judged_window.start + bands.scored_from, judged_window.stop)
+            window = record.window_slice(*self.window)
+        bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
+        return bands, simulated, slice(window.start + bands.scored_from, window.stop)
 
 
 def covered(

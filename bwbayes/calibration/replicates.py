@@ -24,7 +24,7 @@ from bwbayes.calibration.records import OtherRecord, Simulated, covered
 from bwbayes.errors import one_line
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.prediction import predict_windows, thinned
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
@@ -211,9 +211,11 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     entry["ranks"] = dict(zip(names, np.sum(drawn < truth, axis=0).tolist(), strict=True))
     # Fewer draws than a run's, to save time.
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
+    predictions = _predictions(experiment, posterior, flat, theta, simulated, predicting, others)
     entry["covered"] = {
-        **_held_out(experiment, posterior, flat, simulated, predicting),
-        **_others(experiment, posterior, flat, theta, readings, others),
+        f"{name} {kind} {level}".strip(): share
+        for name, predicted in predictions.items()
+        for kind, level, share in covered(predicted)
     }
     return Replicate(entry, drawn)
 
@@ -265,15 +267,21 @@ def _independent(
     return spacing, thinned(chained[::-spacing].reshape(-1, free), generator, RANKED)
 
 
-def _held_out(
+def _predictions(
     experiment: Experiment,
     posterior: Posterior,
     draws: FloatArray,
+    theta: Mapping[str, FloatArray],
     simulated: Mapping[str, Simulated],
-    generator: np.random.Generator,
-) -> dict[str, float]:
-    """Part of the held-out samples, of all windows together, inside each band."""
-    predictions, first = [], posterior.table.records[0]
+    predicting: np.random.Generator,
+    others: np.random.Generator,
+) -> dict[str, list[tuple[Bands, Simulated, slice]]]:
+    """Predict held-out windows, all together under no name, and other records of the same truth.
+
+    Each prediction comes with what it is of, and with the samples of it that count.
+    """
+    held_out: list[tuple[Bands, Simulated, slice]] = []
+    first = posterior.table.records[0]
     for name, single, record_draws in posterior.each(draws):
         windows = {
             window: samples
@@ -281,31 +289,18 @@ def _held_out(
             if experiment.belongs.get(window, first) == name
         }
         if windows:
-            record = simulated[name]
-            bands = predict_windows(single, record_draws, record.record, windows, generator)
-            predictions += [(b, record, w) for b, w in zip(bands, windows.values(), strict=True)]
-    if not predictions:
-        return {}
-    return {f"{kind} {level}": share for kind, level, share in covered(predictions)}
-
-
-def _others(
-    experiment: Experiment,
-    posterior: Posterior,
-    draws: FloatArray,
-    theta: Mapping[str, FloatArray],
-    readings: Mapping[str, FloatArray],
-    generator: np.random.Generator,
-) -> dict[str, float]:
-    """Make the other records with the same truth; part of their samples inside each band."""
+            record = simulated[name].record
+            bands = predict_windows(single, record_draws, record, windows, predicting)
+            held_out += [
+                (b, simulated[name], w) for b, w in zip(bands, windows.values(), strict=True)
+            ]
+    predictions = {"": held_out} if held_out else {}
+    readings = {dataset.name: dataset.displacement for dataset in posterior.datasets}
     source = experiment.truth.with_readings(readings)
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
-    inside = {}
     for name, other in experiment.others.items():
-        like = other.like or posterior.table.records[0]
-        simulated = other.simulated(source.alone(like), source.table.of(true, like), generator)
+        like = other.like or first
+        another = other.simulated(source.alone(like), source.table.of(true, like), others)
         single, record_draws = posterior.alone(like), posterior.select_draws(draws, like)
-        bands, window = other.predicted(single, record_draws, simulated.record, generator)
-        for kind, level, share in covered([(bands, simulated, window)]):
-            inside[f"{name} {kind} {level}"] = share
-    return inside
+        predictions[name] = [other.predicted(single, record_draws, another, others)]
+    return predictions
