@@ -145,7 +145,7 @@ def design(
     def try_speed(speed: float) -> tuple[Gains, Margins]:
         first, second, third = (speed * poles / poles.sum()).tolist()
         gains = Gains((first, second, third), mean.actuator.interval)
-        return gains, _margins(gains, response, slopes, delay)
+        return gains, margins(gains, response, slopes, delay)
 
     # An integrator of this speed is at its limit on the steepest slope, whatever the dynamics.
     fastest = 2.0 / float(slopes[1].max())
@@ -167,20 +167,15 @@ def design(
     return best
 
 
-def margins(gains: Gains, draws: SampledModel, limits: Span, delay: int) -> Margins:
-    """Return the margins of every draw, the voltages within limits, V.
+def margins(
+    gains: Gains, response: FloatArray, slopes: tuple[FloatArray, FloatArray], delay: int
+) -> Margins:
+    """Return the margins of draws with a response (draws, angles) and bounds of the slope (draws,).
 
     The loop is L = k C(z) z^−delay P(z) with a slope k of the hysteresis, the linear part P and
     C = (q₀ + q₁/z + q₂/z²) / (1 − 1/z). It is looked at on a grid of angles per sample, rad, and
     taken to go straight, in log size and angle, from one to the next.
     """
-    return _margins(gains, draws.frequency_response(ANGLES), draws.slopes(limits), delay)
-
-
-def _margins(
-    gains: Gains, response: FloatArray, slopes: tuple[FloatArray, FloatArray], delay: int
-) -> Margins:
-    """Return the margins of draws with this response (draws, angles) and bounds of the slope."""
     back = np.exp(-1j * ANGLES)
     controller = np.polyval(gains.steps[::-1], back) / (1 - back) * back**delay
     loop = controller * response

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bwbayes.control.gains import Gains, Robustness, design, margins
+from bwbayes.control.gains import ANGLES, Gains, Margins, Robustness, design, margins
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -49,6 +49,10 @@ def largest_pole(gains: Gains, draws: SampledModel) -> float:
     return float(np.abs(np.roots(fed + np.pad(opened, (0, fed.size - opened.size)))).max())
 
 
+def margins_of(gains: Gains, draws: SampledModel, delay: int) -> Margins:
+    return margins(gains, draws.frequency_response(ANGLES), draws.slopes(cases.SPAN), delay)
+
+
 def scaled(gains: Gains, factor: float) -> Gains:
     first, second, third = (factor * one for one in gains.steps)
     return replace(gains, steps=(first, second, third))
@@ -65,7 +69,7 @@ def test_margins_of_an_integrator_are_the_closed_form(
 ) -> None:
     """L = K z^−(1+D) / (1 − 1/z): |L| = K / (2 sin(θ/2)), its lag is π/2 + (D + 1/2) θ."""
     made = without_hysteresis(slope)
-    result = margins(Gains((speed / slope, 0.0, 0.0), 1e-3), made, cases.SPAN, delay)
+    result = margins_of(Gains((speed / slope, 0.0, 0.0), 1e-3), made, delay)
     crossing = 2 * np.arcsin(speed / 2)
     gain = 2 * np.sin(np.pi / (2 * (2 * delay + 1))) / speed
     assert result.gain[0] == pytest.approx(gain, rel=1e-3)
@@ -79,7 +83,7 @@ def test_at_its_gain_margin_a_loop_has_a_pole_on_the_circle(name: str) -> None:
     """The margin comes from the frequency response; poles are worked out apart, and agree."""
     draws = models(name)
     gains = design(draws, draws, cases.SPAN, 1, Robustness())[0]
-    factors = margins(gains, draws, cases.SPAN, 1).gain
+    factors = margins_of(gains, draws, 1).gain
     for row in (0, 7):
         theta = cases.theta(draws.actuator, 20, name)[row : row + 1]
         single = SampledModel.of(draws.actuator, theta)
@@ -98,7 +102,7 @@ def test_a_design_keeps_its_margins_and_is_the_fastest(name: str, delay: int) ->
     assert result.stable
     assert (result.gain >= required.gain).all()
     assert (result.phase >= required.phase).all()
-    faster = margins(scaled(gains, 1.03), draws, cases.SPAN, delay)
+    faster = margins_of(scaled(gains, 1.03), draws, delay)
     kept = (faster.gain >= required.gain) & (faster.phase >= required.phase) & (faster.circle > 0)
     assert not kept.all()
 
