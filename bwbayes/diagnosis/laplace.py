@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import combinations, product
+from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 
@@ -101,52 +101,50 @@ def climb(
     Two rounds from each of them, with each of an effect's starts, tell which one leads. The climb
     ends where it gains so little that it would never reach a log density of ``least``.
     """
-    target = _Target(posterior, effect)
+    target = _Target(posterior, effect, least)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
-    states = target.climb(target.at(np.stack(starts)), 2, least)
-    best = states.rows(np.array([np.argmax(states.density)]))
-    return target.fitted(target.climb(best, ROUNDS, least))
+    climbed = [target.climb(target.at(start), 2) for start in starts]
+    return target.fitted(target.climb(max(climbed, key=lambda place: place.density), ROUNDS))
 
 
 def climb_each(posterior: Posterior, places: FloatArray) -> list[LocalFit]:
     """Fit from each of coordinates (places, free) of a posterior of one record."""
     target = _Target(posterior, NONE)
-    states = target.climb(target.at(places.copy()), ROUNDS, -np.inf)
-    return [target.fitted(states.rows(np.array([row]))) for row in range(len(places))]
+    return [target.fitted(target.climb(target.at(place), ROUNDS)) for place in places]
 
 
 @dataclass(frozen=True)
-class _States:
-    """Where climbers are: they go side by side, because a call costs more than a model in it.
-
-    Coordinates (climbers, free + sizes), their log density (climbers,) without the constant, and
-    the displacement there (climbers, readings).
-    """
+class _Place:
+    """Where a climb is: coordinates (free + sizes,), log density, displacement (readings,)."""
 
     coordinates: FloatArray
-    density: FloatArray
+    density: float
     displacement: FloatArray
 
-    def rows(self, rows: IntArray | BoolArray) -> _States:
-        """Return some of them."""
-        return _States(self.coordinates[rows], self.density[rows], self.displacement[rows])
 
-    def put(self, rows: IntArray, states: _States) -> None:
-        """Put others in the place of some."""
-        self.coordinates[rows], self.density[rows] = states.coordinates, states.density
-        self.displacement[rows] = states.displacement
-
-
+@dataclass(frozen=True)
 class _Target:
     """The log density of a model with an effect, and steps up to its mode."""
 
-    def __init__(self, posterior: Posterior, effect: Effect) -> None:
-        self.posterior, self.effect, self.likelihood = posterior, effect, posterior.likelihood
-        self.free = len(posterior.names)
-        noise = np.array([name not in posterior.table.physical for name in posterior.names])
-        sizes = self.free + np.arange(effect.starts.shape[1])
-        self.noise = np.flatnonzero(noise)
-        self.physical = np.concatenate([np.flatnonzero(~noise), sizes])
+    posterior: Posterior
+    effect: Effect
+    least: float = -np.inf
+
+    @property
+    def free(self) -> int:
+        """How many of the coordinates are the model's, the first ones."""
+        return len(self.posterior.names)
+
+    @cached_property
+    def noise(self) -> IntArray:
+        """Which coordinates are those of the noise's parameters."""
+        physical = self.posterior.table.physical
+        return np.flatnonzero([name not in physical for name in self.posterior.names])
+
+    @cached_property
+    def physical(self) -> IntArray:
+        """Which coordinates move the displacement."""
+        return np.setdiff1d(np.arange(self.free + self.effect.starts.shape[1]), self.noise)
 
     def prior(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
         """θ (models, parameters) and log prior (models,) of coordinates (models, free + sizes)."""
@@ -154,11 +152,11 @@ class _Target:
         sizes = coordinates[:, self.free :]
         return self.posterior.prior.theta(free), density - 0.5 * np.sum(sizes**2, axis=1)
 
-    def displacement(self, coordinates: FloatArray) -> FloatArray:
-        """Displacement (models, readings), um."""
-        theta, _ = self.prior(coordinates)
-        readings = self.likelihood.readings
-        voltage = self.likelihood.voltage[: readings.samples]
+    def displacement(self, theta: FloatArray, coordinates: FloatArray) -> FloatArray:
+        """Displacement (models, readings), um, of θ and coordinates that are possible."""
+        likelihood = self.posterior.likelihood
+        readings = likelihood.readings
+        voltage = likelihood.voltage[: readings.samples]
         moved = np.empty((len(theta), readings.rows.size))
         # An effect is worked out once for all models that have the same sizes.
         every, which = np.unique(coordinates[:, self.free :], axis=0, return_inverse=True)
@@ -166,146 +164,123 @@ class _Target:
             alike = np.flatnonzero(which.ravel() == number)
             for batch in batches(alike.size, voltage.size):
                 rows = alike[batch]
-                model = self.likelihood.table.actuator(theta[rows])
-                simulate = partial(self.likelihood.simulate, model)
+                model = likelihood.table.actuator(theta[rows])
+                simulate = partial(likelihood.simulate, model)
                 moved[rows] = self.effect.apply(simulate, voltage, sizes)[:, readings.where]
         return moved
 
-    def at(self, coordinates: FloatArray) -> _States:
-        """Return the states at coordinates (climbers, free + sizes)."""
-        theta, density = self.prior(coordinates)
-        possible = np.isfinite(density)
-        moved = np.zeros((len(theta), self.likelihood.readings.rows.size))
+    def density(
+        self, theta: FloatArray, log_prior: FloatArray, displacement: FloatArray
+    ) -> FloatArray:
+        """Log density (models,), less a constant, where the displacement (readings,) is known."""
+        possible, density = np.isfinite(log_prior), log_prior.copy()
         if possible.any():
-            moved[possible] = self.displacement(coordinates[possible])
-            density[possible] += self._log_likelihood(theta[possible], moved[possible])
-        return _States(coordinates, np.where(np.isfinite(density), density, -np.inf), moved)
+            theta = theta[possible]
+            moved = np.tile(displacement, (len(theta), 1))
+            score = self.posterior.likelihood.score(theta, moved[:0], moved)
+            density[possible] += score.log_density
+        return np.where(np.isfinite(density), density, -np.inf)
 
-    def _log_likelihood(self, theta: FloatArray, displacement: FloatArray) -> FloatArray:
-        """Log likelihood (models,) of models θ with a displacement (models, readings)."""
-        shapes = np.empty((0, displacement.shape[1]))
-        return self.likelihood.score(theta, shapes, displacement).log_density
+    def at(self, coordinates: FloatArray) -> _Place:
+        """Return the place at coordinates (free + sizes,)."""
+        theta, density = self.prior(coordinates[np.newaxis])
+        moved = np.zeros((1, self.posterior.likelihood.readings.rows.size))
+        if np.isfinite(density).all():
+            moved = self.displacement(theta, coordinates[np.newaxis])
+            density = self.density(theta, density, moved[0])
+        return _Place(coordinates, float(density[0]), moved[0])
 
-    def climb(self, states: _States, rounds: int, least: float) -> _States:
-        """Climb from each for so many rounds at most, as long as these may reach ``least``."""
-        going = np.flatnonzero(np.isfinite(states.density))
-        for _ in range(rounds):
-            if not going.size:
+    def climb(self, place: _Place, rounds: int) -> _Place:
+        """Climb for so many rounds at most, as long as these may reach ``least``."""
+        for _ in range(rounds if np.isfinite(place.density) else 0):
+            before, place = place.density, self._step_physics(self._step_noise(place))
+            if place.density < before + max(GAIN, (self.least - place.density) / ROUNDS):
                 break
-            before, now = states.density[going], states.rows(going)
-            self._step_noise(now)
-            self._step_physics(now)
-            states.put(going, now)
-            enough = np.maximum(GAIN, (least - now.density) / ROUNDS)
-            going = going[now.density >= before + enough]
-        return states
+        return place
 
-    def fitted(self, state: _States) -> LocalFit:
-        """Put the evidence of a single state together."""
-        coordinates, log_evidence = state.coordinates[0], float(state.density[0])
-        covariance = np.eye(coordinates.size)
+    def fitted(self, place: _Place) -> LocalFit:
+        """Put the evidence at a mode together."""
+        log_evidence, covariance = place.density, np.eye(place.coordinates.size)
         # What the record does not tell keeps its prior; the noise's bend is a finite difference.
-        for places, curvature, flattest in (
-            (self.physical, self._physical_bend(state)[1][0], 1.0),
-            (self.noise, self._noise_bend(state)[1][0], 1e-2),
+        for rows, curvature, flattest in (
+            (self.physical, self._physical_bend(place)[1], 1.0),
+            (self.noise, self._noise_bend(place)[1], 1e-2),
         ):
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
-            covariance[np.ix_(places, places)] = (vectors / values) @ vectors.T
+            covariance[np.ix_(rows, rows)] = (vectors / values) @ vectors.T
             log_evidence -= 0.5 * float(np.sum(np.log(values)))
         return LocalFit(
             self.posterior,
             self.effect,
-            coordinates,
+            place.coordinates,
             covariance,
-            float(state.density[0]),
+            place.density,
             log_evidence,
-            state.displacement[0],
+            place.displacement,
         )
 
-    def _step_physics(self, states: _States) -> None:
+    def _step_physics(self, place: _Place) -> _Place:
         """Step in the physical coordinates and the sizes, by Fisher scoring."""
-        slope, curvature = self._physical_bend(states)
-        step = np.linalg.solve(curvature, slope[:, :, np.newaxis])[:, :, 0]
-        waiting = np.arange(len(step))
-        for fraction in FRACTIONS:
-            if not waiting.size:
-                break
-            coordinates = states.coordinates[waiting]
-            coordinates[:, self.physical] += fraction * step[waiting]
-            tried = self.at(coordinates)
-            higher = tried.density > states.density[waiting]
-            states.put(waiting[higher], tried.rows(higher))
-            waiting = waiting[~higher]
+        slope, curvature = self._physical_bend(place)
+        step = np.zeros(place.coordinates.size)
+        step[self.physical] = np.linalg.solve(curvature, slope)
+        tried = (self.at(place.coordinates + fraction * step) for fraction in FRACTIONS)
+        return next((there for there in tried if there.density > place.density), place)
 
-    def _physical_bend(self, states: _States, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
+    def _physical_bend(self, place: _Place, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the physical coordinates.
 
         ``step`` may be small: a simulation has no noise but rounding.
         """
-        steps = step * np.eye(states.coordinates.shape[1])[self.physical]
-        sides = states.coordinates[:, np.newaxis, np.newaxis] + np.stack([steps, -steps])
-        shape, sides = sides.shape[:3], sides.reshape(-1, sides.shape[3])
-        possible = np.isfinite(self.prior(sides)[1])
-        moved = np.repeat(states.displacement, 2 * len(steps), axis=0)
-        moved[possible] = self.displacement(sides[possible])
-        forth, back = np.moveaxis(moved.reshape(*shape, -1), 1, 0)
-        width = step * np.maximum(np.sum(possible.reshape(shape), axis=1), 1)
-        slopes = (forth - back) / width[:, :, np.newaxis]
-        theta, _ = self.prior(states.coordinates)
-        score = self.likelihood.score(theta, slopes, states.displacement)
-        slope = score.pull - states.coordinates[:, self.physical]
-        return slope, score.information + np.eye(len(steps))
+        steps = step * np.eye(place.coordinates.size)[self.physical]
+        sides = place.coordinates + np.concatenate([steps, -steps])
+        theta, log_prior = self.prior(np.concatenate([place.coordinates[np.newaxis], sides]))
+        possible = np.isfinite(log_prior[1:])
+        moved = np.tile(place.displacement, (len(sides), 1))
+        moved[possible] = self.displacement(theta[1:][possible], sides[possible])
+        forth, back = np.split(moved, 2)
+        width = step * np.maximum(np.sum(possible.reshape(2, -1), axis=0), 1)
+        slopes, here = (forth - back) / width[:, np.newaxis], place.displacement[np.newaxis]
+        score = self.posterior.likelihood.score(theta[:1], slopes, here)
+        slope = score.pull[0] - place.coordinates[self.physical]
+        return slope, score.information[0] + np.eye(len(steps))
 
-    def _step_noise(self, states: _States) -> None:
+    def _step_noise(self, place: _Place) -> _Place:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
-        going = np.arange(len(states.density))
         for _ in range(6 if self.noise.size else 0):
-            now = states.rows(going)
-            slope, curvature = self._noise_bend(now)
+            slope, curvature = self._noise_bend(place)
             values, vectors = np.linalg.eigh(curvature)
-            along = np.einsum("mji,mj->mi", vectors, slope) / np.maximum(np.abs(values), 1.0)
-            step = np.einsum("mij,mj->mi", vectors, along)
-            step /= np.maximum(1.0, np.max(np.abs(step), axis=1, keepdims=True) / 0.5)
-            steps = FRACTIONS[:, np.newaxis] * step[:, np.newaxis]
-            gains = self._noise_gains(now, steps)
-            best, every = np.argmax(gains, axis=1), np.arange(going.size)
-            higher = gains[every, best] > GAIN / 4
-            going, every, best = going[higher], every[higher], best[higher]
-            if not going.size:
+            step = vectors @ (vectors.T @ slope / np.maximum(np.abs(values), 1.0))
+            step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
+            steps = FRACTIONS[:, np.newaxis] * step
+            gains = self._noise_gains(place, steps)
+            best = int(np.argmax(gains))
+            if gains[best] <= GAIN / 4:
                 break
-            states.coordinates[going[:, np.newaxis], self.noise] += steps[every, best]
-            states.density[going] += gains[every, best]
+            coordinates = place.coordinates.copy()
+            coordinates[self.noise] += steps[best]
+            place = _Place(coordinates, place.density + float(gains[best]), place.displacement)
+        return place
 
-    def _noise_gains(self, states: _States, steps: FloatArray) -> FloatArray:
-        """By how much steps in the noise's coordinates raise the log density.
+    def _noise_gains(self, place: _Place, steps: FloatArray) -> FloatArray:
+        """By how much steps (steps, noise) in the noise's coordinates raise the log density."""
+        coordinates = np.tile(place.coordinates, (len(steps), 1))
+        coordinates[:, self.noise] += steps
+        density = self.density(*self.prior(coordinates), place.displacement)
+        return np.maximum(density, -1e12) - place.density
 
-        ``steps`` are (climbers or 1, steps, noise), the gains (climbers, steps).
-        """
-        count = steps.shape[1]
-        coordinates = np.repeat(states.coordinates[:, np.newaxis], count, axis=1)
-        coordinates[:, :, self.noise] += steps
-        theta, density = self.prior(coordinates.reshape(-1, coordinates.shape[2]))
-        possible = np.isfinite(density)
-        moved = np.repeat(states.displacement, count, axis=0)
-        density[possible] += self._log_likelihood(theta[possible], moved[possible])
-        density = np.where(np.isfinite(density), density, -1e12).reshape(-1, count)
-        return density - states.density[:, np.newaxis]
-
-    def _noise_bend(self, states: _States, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
+    def _noise_bend(self, place: _Place, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the noise's coordinates.
 
         The posterior's sds are hundredths of the prior's, which are one.
         """
-        size, climbers = self.noise.size, len(states.density)
-        if not size:
-            return np.zeros((climbers, 0)), np.zeros((climbers, 0, 0))
-        single, pairs = np.eye(size), [*combinations(range(size), 2)]
-        steps = step * np.stack([*single, *(single[i] + single[j] for i, j in pairs)])
-        sides = np.concatenate([steps, -steps])[np.newaxis]
-        plus, minus = np.split(self._noise_gains(states, sides), 2, axis=1)
+        size, (i, j) = self.noise.size, np.tril_indices(self.noise.size, -1)
+        single = step * np.eye(size)
+        # Along each coordinate, then along each two of them.
+        steps = np.concatenate([single, single[i] + single[j]])
+        plus, minus = np.split(self._noise_gains(place, np.concatenate([steps, -steps])), 2)
         bend = plus + minus
-        curvature = bend[:, :size, np.newaxis] * np.eye(size)
-        for (i, j), together in zip(pairs, bend.T[size:], strict=True):
-            curvature[:, i, j] = curvature[:, j, i] = (together - bend[:, i] - bend[:, j]) / 2
-        return (plus - minus)[:, :size] / (2 * step), -curvature / step**2
+        curvature = np.diag(bend[:size])
+        curvature[i, j] = curvature[j, i] = (bend[size:] - bend[i] - bend[j]) / 2
+        return (plus - minus)[:size] / (2 * step), -curvature / step**2
