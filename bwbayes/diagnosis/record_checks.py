@@ -49,7 +49,12 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     if record.displacement is not None:
         outliers = isolated_outliers(record)
         if outliers.size:
-            spiky = [_spikes(record, outliers)]
+            times, several = record.time[outliers], outliers.size > 1
+            shown = ", ".join(map(record.clock, times[:5])) + ", ..." * (times.size > 5)
+            text = f"{times.size} isolated outlier{'s' * several} of the displacement, at {shown} s"
+            stop = float(times[-1]) + record.interval
+            fix = "outliers = true under [model]"
+            spiky = [Finding("spikes", text, fix, float(times[0]), stop)]
         # All else is said of the others.
         record = record.without(outliers)
     findings = [*_plausibility(record)]
@@ -136,15 +141,6 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     near = spikes(displacement, drive, threshold, ends=ends)
     isolated = np.union1d(gross, others[near])
     return rows[isolated] if isolated.size <= 0.05 * rows.size else rows[:0]
-
-
-def _spikes(record: Record, outliers: IntArray) -> Finding:
-    times = record.time[outliers]
-    shown = ", ".join(map(record.clock, times[:5])) + (", ..." if times.size > 5 else "")
-    plural = "" if times.size == 1 else "s"
-    text = f"{times.size} isolated outlier{plural} of the displacement, at {shown} s"
-    fix = "outliers = true under [model]"
-    return Finding("spikes", text, fix, float(times[0]), float(times[-1]) + record.interval)
 
 
 def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:

@@ -221,11 +221,13 @@ def _population_of(
     scale = np.exp if logarithmic else np.positive
     among = {}
     for i, (specimen, (y, log_prior)) in enumerate(zip(specimens, draws, strict=True)):
-        shrunk = (
-            normal.shrunk(i, mean, spread, generator)
-            if is_normal[i]
-            else _resampled(y, log_prior, mean, spread, generator)
-        )
+        if is_normal[i]:
+            shrunk = normal.shrunk(i, mean, spread, generator)
+        else:
+            # From its own draws; a quarter of the populations are enough for a prior.
+            by_population, _ = _weights(y, log_prior, mean[::4], spread[::4])
+            weights = np.mean(by_population / np.sum(by_population, axis=0), axis=1)
+            shrunk = generator.choice(y, DRAWS, p=weights / np.sum(weights))
         lower, median, upper = scale(np.quantile(shrunk, [0.025, 0.5, 0.975])).tolist()
         own_lower, own_median, own_upper = scale(np.quantile(y, [0.025, 0.5, 0.975])).tolist()
         among[specimen.name] = SpecimenEstimate(
@@ -298,21 +300,6 @@ def _weights(
     weights -= largest
     np.exp(weights, out=weights)
     return weights, largest - np.log(spread)
-
-
-def _resampled(
-    y: FloatArray,
-    log_prior: FloatArray,
-    mean: FloatArray,
-    spread: FloatArray,
-    generator: np.random.Generator,
-) -> FloatArray:
-    """Draw a specimen's coordinate with populations (n,) for its prior, from its own draws."""
-    # A quarter of the populations are enough for a prior.
-    by_population, _ = _weights(y, log_prior, mean[::4], spread[::4])
-    weights = np.mean(by_population / np.sum(by_population, axis=0), axis=1)
-    drawn: FloatArray = generator.choice(y, DRAWS, p=weights / np.sum(weights))
-    return drawn
 
 
 def _around(

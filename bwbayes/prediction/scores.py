@@ -125,8 +125,7 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
             known[: bands.scored_from] = False
             hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
             coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
-            block = _block_length((values - bands.mean)[known])
-            error[kind] = _coverage_errors(hits, block)
+            error[kind] = _coverage_errors(hits, (values - bands.mean)[known])
     width, interval_score, worst = {}, {}, {}
     scored = slice(bands.scored_from, None)
     for level in LEVELS:
@@ -171,18 +170,7 @@ def _bootstrap_error(hits: BoolArray, block: int) -> float:
     return float(np.sqrt(means.var() * block / (samples - block)))
 
 
-def _block_length(residual: FloatArray) -> int:
-    """Choose the samples in a block of the bootstrap: three integrated autocorrelation times.
-
-    Of the residual (samples,), with Sokal's window. A hit depends on the residual's size, not on
-    its sign, and the square of a Gaussian series forgets twice as fast as the series, so that a
-    block is at least six times as long as the hits' own time.
-    """
-    time = autocorrelation_time(residual[np.newaxis])
-    return max(1, round(3 * time)) if np.isfinite(time) else 1
-
-
-def _coverage_errors(hits: dict[int, BoolArray], block: int) -> dict[int, float]:
+def _coverage_errors(hits: dict[int, BoolArray], residual: FloatArray) -> dict[int, float]:
     """Estimate the errors of coverage by level, also where a band is hardly ever missed.
 
     With few misses, or none, the bootstrap takes the luck of the window for certainty. The level
@@ -190,6 +178,11 @@ def _coverage_errors(hits: dict[int, BoolArray], block: int) -> dict[int, float]
     the squared error; another level's error is at least that of m hits at Jeffreys' estimate
     (m p + 1/2) / (m + 1) of its coverage.
     """
+    # Three integrated autocorrelation times of the residual. A hit depends on its size, not on its
+    # sign, and the square of a Gaussian series forgets twice as fast as the series, so that a block
+    # is at least six times as long as the hits' own time.
+    time = autocorrelation_time(residual[np.newaxis])
+    block = max(1, round(3 * time)) if np.isfinite(time) else 1
     errors = {level: _bootstrap_error(hit, block) for level, hit in hits.items()}
     covered = {level: float(hit.mean()) for level, hit in hits.items()}
     nearest = min(covered, key=lambda level: abs(covered[level] - 0.5))

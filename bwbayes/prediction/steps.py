@@ -17,7 +17,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.linear import Recursion
 from bwbayes.prediction.loops import Curve, Estimate
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
@@ -155,19 +154,12 @@ def _responses(
     parts = np.empty((2, settled.size, time.size))
     for i, t in enumerate(time.tolist()):
         sections = replace(actuator, interval=t).sections(column)
-        moved = [
-            gain * _after_a_sample(recursion) * by
-            for recursion, gain, by in zip(sections.recursions, sections.gains, steps, strict=True)
-        ]
+        taps = [(r.numerator, r.denominator[:, 1]) for r in sections.recursions]
+        # What a recursion makes of a unit that has been held for one sample.
+        units = [top[:, 1] + (1 - back) * top[:, 0] for top, back in taps]
+        moved = [gain * u * by for gain, u, by in zip(sections.gains, units, steps, strict=True)]
         parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))
     return settled, parts[0], parts[1]
-
-
-def _after_a_sample(recursion: Recursion) -> FloatArray:
-    """Return what a recursion makes of a unit that has been held for one sample, (models,)."""
-    now, before = recursion.numerator[:, 0], recursion.numerator[:, 1]
-    passed: FloatArray = now + before - recursion.denominator[:, 1] * now
-    return passed
 
 
 def _passes(time: FloatArray, fraction: FloatArray, level: float) -> FloatArray:
