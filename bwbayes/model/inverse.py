@@ -138,12 +138,12 @@ class _Single:
             sample = int(np.argmax(edges))
             raise InputError(
                 f"reference: no voltage gives {displacement[sample]:.6g} um at "
-                f"{sample * interval:.6g} s; make it smaller, or ask for the nearest command"
+                f"{sample * interval:.6g} s; make it smaller, or say `nearest=True`"
             )
         if why := limits.refuses(voltage, interval):
             raise InputError(
-                f"reference: {why}; make it smaller or smoother, widen the limits, or ask for the "
-                "nearest command"
+                f"reference: {why}; move its middle, make it smaller or smoother, widen the limits, "
+                "or say `nearest=True` for the nearest command"
             )
         return voltage
 

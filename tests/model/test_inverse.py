@@ -214,6 +214,9 @@ def test_what_the_amplifier_cannot_do_is_refused_with_place_and_time(
         inverse(actuator, theta, smooth(), from_rest=True, limits=limits)
     assert "reference: " in str(refused.value)
     assert " s " in str(refused.value)
+    # What helps: with an amplifier of one sign, usually another middle.
+    for fix in ("move its middle", "smaller or smoother", "widen the limits", "`nearest=True`"):
+        assert fix in str(refused.value)
 
 
 def test_the_nearest_command_keeps_to_the_limits_and_is_right_elsewhere() -> None:

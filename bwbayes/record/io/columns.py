@@ -195,7 +195,7 @@ def _named(source: Source, name: str, quantity: str) -> Series:
         return matches[0]
     problem = "several columns" if matches else "no column"
     raise InputError(
-        f"{source.path}: {problem} {name!r} for the {quantity}; choose one of "
+        f"{source.path}: {problem} {name!r} for the {quantity}; choose another. "
         f"{_listed(matches or source.series, _ranges(matches or source.series))}"
     )
 
