@@ -142,8 +142,8 @@ class _Single:
             )
         if why := limits.refuses(voltage, interval):
             raise InputError(
-                f"reference: {why}; move its middle, make it smaller or smoother, widen the limits, "
-                "or say `nearest=True` for the nearest command"
+                f"reference: {why}; move its middle, make it smaller or smoother, widen the "
+                "limits, or say `nearest=True` for the nearest command"
             )
         return voltage
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 import bwbayes as bw
@@ -17,8 +19,9 @@ from bwbayes.app.config.config import Config, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import chosen_noise, improve_model
+from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
 from bwbayes.app.running.run import resume, start
+from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
@@ -76,6 +79,13 @@ def test_several_records_are_refused_in_one_line(tmp_path: Path) -> None:
     record = RecordConfig(file="record.h5", from_rest=True)
     with pytest.raises(InputError, match="improve: is for one training record"):
         improve_model(Config(record={"first": record, "second": record}), tmp_path, QUIET)
+
+
+@given(st.floats(-5, 100), st.floats(0.01, 10), st.floats(0.1, 10))
+def test_nothing_explains_better_that_misses_more(nats: float, rmse: float, ratio: float) -> None:
+    found = Explanation("gain", "a gain that moves", "fix it", nats=nats, rmse=(rmse, ratio * rmse))
+    said = list(lines([found]))
+    assert (ratio <= 1 and nats > 0) <= bool(said) <= (ratio <= 1.2 and nats > 0)
 
 
 # ``noise = "auto"`` is the one that a record has evidence for, and the run says so

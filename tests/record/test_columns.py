@@ -48,7 +48,11 @@ def assert_same(record: Record, sign: float = 1.0) -> None:
 @pytest.mark.parametrize(
     ("columns", "units", "line"),
     [
-        ({"displacement": "poss"}, UNIT, "no column 'poss' for the displacement; choose another. There"),
+        (
+            {"displacement": "poss"},
+            UNIT,
+            "no column 'poss' for the displacement; choose another.",
+        ),
         ({}, {}, r"which unit has 'pos' \(displacement\)\? .* 'pos' \(-3.*; say .*units={'disp"),
         ({}, {"displacement": "in"}, "units: displacement in 'in' is unknown; write um, nm, mm, m"),
         ({}, UNIT | {"displacement": "s"}, "units: displacement in 's' is unknown"),
