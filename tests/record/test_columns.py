@@ -224,7 +224,7 @@ def test_arrays_may_have_times_and_units(
         ({"time": None, "interval": -1.0}, "interval: -1.0 s is not a positive time"),
         ({"time": TIME[1:]}, "arrays: voltage: 200 values where time has 199; store one"),
         ({"time": ["a"] * 200}, "time: not numbers"),
-        ({"time": np.full(200, np.nan)}, "arrays:sample 0: time: no number .*; give one at every"),
+        ({"time": np.full(200, np.nan)}, "arrays:sample 0: time: no number .*; give one, or leave"),
         ({"voltage": ["a"] * 200}, "voltage: not numbers"),
         ({"voltage": VOLTAGE[:, np.newaxis]}, r"voltage: shape \(200, 1\) is no vector"),
     ],

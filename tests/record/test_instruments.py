@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import warnings
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
-from tests.record.instruments import DISPLACEMENT, INSTRUMENTS, INTERVAL, VOLTAGE, Written
+from tests.record.instruments import (
+    DISPLACEMENT,
+    INSTRUMENTS,
+    INTERVAL,
+    TIME,
+    VOLTAGE,
+    Written,
+)
 
 
 def read(written: Written) -> Record:
@@ -52,6 +63,37 @@ def test_a_clock_counts_from_the_first_sample_and_is_kept(tmp_path: Path) -> Non
     assert (0.0, 1_772_539_199.0) == (record.start, record.time_offset)
     dated = read(INSTRUMENTS["logger with dates"](tmp_path))
     assert (0.0, 1_772_539_199.0) == (dated.start, dated.time_offset)
+
+
+@given(st.integers(0, 86_399), st.sampled_from(["{:%H:%M:%S.%f}", "{:%H:%M:%S.%f},{:%Y-%m-%d}"]))
+def test_times_of_day_go_on_after_midnight(
+    tmp_path_factory: pytest.TempPathFactory, start: int, form: str
+) -> None:
+    names = f"Time,{'Date,' * ('%Y' in form)}voltage_V,displacement_um"
+    begin = datetime(2026, 3, 3, tzinfo=UTC) + timedelta(seconds=start)
+    rows = [
+        f"{form.format(*2 * [begin + timedelta(seconds=t)])},{v},{d}"
+        for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)
+    ]
+    path = tmp_path_factory.getbasetemp() / "clock.csv"
+    path.write_text("\n".join([names, *rows]) + "\n")
+    record = read(Written(path))
+    assert (INTERVAL, float(start)) == (record.interval, record.start)
+    np.testing.assert_allclose(record.voltage, VOLTAGE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("fs", 200.0), ("Sample_Rate", 200.0), ("dt", 0.005), ("gain", None)]
+)
+def test_a_rate_beside_the_numbers_is_the_one_to_copy(
+    tmp_path: Path, name: str, value: float | None
+) -> None:
+    """Of a number that is called otherwise nothing is known."""
+    log = {"u_V": VOLTAGE, "x_um": DISPLACEMENT, name: value or 200.0}
+    scipy.io.savemat(tmp_path / "a.mat", {"log": log})
+    with pytest.raises(ColumnsError) as caught:
+        read_record(tmp_path / "a.mat")
+    assert (200.0 if value else 1000.0) == caught.value.fs
 
 
 def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> None:

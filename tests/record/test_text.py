@@ -135,7 +135,7 @@ def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     for column in (0, 1):
         where = f"record.csv:17: {HEADER.split(',')[column]}: "
         word = text in ("OVERLOAD", "---", "no signal")
-        problem = f"{text!r} is not a number" if word else "no number (empty or nan); give one at"
+        problem = f"{text!r} is not a number" if word else "no number (empty or nan); give one, or"
         assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 
 

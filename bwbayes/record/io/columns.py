@@ -40,6 +40,12 @@ _WORDS = {
         *("sensor", "output", "weg", "auslenkung"),
     ),
 }
+# What a single number beside the series is called that is their rate, Hz, or the interval, s: the
+# power of it that is the rate.
+_RATES = {
+    **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
+    **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time"), -1),
+}
 
 
 @dataclass(frozen=True)
@@ -337,7 +343,12 @@ def _columns_error(
     if timeless:
         questions.append("what is the sampling rate, Hz (no column can be the time)")
     problem = f"{where}: {', and '.join(questions)}? {listing}"
-    return ColumnsError(problem, columns, units, fs=1000.0 if timeless else None)
+    single = [s for s in source.series if s.size == 1 and s.name in ranges]
+    numbers = {s.label.lower(): ranges[s.name][0] for s in single}
+    stated = [
+        float(numbers[name]) ** power for name, power in _RATES.items() if numbers.get(name, 0) > 0
+    ]
+    return ColumnsError(problem, columns, units, fs=[*stated, 1000.0][0] if timeless else None)
 
 
 def _finite(series: Series) -> FloatArray:

@@ -137,7 +137,7 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
         problem = f"{raw:g} is absurdly large; check the unit in the column's name"
         if not np.isfinite(raw):
             fact = "no number (empty or nan)" if np.isnan(raw) else f"{raw} is not a finite number"
-            problem = f"{fact}; give one at every sample (only a displacement may be missing: nan)"
+            problem = f"{fact}; give one, or leave the sample out (a displacement may be nan)"
         raise table.error(problem, quantity, sample)
     return values
 

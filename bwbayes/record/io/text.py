@@ -309,12 +309,14 @@ def _numbers(
         return np.asarray(numbers, dtype=np.float64)
     if ":" in text.iloc[0]:
         for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
+            is_clock = parse is pd.to_timedelta
             try:
-                return in_seconds(
-                    parse(text).to_numpy(f"{'mM'[parse is not pd.to_timedelta]}8[ns]")
-                )
+                times = in_seconds(parse(text).to_numpy(f"{'Mm'[is_clock]}8[ns]"))
             except (ValueError, OverflowError):
                 continue
+            # Times of day begin again at midnight.
+            days = np.cumsum(np.diff(times, prepend=times[:1]) < -43_200) if is_clock else 0
+            return np.asarray(times + 86_400.0 * days)
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     where = f"{path}:{first_line + wrong[0]}: {name}: {shown}"
