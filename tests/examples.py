@@ -54,7 +54,7 @@ SHORTER = {
 DEFAULTS = {
     "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
     "bwbayes.report.outputs.picture_of": lambda _: picture_of(Figure),
-    "bwbayes.app.commands.studies.USUAL_MODELS": "linear; bouc-wen",
+    "bwbayes.app.fit.calls.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}
 

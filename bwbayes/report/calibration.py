@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import partial
 from itertools import product
 
+from markupsafe import Markup
+
 from bwbayes.calibration.evaluation import FAMILY_LEVEL, JUDGED_FROM, Calibration
 from bwbayes.calibration.replicates import RANKED
 from bwbayes.prediction.bands import KINDS, LEVELS
@@ -22,6 +24,13 @@ EXTRA_WORDS = {
 def calibration_report(calibration: Calibration) -> Report:
     """Return what a calibration says: whether it has passed, the tests, and what was run."""
     bands = _bands(calibration)
+    free = [
+        {"name": p.name, "symbol": symbol(p), "prior": p.prior, "unit": unit_text(p.unit)}
+        for p in calibration.parameters
+        if p.fixed is None
+    ]
+    columns = {"Parameter": "{name}", "Symbol": Markup("{symbol}"), "Prior": "{prior}"}
+    columns["Unit"] = "{unit}"
     return Report(
         title=f"{calibration.name}, simulation-based calibration",
         heading=f"Simulation-based calibration: {calibration.name}",
@@ -32,7 +41,7 @@ def calibration_report(calibration: Calibration) -> Report:
             * bool(bands.rows),
             Section("Pictures", _pictures(calibration), folded=False),
             Section("Tests", _tests(calibration), folded=False),
-            Section("Priors", [_priors(calibration)]),
+            Section("Priors", [Table.of("priors", "Priors", free, columns)]),
             Section("Settings", [Facts(calibration.facts)]),
         ],
         numbers=calibration.numbers,
@@ -110,7 +119,7 @@ def _bands(calibration: Calibration) -> Table:
 
 
 def _pictures(calibration: Calibration) -> list[Picture]:
-    from bwbayes.report.figures import calibration as figures  # noqa: PLC0415  # slow to load
+    from bwbayes.report.figures import studies  # noqa: PLC0415  # slow to load
 
     return [
         Picture(
@@ -118,7 +127,7 @@ def _pictures(calibration: Calibration) -> list[Picture]:
             "Ranks",
             "Where the truth lies among the posterior's draws, over all replicates. Level is "
             "right; a bowl means posteriors that are too narrow, a hump too wide, a slope a bias.",
-            partial(figures.draw_histograms, calibration),
+            partial(studies.draw_histograms, calibration),
         ),
         Picture(
             "rank_ecdf",
@@ -126,14 +135,14 @@ def _pictures(calibration: Calibration) -> list[Picture]:
             "The ranks' cumulative distribution less that of even ranks, with the band that even "
             "ranks leave anywhere no more often than the stated level allows; p of the smooth "
             "test.",
-            partial(figures.draw_ecdf, calibration),
+            partial(studies.draw_ecdf, calibration),
         ),
         Picture(
             "coverage",
             "Coverage",
             "Left: how often the posteriors' central intervals hold the truth. Right: how far the "
             "coverage of the bands on held-out samples is off what they promise.",
-            partial(figures.draw_coverage, calibration),
+            partial(studies.draw_coverage, calibration),
         ),
     ]
 
@@ -162,14 +171,3 @@ def _tests(calibration: Calibration) -> list[Text]:
             on="both",
         ),
     ]
-
-
-def _priors(calibration: Calibration) -> Table:
-    columns = (
-        TableColumn("Parameter", text=lambda parameter: parameter.name),
-        TableColumn("Symbol", text=symbol),
-        TableColumn("Prior", text=lambda parameter: str(parameter.prior)),
-        TableColumn("Unit", text=lambda parameter: unit_text(parameter.unit)),
-    )
-    free = [parameter for parameter in calibration.parameters if parameter.fixed is None]
-    return Table.of("priors", "Priors", free, columns)

@@ -107,19 +107,16 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
             if number == 0:
                 file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
             prefix = f"{predicted.name}," if len(bands) > 1 else ""
-            row = prefix + ",".join(_format(n, c) for n, c in zip(names, columns, strict=True))
-            row += "\n"
+            formats = []
+            for name, column in zip(names, columns, strict=True):
+                values = column[np.isfinite(column)]
+                span = float(np.ptp(values)) if values.size else 0.0
+                far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
+                # A float has no more than 17 digits.
+                extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
+                formats.append(f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g")
+            row = f"{prefix}{','.join(formats)}\n"
             file.writelines(row % values for values in zip(*columns, strict=True))
-
-
-def _format(name: str, column: FloatArray) -> str:
-    """Return the format of a column (samples,), which may hold NaN."""
-    values = column[np.isfinite(column)]
-    span = float(np.ptp(values)) if values.size else 0.0
-    far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
-    # A float has no more than 17 digits.
-    extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
-    return f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g"
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:

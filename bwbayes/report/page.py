@@ -9,12 +9,12 @@ from __future__ import annotations
 import re
 import struct
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import groupby
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -79,9 +79,10 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
         lstrip_blocks=True,
     )
     environment.globals |= {"pictures": pictures, "plots": plots.drawn}
-    environment.filters |= {
+    filters: dict[str, Callable[..., Any]] = {
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
-        "pixels": _pixels,
+        # A picture's width and height, if it is a whole one.
+        "pixels": lambda png: struct.unpack(">2I", png[16:24]) if len(png) > 24 else None,
         "csv_link": csv_link,
         # Whether each column holds words, which go to the left.
         "is_wordy": lambda rows: [
@@ -93,15 +94,8 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
             for title, spanned in groupby(columns[1:], key=attrgetter("group"))
         ],
     }
+    environment.filters |= filters
     return environment
-
-
-def _pixels(png: bytes) -> tuple[int, int] | None:
-    """Return a picture's width and height, or None if it is no whole PNG."""
-    if not png.startswith(b"\x89PNG\r\n\x1a\n") or len(png) < 24:
-        return None
-    width, height = struct.unpack(">2I", png[16:24])
-    return width, height
 
 
 def csv_link(table: Table) -> str:

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 # A figure of matplotlib, which is loaded when something is drawn.
 type Figure = "figure.Figure"  # quoted, for those who evaluate it
 
+# What stands for a number that is not known.
+UNKNOWN = "–"
+
 Target = Literal["both", "page", "screen", "nowhere"]
 Kind = Literal["good", "note", "bad"]
 
@@ -30,13 +33,23 @@ type Block = Table | Picture | Facts | Text | Glossary | Section | SideBySide
 class TableColumn:
     """A column of a table: its title, that of the columns about it, and where it is shown.
 
-    ``text`` returns what a cell says of the row's item; see :meth:`Table.of`.
+    ``text`` is what a cell says of the row's item, a format with the names of what the item has, as
+    ``"{mean:.3g}"``, or a function of the item; see :meth:`Table.of`.
     """
 
     title: str
     group: str = ""
     on: Target = "both"
-    text: Callable[[Any], str] = str
+    text: str | Callable[[Any], str] = str
+
+    def cell(self, item: Any) -> str:
+        """Return the text of a row's item; a dash where a number is not known."""
+        if callable(self.text):
+            return self.text(item)
+        try:
+            return self.text.format_map(item if isinstance(item, Mapping) else vars(item))
+        except (KeyError, TypeError):
+            return UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -66,11 +79,16 @@ class Table:
         name: str,
         caption: str,
         items: Iterable[Any],
-        columns: Sequence[TableColumn],
+        columns: Sequence[TableColumn] | Mapping[str, str],
         **rest: Any,
     ) -> Self:
-        """Return a table with a row for each item, whose texts the columns write."""
-        rows = [[column.text(item) for column in columns] for item in items]
+        """Return a table with a row for each item, whose texts the columns write.
+
+        Columns that are shown everywhere may be texts by their titles.
+        """
+        if isinstance(columns, Mapping):
+            columns = [TableColumn(title, text=text) for title, text in columns.items()]
+        rows = [[column.cell(item) for column in columns] for item in items]
         return cls(name, caption, columns, rows, **rest)
 
     def cells(self, target: Target) -> tuple[list[TableColumn], list[list[str]]]:
@@ -107,7 +125,6 @@ class Facts:
     kind: ClassVar = "facts"
 
     pairs: Sequence[tuple[str, str]]
-    on: Target = "page"
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,14 @@ What does not hold is said first. Without convergence nothing is said of paramet
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 from markupsafe import Markup
 
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.scores import Scores
 from bwbayes.report import tables
 from bwbayes.report.figures.pictures import Pictures
 from bwbayes.report.figures.pictures import pictures as all_pictures
@@ -45,38 +42,17 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     ``go_on``, the command that goes on.
     """
     pictures = all_pictures(result)
-    converged = result.outcome.converged
-    blocks = _answer(result, numbers, pictures) if converged else _chains(result, numbers, pictures)
-    if converged:
-        blocks += _evidence(result, numbers, pictures)
+    if result.outcome.converged:
+        blocks = [*_answer(result, numbers, pictures), *_evidence(result, numbers, pictures)]
+    else:
+        sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
+        blocks = [Section("Sampling", sampling, folded=False)]
+    moves = Text(_moves(result), on="screen")
     return Report(
         title=result.name,
         about=_about(result),
-        banners=[
-            *_verdict_banners(result, numbers),
-            *remarks_banner(result.remarks),
-        ],
-        blocks=[*blocks, *_details(result, numbers, pictures)],
-    )
-
-
-def prediction_report(
-    name: str,
-    scores: Scores | None,
-    verdict: Verdict | None,
-    remarks: Sequence[str],
-) -> Report:
-    """Return how one prediction turned out, if there are readings, and what to know of it."""
-    table = []
-    if scores is not None and verdict is not None:
-        table = [tables.scores_table({name: scores}, {name: verdict}, {name: name})]
-    return Report(
-        title=name,
-        banners=[
-            *_standing_on_screen(Standing.of([verdict] if verdict else [])),
-            *remarks_banner(remarks),
-        ],
-        blocks=table,
+        banners=[*_verdict_banners(result, numbers), *remarks_banner(result.remarks)],
+        blocks=[*blocks, moves, *_details(result, numbers, pictures)],
     )
 
 
@@ -98,24 +74,17 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
         else "the bands fail validation; the parameters may be biased too"
     )
     open_verdicts = [v for v in result.verdicts.values() if v.holds is standing.holds]
-    explained = Glossary([(v.where, _explained(v)) for v in open_verdicts], note=False)
-    blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), explained]
-    (on_screen,) = _standing_on_screen(standing)
+    explained = []
+    for verdict in open_verdicts:
+        why = Markup("{}.").format("; ".join(verdict.reasons))
+        if verdict.cause is not None:
+            cause = Markup("<br>Likely cause: {}.<br>Fix: {}.")
+            why += cause.format(verdict.cause.text, verdict.cause.fix)
+        explained.append((verdict.where, why))
+    glossary = Glossary(explained, note=False)
+    blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), glossary]
+    (on_screen,) = standing_banner(standing, on="screen")
     return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
-
-
-def _standing_on_screen(standing: Standing) -> list[Banner]:
-    return [replace(banner, blocks=()) for banner in standing_banner(standing, on="screen")]
-
-
-def _explained(verdict: Verdict) -> Markup:
-    """Return why a verdict is what it is, with the likeliest cause and what to do."""
-    text = Markup("{}.").format("; ".join(verdict.reasons))
-    if verdict.cause is not None:
-        text += Markup("<br>Likely cause: {}.<br>Fix: {}.").format(
-            verdict.cause.text, verdict.cause.fix
-        )
-    return text
 
 
 def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
@@ -228,7 +197,7 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
     if result.steps:
         steps: list[Block] = [tables.steps_table(result.steps, numbers), pictures["steps"]]
         blocks.append(Section("Step responses", steps, folded=False))
-    return [*blocks, Text(_moves(result), on="screen")]
+    return blocks
 
 
 def _moves(result: Result) -> str:
@@ -239,11 +208,6 @@ def _moves(result: Result) -> str:
     )
     cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
     return f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
-
-
-def _chains(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
-    sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
-    return [Section("Sampling", sampling, folded=False), Text(_moves(result), on="screen")]
 
 
 def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> Iterator[Section]:

@@ -10,21 +10,34 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
-from bwbayes.report.report import Banner, Facts, Report, Table, Text
+from bwbayes.report.report import Report, Table, Text
 
 
 def show(report: Report, console: Console) -> None:
     """Show the banners of a report, and the tables and texts that are meant for a screen."""
     for banner in report.banners:
-        if banner.on != "page":
-            _show_banner(banner, console)
+        if banner.on == "page":
+            continue
+        color = {"good": "green", "note": "yellow", "bad": "red"}[banner.kind]
+        lines = [escape(_plain(line)) for line in banner.lines]
+        headline = f"[bold {color}]{escape(_plain(banner.headline))}[/]"
+        label = escape(banner.label) or headline
+        if lines or not banner.items:
+            lines = [": ".join([headline, *lines[:1]]), *lines[1:]]
+        for line in [*lines, *(f"{label}: {escape(_plain(item))}" for item in banner.items)]:
+            _say(line, console)
     for block in report.all_blocks():
         if isinstance(block, Table) and block.on != "page" and block.rows:
-            console.print(_grid(block))
+            columns, rows = block.cells("screen")
+            grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+            for i, column in enumerate(columns):
+                title = f"{column.group}: {column.title}" if column.group else column.title
+                grid.add_column(escape(_plain(title)), no_wrap=i == 0)
+            for row in rows:
+                grid.add_row(*(escape(_plain(text)) for text in row))
+            console.print(grid)
         elif isinstance(block, Text) and block.on != "page":
             _say(escape(_plain(block.text)), console)
-        elif isinstance(block, Facts) and block.on != "page":
-            _say(escape("; ".join(_plain(fact) for _, fact in block.pairs)), console)
 
 
 def as_text(report: Report, width: int = 110) -> str:
@@ -32,28 +45,6 @@ def as_text(report: Report, width: int = 110) -> str:
     text = StringIO()
     show(report, Console(file=text, width=width, force_jupyter=False, color_system=None))
     return text.getvalue().rstrip()
-
-
-def _show_banner(banner: Banner, console: Console) -> None:
-    color = {"good": "green", "note": "yellow", "bad": "red"}[banner.kind]
-    lines = [escape(_plain(line)) for line in banner.lines]
-    headline = f"[bold {color}]{escape(_plain(banner.headline))}[/]"
-    label = escape(banner.label) or headline
-    if lines or not banner.items:
-        lines = [": ".join([headline, *lines[:1]]), *lines[1:]]
-    for line in [*lines, *(f"{label}: {escape(_plain(item))}" for item in banner.items)]:
-        _say(line, console)
-
-
-def _grid(table: Table) -> Grid:
-    columns, rows = table.cells("screen")
-    grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for i, column in enumerate(columns):
-        title = f"{column.group}: {column.title}" if column.group else column.title
-        grid.add_column(escape(_plain(title)), no_wrap=i == 0)
-    for row in rows:
-        grid.add_row(*(escape(_plain(text)) for text in row))
-    return grid
 
 
 def _say(text: str, console: Console) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
-from bwbayes.report.report import Table, TableColumn, Target
+from bwbayes.report.report import UNKNOWN, Table, TableColumn
 from bwbayes.report.result import Result
 from bwbayes.report.words import (
     covered,
@@ -32,42 +32,35 @@ from bwbayes.report.words import (
 
 Summary = Mapping[str, Any]
 
-UNKNOWN = "–"
+# A parameter in words, with its symbol; and the columns of names, bare on a screen.
+WORDS = Markup("{words}")
+NAME = (
+    TableColumn("Parameter", on="page", text=WORDS),
+    TableColumn("Parameter", on="screen", text="{name}"),
+)
 
 
 def parameters_table(result: Result, numbers: Summary) -> Table:
     """Return the estimate of each free parameter."""
     estimates = numbers["parameters"]
-    truth_on: Target = "nowhere"
-    if any("truth" in estimate for estimate in estimates.values()):
-        truth_on = "page"
-
-    def number(key: str) -> Callable[[Parameter], str]:
-        """Return what writes a number as exactly as it is known."""
-        return lambda p: digits(estimates[p.name][key], estimates[p.name]["sd"])
-
-    def truth(parameter: Parameter) -> str:
-        value = estimates[parameter.name].get("truth")
-        return UNKNOWN if value is None else f"{value:.6g}"
-
-    def ess(parameter: Parameter) -> str:
-        estimate = estimates[parameter.name]
-        return f"{min(estimate['ess_bulk'], estimate['ess_tail']):.0f}"
-
-    mean, sd, lower, upper = map(number, ("mean", "sd", "lower_95", "upper_95"))
+    is_simulated = any("truth" in estimate for estimate in estimates.values())
     columns = (
-        *name_columns("Parameter"),
-        TableColumn("Mean ± SD", on="page", text=lambda p: f"{mean(p)} ± {sd(p)}"),
-        TableColumn("Mean", on="screen", text=mean),
-        TableColumn("SD", on="screen", text=sd),
-        TableColumn("95% interval", text=lambda p: f"{lower(p)} to {upper(p)}"),
-        TableColumn("Unit", text=lambda p: unit_text(p.unit)),
-        TableColumn("Truth", on=truth_on, text=truth),
-        TableColumn("ESS", on="screen", text=ess),
-        TableColumn("R-hat", on="screen", text=lambda p: f"{estimates[p.name]['rhat']:.3f}"),
+        *NAME,
+        TableColumn("Mean ± SD", on="page", text="{mean} ± {sd}"),
+        TableColumn("Mean", on="screen", text="{mean}"),
+        TableColumn("SD", on="screen", text="{sd}"),
+        TableColumn("95% interval", text="{lower_95} to {upper_95}"),
+        TableColumn("Unit", text="{unit}"),
+        TableColumn("Truth", on="page" if is_simulated else "nowhere", text="{truth:.6g}"),
+        TableColumn("ESS", on="screen", text="{ess:.0f}"),
+        TableColumn("R-hat", on="screen", text="{rhat:.3f}"),
     )
+    rows = []
+    for parameter in result.free:
+        row = parameter_row(parameter, estimates[parameter.name])
+        rows.append(row | {"ess": min(row["ess_bulk"], row["ess_tail"])})
     records = [{"parameter": p.name, **estimates[p.name]} for p in result.free]
-    return Table.of("parameters", "Parameters", result.free, columns, records=records, on="both")
+    return Table.of("parameters", "Parameters", rows, columns, records=records, on="both")
 
 
 def sampling_table(result: Result, numbers: Summary) -> Table:
@@ -78,36 +71,30 @@ def sampling_table(result: Result, numbers: Summary) -> Table:
         "ESS: effective number of draws, in the bulk and in the tails; "
         f"{agreement}: agreement of the ensembles, 1 when they agree"
     )
-    columns = ["Parameter", "ESS bulk", "ESS tail", agreement]
+    columns = {"ESS bulk": "{ess_bulk:.0f}", "ESS tail": "{ess_tail:.0f}", agreement: "{rhat:.4f}"}
     if estimates:
-        columns += ["MCSE", "Median", "Unit"]
+        columns |= {"MCSE": "{mcse_mean:.2g}", "Median": "{median}", "Unit": "{unit}"}
         note += "; MCSE: Monte Carlo standard error of the mean"
     rows = []
     for i, parameter in enumerate(result.free):
-        sizes = f"{check.ess_bulk[i]:.0f}", f"{check.ess_tail[i]:.0f}"
-        row = [parameter_words(parameter), *sizes, f"{check.rhat[i]:.4f}"]
-        if estimates:
-            estimate = estimates[parameter.name]
-            median = digits(estimate["median"], estimate["sd"])
-            row += [f"{estimate['mcse_mean']:.2g}", median, unit_text(parameter.unit)]
-        rows.append(row)
-    return Table("sampling", "Sampling of each parameter", columns, rows, note=f"{note}.")
+        row = parameter_row(parameter, estimates.get(parameter.name, {}))
+        sizes = {"ess_bulk": check.ess_bulk[i], "ess_tail": check.ess_tail[i]}
+        rows.append(row | sizes | {"rhat": check.rhat[i]})
+    columns = {"Parameter": WORDS, **columns}
+    return Table.of("sampling", "Sampling of each parameter", rows, columns, note=f"{note}.")
 
 
 def moves_table(result: Result) -> Table:
     """Return how often each kind of move was proposed, and accepted."""
     rows = [
-        (name, str(proposed), f"{100 * accepted / proposed:.1f} %")
+        {"name": name, "proposed": proposed, "share": accepted / proposed}
         for name, (proposed, accepted) in result.moves.items()
     ]
-    pareto_k = result.outcome.check.pareto_k
+    columns = {"Move": "{name}", "Proposed to a walker": "{proposed}", "Accepted": "{share:.1%}"}
     note = "No mixture proposed these draws, so there is no Pareto k."
-    if pareto_k is not None:
-        note = (
-            f"Pareto k of the mixture at the draws: {pareto_k:.2f}; below 0.7 the mixture covers "
-            "them."
-        )
-    return Table("moves", "Moves", ("Move", "Proposed to a walker", "Accepted"), rows, note=note)
+    if (pareto_k := result.outcome.check.pareto_k) is not None:
+        note = f"Pareto k of the mixture at the draws: {pareto_k:.2f}; below 0.7 it covers them."
+    return Table.of("moves", "Moves", rows, columns, note=note)
 
 
 def learned_table(result: Result, learned: Learned) -> Table:
@@ -115,14 +102,19 @@ def learned_table(result: Result, learned: Learned) -> Table:
     rows = []
     for parameter in result.free:
         about = learned.parameters[parameter.name]
-        shares = (f"{share:.2f}" for share in (about.contraction, about.prior, about.likelihood))
-        decided = "the prior" if about.prior_decides else "the readings"
-        rows.append((parameter_words(parameter), *shares, decided))
-    return Table(
+        decides = "the prior" if about.prior_decides else "the readings"
+        rows.append(parameter_row(parameter, vars(about)) | {"decides": decides})
+    return Table.of(
         "taught",
         "Information gained from the data",
-        ("Parameter", "Contraction", "Prior sensitivity", "Likelihood sensitivity", "Dominated by"),
         rows,
+        {
+            "Parameter": WORDS,
+            "Contraction": "{contraction:.2f}",
+            "Prior sensitivity": "{prior:.2f}",
+            "Likelihood sensitivity": "{likelihood:.2f}",
+            "Dominated by": "{decides}",
+        },
         note="Contraction: 1 - (posterior SD / prior SD)², in the prior's normal scores; near 1 "
         "the data dominate, near 0 the prior. Sensitivity of the posterior to a small "
         "change in the weight of the prior, and of the readings; above 0.05 it is not small.",
@@ -131,25 +123,25 @@ def learned_table(result: Result, learned: Learned) -> Table:
 
 def replicated_tables(result: Result) -> list[Table]:
     """Return the numbers of each fitted record among those of replicated records."""
-    columns = (
-        TableColumn("Number", text=lambda item: STATISTICS[item[0]][0]),
-        TableColumn("Observed", text=lambda item: f"{item[1].observed:.4g}"),
-        TableColumn(
-            "95 % of replicated", text=lambda item: f"{item[1].lower:.4g} to {item[1].upper:.4g}"
-        ),
-        TableColumn("Unit", text=lambda item: unit_text(STATISTICS[item[0]][1])),
-        TableColumn("p", text=lambda item: f"{item[1].p:.3f}"),
-        TableColumn("Extreme", text=lambda item: "extreme" if item[1].odd else ""),
-    )
-    return [
-        Table.of(
-            f"replicated-{name}",
-            f"Posterior predictive checks{f' of {name}' if len(result.replicated) > 1 else ''}",
-            checked.statistics.items(),
-            columns,
-        )
-        for name, checked in result.replicated.items()
-    ]
+    columns = {
+        "Number": "{words}",
+        "Observed": "{observed:.4g}",
+        "95 % of replicated": "{lower:.4g} to {upper:.4g}",
+        "Unit": "{unit}",
+        "p": "{p:.3f}",
+        "Extreme": "{extreme}",
+    }
+    tables = []
+    for name, checked in result.replicated.items():
+        rows = []
+        for kind, statistic in checked.statistics.items():
+            words, unit = STATISTICS[kind]
+            row = {"words": words, "unit": unit_text(unit), **vars(statistic)}
+            rows.append(row | {"extreme": "extreme" if statistic.odd else ""})
+        of = f" of {name}" if len(result.replicated) > 1 else ""
+        caption = f"Posterior predictive checks{of}"
+        tables.append(Table.of(f"replicated-{name}", caption, rows, columns))
+    return tables
 
 
 def scores_table(
@@ -167,41 +159,42 @@ def scores_table(
     records
         The rows of the CSV.
     """
-
-    def coverage(name: str) -> str:
-        texts = (covered(scores[name], "sensor", level).removesuffix(" %") for level in LEVELS)
-        return f"{', '.join(texts)}%"
-
-    def plain_coverage(name: str) -> str:
-        shares = (scores[name].coverage["sensor"] or {}).values()
-        return "/".join(f"{100 * share:.1f}" for share in shares)
-
-    def status(name: str) -> str:
-        return mark(verdicts[name].status) if name in verdicts else UNKNOWN
-
+    rows = []
+    for name, judged in scores.items():
+        covers = [covered(judged, "sensor", level).removesuffix(" %") for level in LEVELS]
+        shares = (judged.coverage["sensor"] or {}).values()
+        row = {
+            "title": titles[name],
+            "name": name,
+            "status": mark(verdicts[name].status) if name in verdicts else UNKNOWN,
+            "nrmse": judged.nrmse,
+            "error": error_text(judged),
+            "largest": length_text(judged.max_error_um),
+            "width": length_text(judged.width_um[95]),
+            "covers": ", ".join(covers),
+            "shares": "/".join(f"{100 * share:.1f}" for share in shares),
+        }
+        rows.append(row)
     levels = [str(level) for level in LEVELS]
-    return Table.of(
-        "validation",
-        "Band validation",
-        scores,
-        (
-            TableColumn("Record", on="page", text=titles.__getitem__),
-            TableColumn("Record", on="screen"),
-            TableColumn("Validation", text=status),
-            TableColumn("NRMSE", on="page", text=lambda n: error_text(scores[n])),
-            TableColumn("NRMSE", on="screen", text=lambda n: f"{100 * scores[n].nrmse:.2f}%"),
-            TableColumn("Max error", text=lambda n: length_text(scores[n].max_error_um)),
-            TableColumn("Width 95%", text=lambda n: length_text(scores[n].width_um[95])),
-            TableColumn(
-                f"Coverage of the {', '.join(levels)}% sensor bands", on="page", text=coverage
-            ),
-            TableColumn(f"Coverage {'/'.join(levels)}%", on="screen", text=plain_coverage),
-        ),
-        records=records,
-        note="NRMSE: root mean square of measured minus mean, over the range of the measured "
+    bands = f"Coverage of the {', '.join(levels)}% sensor bands"
+    columns = (
+        TableColumn("Record", on="page", text="{title}"),
+        TableColumn("Record", on="screen", text="{name}"),
+        TableColumn("Validation", text=Markup("{status}")),
+        TableColumn("NRMSE", on="page", text="{error}"),
+        TableColumn("NRMSE", on="screen", text="{nrmse:.2%}"),
+        TableColumn("Max error", text="{largest}"),
+        TableColumn("Width 95%", text="{width}"),
+        TableColumn(bands, on="page", text="{covers}%"),
+        TableColumn(f"Coverage {'/'.join(levels)}%", on="screen", text="{shares}"),
+    )
+    note = (
+        "NRMSE: root mean square of measured minus mean, over the range of the measured "
         "displacement. ±: one standard error from a block bootstrap, because neighboring samples "
-        "err together.",
-        on="both",
+        "err together."
+    )
+    return Table.of(
+        "validation", "Band validation", rows, columns, records=records, note=note, on="both"
     )
 
 
@@ -271,17 +264,14 @@ def _measured(
     for measure, (words, unit) in measures.items():
         row = [words]
         for estimated in estimates.values():
-            row += _estimate_texts(estimated[measure])
+            if (estimate := estimated[measure]) is None:
+                row += [UNKNOWN, UNKNOWN]
+                continue
+            values = estimate.mean, estimate.sd, estimate.lower, estimate.upper
+            mean, sd, lower, upper = (digits(value, estimate.sd) for value in values)
+            row += [f"{mean} ± {sd}", f"{lower} to {upper}"]
         rows.append([*row, unit_text(unit)])
     return Table(name, caption, [*columns, "Unit"], rows, records=records, note=note, on="both")
-
-
-def _estimate_texts(estimate: Estimate | None) -> tuple[str, str]:
-    if estimate is None:
-        return UNKNOWN, UNKNOWN
-    numbers = estimate.mean, estimate.sd, estimate.lower, estimate.upper
-    mean, sd, lower, upper = (digits(number, estimate.sd) for number in numbers)
-    return f"{mean} ± {sd}", f"{lower} to {upper}"
 
 
 def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -295,15 +285,13 @@ def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any
     return [{str(key): value for key, value in row.items()} for row in frame.to_dict("records")]
 
 
-def name_columns(title: str) -> tuple[TableColumn, TableColumn]:
-    """Return the columns of parameters' names: in words on a page, bare on a screen."""
-    bare = TableColumn(title, on="screen", text=lambda parameter: parameter.name)
-    return TableColumn(title, on="page", text=parameter_words), bare
-
-
-def parameter_words(parameter: Parameter) -> Markup:
-    """Return a parameter in words, with its symbol."""
-    return Markup("{}, {}").format(parameter.description, symbol(parameter))
+def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what tables say of a parameter: its names, its unit, and estimates as known."""
+    row = dict(numbers)
+    for key in {"mean", "sd", "median", "lower_95", "upper_95"} & numbers.keys():
+        row[key] = digits(numbers[key], numbers["sd"])
+    words = Markup("{}, {}").format(parameter.description, symbol(parameter))
+    return row | {"name": parameter.name, "words": words, "unit": unit_text(parameter.unit)}
 
 
 def _other_scores(scores: Scores) -> Iterator[tuple[str, str]]:
@@ -324,26 +312,27 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
     interval under the joint prior. On the screen it stands below the stated one where it differs.
     ``point`` has the parameters of a point fit, if there is one.
     """
-    quantiles = effective(prior, np.random.default_rng(0))
-    in_effect = dict(zip(prior.free_names, quantiles.T, strict=True))
-
-    def effect(parameter: Parameter) -> str:
+    in_effect = dict(
+        zip(prior.free_names, effective(prior, np.random.default_rng(0)).T, strict=True)
+    )
+    rows = []
+    for parameter in prior.parameters:
+        row = parameter_row(parameter, {}) | {"effect": "", "point": ""}
         if parameter.prior is None:
-            return ""
-        low, median, high = in_effect[parameter.name]
-        return f"{median:.3g} ({low:.2g} to {high:.2g})"
-
-    def short(parameter: Parameter) -> str:
-        if parameter.prior is None:
-            return f"fixed at {parameter.fixed:g}"
-        probabilities = parameter.prior.frozen.cdf(in_effect[parameter.name])
-        # Constraints that move a quantile by less are not told from the draws' own error.
-        is_cut = max(abs(probabilities - [0.025, 0.5, 0.975])) > 0.03
-        return f"{parameter.prior}" + (f"\n  effective: {effect(parameter)}" if is_cut else "")
-
-    def estimate(parameter: Parameter) -> str:
-        return f"{point[parameter.name]:.5g}" if point and parameter.name in point else ""
-
+            row["stated"] = row["short"] = f"fixed at {parameter.fixed:.6g}"
+        else:
+            low, median, high = at = in_effect[parameter.name]
+            row["effect"] = f"{median:.3g} ({low:.2g} to {high:.2g})"
+            edges = {"at least": parameter.lower, "at most": parameter.upper}
+            cuts = (f", {words} {x:.6g}" for words, x in edges.items() if math.isfinite(x))
+            row["stated"] = "".join([str(parameter.prior), *cuts])
+            # Constraints that move a quantile by less are not told from the draws' own error.
+            moved = np.abs(parameter.prior.frozen.cdf(at) - [0.025, 0.5, 0.975]).max()
+            effect = f"\n  effective: {row['effect']}" if moved > 0.03 else ""
+            row["short"] = f"{parameter.prior}{effect}"
+        if point and parameter.name in point:
+            row["point"] = f"{point[parameter.name]:.5g}"
+        rows.append(row)
     bounds = [
         parameter.declared.stated_bounds
         for parameter in prior.parameters
@@ -354,34 +343,17 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
         cut = Markup(
             'model\'s own constraints (<span id="constraints">{}</span>) have cut the joint prior'
         ).format("; ".join(bounds))
-    return Table.of(
-        "priors",
-        "Priors and fixed values",
-        prior.parameters,
-        (
-            *name_columns("Parameter"),
-            TableColumn("Prior or value", on="page", text=_stated),
-            TableColumn("Prior", on="screen", text=short),
-            TableColumn("Effective", on="page", text=effect),
-            TableColumn("MAP estimate", on="both" if point else "nowhere", text=estimate),
-            TableColumn("Unit", text=lambda parameter: unit_text(parameter.unit)),
-        ),
-        note=Markup(
-            "Effective: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. "
-            "The scales of default priors come from the training data's ranges of voltage and "
-            "displacement and from the drive's times."
-        ).format(cut),
-        on="both",
+    columns = (
+        *NAME,
+        TableColumn("Prior or value", on="page", text="{stated}"),
+        TableColumn("Prior", on="screen", text="{short}"),
+        TableColumn("Effective", on="page", text="{effect}"),
+        TableColumn("MAP estimate", on="both" if point else "nowhere", text="{point}"),
+        TableColumn("Unit", text="{unit}"),
     )
-
-
-def _stated(parameter: Parameter) -> str:
-    """Return a prior in words, with the bounds that cut it, or a fixed value."""
-    if parameter.fixed is not None:
-        return f"fixed at {parameter.fixed:.6g}"
-    text = str(parameter.prior)
-    if math.isfinite(parameter.lower):
-        text += f", at least {parameter.lower:.6g}"
-    if math.isfinite(parameter.upper):
-        text += f", at most {parameter.upper:.6g}"
-    return text
+    note = Markup(
+        "Effective: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. The "
+        "scales of default priors come from the training data's ranges of voltage and displacement "
+        "and from the drive's times."
+    ).format(cut)
+    return Table.of("priors", "Priors and fixed values", rows, columns, note=note, on="both")

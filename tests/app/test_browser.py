@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.campaign import STATUSES, Campaign, Row
-from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.designed import Design, Promise
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.model.limits import Limits

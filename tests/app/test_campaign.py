@@ -18,7 +18,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.running.campaign import Campaign, Row
-from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.run import start as begin

@@ -139,11 +139,12 @@ def test_other_readings_are_refused(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["a"], "give two runs or more, or a CONFIG"),
+        (["a"], "a: does not exist; check the path"),
         (["b.toml"], "b.toml: No such file or directory; check the config's path"),
-        (["a", "b", "--models", "linear"], "goes with one CONFIG"),
-        (["a", "a"], "the same run is there twice"),
-        (["a", "b"], "a: no run here"),
+        ([".", "b", "--models", "linear"], "models: fits are compared as they are; leave it out"),
+        ([".", "."], "the same run is there twice"),
+        ([".", "b"], "no run here"),
+        (["."], "one fit alone; give two or more"),
         (["c.toml", "--models", "linear; linear"], "is there twice"),
     ],
 )

@@ -138,7 +138,7 @@ def second(**changes: Any) -> Record:
     ("tables", "message"),
     [
         ({"b": {"continues": "c"}}, r"record\.b\.continues: no other record 'c'; known are a"),
-        ({"b": {"continues": "b"}}, r"record\.b\.continues: the record itself; name the one"),
+        ({"b": {"continues": "b"}}, r"record\.b\.continues: no other record 'b'; known are a"),
         ({"a": {"continues": "b"}}, r"continues: a circle \([ab], [ab], [ab]\); one is the first"),
         ({"c": {"continues": "a"}}, r"record\.c\.continues: b continues a too; one record can"),
         ({"b": {"from_rest": True}}, r"record\.b\.continues: it starts where a ends; remove its f"),

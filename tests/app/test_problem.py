@@ -170,7 +170,7 @@ def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None
         ("[model]\ndynamics = 'second-order'", "parameters.mass: has no default prior; give prior"),
         ("[parameters.d]\nprior = {distribution = 'nrmal'}", "parameters.d.prior: nrmal: unknown"),
         ("[parameters.d]\nfixed = -1.0", "d: "),
-        ("[validation.a]\nwindow = [1.0, 2.0]", "overlaps the held-out window 1 to 2 s"),
+        ("[validation.a]\nwindow = [1.0, 2.0]", "validation.a.window: 1 to 2 s overlaps"),
         ("[sampling]\nwalkers = 4", "sampling.walkers: 4 are too few"),
         (
             "[parameters]\nd = { prior = { distribution = 'normal', mean = 1e300, sd = 1e299 } }",

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign import Row
-from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.population.population import population

@@ -27,7 +27,7 @@ def test_numbers_table_and_picture_agree(
         asked.update(options)
         return tracking
 
-    monkeypatch.setattr("bwbayes.app.jobs.track.track", track)
+    monkeypatch.setattr("bwbayes.app.jobs.control.track", track)
     shutil.copytree(run, tmp_path / "run")
     command = "track", "run", "--frequency", "5", "--draws", "5"
     said, folder = bwbayes(*command), tmp_path / "run/track"

@@ -12,6 +12,7 @@ error is compared with that of the best candidate.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import pytest
 from rich.console import Console
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.config.keywords import config_of, models_of, slug
+from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.problem.problem import resolve
@@ -118,7 +119,7 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
     planned = Record(fresh.voltage, None, fresh.interval)
     made = {}
     for candidate in comparison.candidates:
-        run = RunFolder.open(folder / slug(candidate.name))
+        run = RunFolder.open(folder / re.sub(r"[^\w.-]+", "-", candidate.name).strip("-."))
         if candidate.converged:
             mean = finished(run).predict(planned, from_rest=True, own_offset=False).mean
         else:

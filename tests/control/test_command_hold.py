@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.jobs.export import export
+from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference, shaped

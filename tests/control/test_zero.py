@@ -11,7 +11,7 @@ import pytest
 
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.at_work import command_limits
-from bwbayes.app.jobs.export import export
+from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.control.compensation import compensate
 from bwbayes.control.exported import exported

@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from bwbayes.app.config.limits import LARGEST_SEED
+from bwbayes.app.config import LARGEST_SEED
 from bwbayes.errors import InputError
 
 type AnyCommand = Callable[..., Any]

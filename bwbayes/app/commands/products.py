@@ -70,7 +70,6 @@ def predict(
     from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.predict import predict as predict_record
     from bwbayes.app.jobs.predict import write_prediction
-    from bwbayes.diagnosis.standing import Standing
     from bwbayes.record import read_record
     from bwbayes.report.outputs import refuse_existing
     from bwbayes.report.report import Report, standing_banner
@@ -94,9 +93,9 @@ def predict(
     bands = predict_record(fit, other, name=name, own_offset=not same_offset, **options)
     write_prediction(bands, files, fit.standing)
     show_report(Report(title=name, banners=standing_banner(fit.standing)))
-    validation = Standing.of([bands.verdict] if bands.verdict else [])
     # The worse of the two.
-    worse = validation if validation.holds is False or fit.standing.holds else fit.standing
+    own = bands.standing.holds is False or fit.standing.holds
+    worse = bands.standing if own else fit.standing
     return present(bands.report(), files, worse)
 
 
@@ -108,7 +107,7 @@ def predict(
 @click.option(
     "--reference", type=FILE, help="A file with time and displacement, in place of SHAPE."
 )
-@options_of("bwbayes.app.jobs.compensate:compensate", smoothed="smooth")
+@options_of("bwbayes.app.jobs.control:compensate", smoothed="smooth")
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option
 @quiet_option
@@ -123,7 +122,7 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.jobs.compensate import compensate as invert
+    from bwbayes.app.jobs.control import compensate as invert
 
     requested = shape or reference
     if requested is None or (shape and reference):
@@ -163,7 +162,7 @@ def design(
 @click.command()
 @folder_argument
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/export.")
-@options_of("bwbayes.app.jobs.export:export")
+@options_of("bwbayes.app.jobs.control:export")
 def export(folder: Path, out: Path | None, **options: Any) -> int:
     """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
 
@@ -173,8 +172,8 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
     Example: bwbayes export results/ring_bender --rate 1000
     """
     from bwbayes.app.fit.fitted import converged
-    from bwbayes.app.jobs.export import FILES
-    from bwbayes.app.jobs.export import export as write
+    from bwbayes.app.jobs.control import FILES
+    from bwbayes.app.jobs.control import export as write
 
     out = out or folder / "export"
     model = write(converged(folder), out, **options)
@@ -190,7 +189,7 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 @click.command()
 @folder_argument
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/track.")
-@options_of("bwbayes.app.jobs.track:track", frequencies="frequency")
+@options_of("bwbayes.app.jobs.control:track", frequencies="frequency")
 @overwrite_option
 @quiet_option
 def track(folder: Path, out: Path | None, **options: Any) -> int:
@@ -203,6 +202,6 @@ def track(folder: Path, out: Path | None, **options: Any) -> int:
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.jobs.track import track as simulate
+    from bwbayes.app.jobs.control import track as simulate
 
     return _saved(simulate, folder, out or folder / "track", **options)

@@ -15,8 +15,8 @@ from bwbayes.app.commands.ending import (
     show_report,
 )
 from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_option, seed_option
-from bwbayes.app.config.limits import USUAL_MODELS
-from bwbayes.errors import ExitStatus, InputError
+from bwbayes.app.config import USUAL_MODELS
+from bwbayes.errors import ExitStatus
 
 
 @click.command()
@@ -95,7 +95,9 @@ def calibrate(
 @click.option("--resume", "resumed", type=FILE, help="Resume the campaign in this folder.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
-@options_of("bwbayes.app.jobs.campaign:resume")
+@options_of(
+    "bwbayes.app.fit.calls:campaign", "config", "folder", "overwrite", "pictures", "progress"
+)
 @quiet_option
 def campaign(
     folder: Path | None,
@@ -116,7 +118,7 @@ def campaign(
     Example: bwbayes campaign records/ --config my.toml --out results/batch
     """
     from bwbayes.app.jobs.campaign import config_text, resume, start
-    from bwbayes.app.running.campaign_folder import CampaignFolder
+    from bwbayes.app.running.folder import CampaignFolder
 
     new = {"out": out, "config": config, "overwrite": overwrite, "pictures": no_pictures}
     require_new_or_resumed(
@@ -141,18 +143,12 @@ def campaign(
 
 @click.command(cls=WithParts)
 @click.argument("paths", type=FILE, nargs=-1, required=True)
-@click.option("--models", help=f"Models to run a CONFIG with; default: {USUAL_MODELS}.")
+@click.option("--models", help=f"Models to fit to a CONFIG's record; default: {USUAL_MODELS}.")
 @click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
 @options_of("bwbayes.app.fit.calls:compare", "models", "folder", "progress")
 @quiet_option
 def compare(
-    paths: tuple[Path, ...],
-    models: str | None,
-    out: Path | None,
-    screen: bool,
-    overwrite: bool,
-    quiet: bool,
-    **options: Any,
+    paths: tuple[Path, ...], models: str | None, out: Path | None, quiet: bool, **options: Any
 ) -> int:
     """Compare the runs in folders PATHS, or models that one config is run with.
 
@@ -163,29 +159,11 @@ def compare(
 
     Example: bwbayes compare results/bender results/bender_plays
     """
-    from bwbayes.app.config.config import load
-    from bwbayes.app.config.keywords import models_of
-    from bwbayes.app.jobs import compare as job
-    from bwbayes.report.outputs import refuse_existing
+    from bwbayes.app.fit.calls import compare as compare_runs
 
-    path, *others = paths
-    if models is None and not others and (path.is_file() or path.suffix == ".toml"):
-        models = USUAL_MODELS
-    if models is None and not others:
-        raise InputError("compare: give two runs or more, or a CONFIG")
-    if models is not None and others:
-        raise InputError("compare: --models goes with one CONFIG; leave the others out")
-    out = out or Path("results") / ("comparison" if models is None else f"{path.stem}-comparison")
-    config = None if models is None else load(path)
-    refuse_existing([out / "comparison.json"], overwrite=overwrite)
-    console = Console(stderr=True, quiet=quiet)
-    if config is None or models is None:
-        comparison = job.compare(job.fits_of(paths), console, **options)
-    else:
-        named_models = models_of(models, config.model)
-        options |= {"screen": screen, "overwrite": overwrite}
-        comparison = job.compare_models(config, path.parent, named_models, out, console, **options)
-    comparison.save(out, overwrite=True)
+    alone = len(paths) == 1 and not paths[0].is_dir()
+    out = out or Path("results") / (f"{paths[0].stem}-comparison" if alone else "comparison")
+    comparison = compare_runs(*paths, models=models, folder=out, progress=not quiet, **options)
     # What does not hold is among what speaks against the recommendation.
     page = out / "comparison.html"
     status = present(comparison.report(), [page], comparison.standing, quiet=quiet)

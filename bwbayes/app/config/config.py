@@ -16,8 +16,8 @@ from typing import Annotated, Self
 import tomlkit
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
+from bwbayes.app.config import LARGEST_SEED
 from bwbayes.app.config.keys import ConfigTable, key, one_line
-from bwbayes.app.config.limits import LARGEST_SEED
 from bwbayes.app.config.settings import (
     ModelConfig,
     Name,

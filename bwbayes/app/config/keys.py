@@ -152,7 +152,13 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     names = [str(name) for name in first["loc"] if not branch.fullmatch(str(name))]
     path = ".".join(names) or "config"
     if first["type"] == "extra_forbidden":
-        return f"{where}: {path}: unknown key; {_hint(names, root)}"
+        hint = suggestion(names[-1], _names_in(names[:-1], root), synonyms(root))
+        homes = [key.parent for key in keys(root) if key.name == names[-1]]
+        for home in [home for home in homes if home not in ("", names[0]) and "." not in home][:1]:
+            hint = f"it belongs under [{home}]"
+        if names[-1] in root.model_fields:
+            hint = "it belongs above the first table, or is a table of its own"
+        return f"{where}: {path}: unknown key; {hint}"
     message = first["msg"].removeprefix("Value error, ")
     match names[-1:], first["type"]:
         case ["prior"], _:
@@ -172,17 +178,6 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
     except ValueError:  # Python writes no whole number of more than 4300 digits
         got = ", got a very long number"
     return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
-
-
-def _hint(names: Sequence[str], root: type[BaseModel]) -> str:
-    """Say where an unknown key belongs, if in another table, or which one is meant."""
-    if names[-1] in root.model_fields:
-        return "it belongs above the first table, or is a table of its own"
-    for key in keys(root):
-        elsewhere = key.parent and "." not in key.parent and key.parent != names[0]
-        if key.name == names[-1] and elsewhere:
-            return f"it belongs under [{key.parent}]"
-    return suggestion(names[-1], _names_in(names[:-1], root), synonyms(root))
 
 
 def _names_in(path: Sequence[str], root: type[BaseModel]) -> list[str]:

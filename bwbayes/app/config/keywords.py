@@ -157,11 +157,6 @@ def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
     return models
 
 
-def slug(name: str) -> str:
-    """Return the name of a model's folder."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
-
-
 def _changes(name: str) -> dict[str, Any]:
     """Return the keys of [model] that a model's name says."""
     first, *others = re.split(r"\+(?![^(]*\))", name)

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bwbayes.app.config.limits import USUAL_MODELS
+from bwbayes.app.config import USUAL_MODELS
 from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
@@ -121,8 +121,8 @@ def compare(
     Parameters
     ----------
     runs
-        What :func:`fit` takes: a record, its file, or a list or dict of several records; or two or
-        more fits and folders of runs.
+        What :func:`fit` takes: a record, its file, or a list or dict of several records; the file
+        of a config; or two or more fits and folders of runs.
     models
         Models to fit to a record, as on the command line: an operator, then gain, creep, dynamics
         and noise after plus signs; in one text with semicolons between them, or in a list. By
@@ -159,10 +159,12 @@ def compare(
         comparison.recommended, comparison.caveats
         comparison = bwbayes.compare(fit, other_fit, "results/bender")
     """
+    from bwbayes.app.config.config import is_config, load
     from bwbayes.app.config.keywords import config_of, models_of
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.jobs import compare as job
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
+    from bwbayes.record import Record
     from bwbayes.report.outputs import refuse_existing
 
     path, scratch = folder_or_scratch(folder, "comparison")
@@ -178,14 +180,22 @@ def compare(
         if len(listed) < 2:
             raise InputError("compare: one fit alone; give two or more, or a record")
         fits = job.fits_of(listed)
-        comparison = job.compare(fits, future=future, workers=workers, executor=executor)
+        comparison = job.compare(
+            fits, console_of(progress), future=future, workers=workers, executor=executor
+        )
     else:
-        config, records = config_of(compared_runs, keys, "compare")
+        where, records = Path(), dict[str, Record]()
+        if isinstance(compared_runs, str | Path) and is_config(Path(compared_runs)):
+            config, where = load(compared_runs), Path(compared_runs).parent
+            for name in keys:
+                raise InputError(f"compare: {name}: say it in the config, or give a record")
+        else:
+            config, records = config_of(compared_runs, keys, "compare")
         named_models = USUAL_MODELS if models is None else models
         text = named_models if isinstance(named_models, str) else "; ".join(named_models)
         comparison = job.compare_models(
             config,
-            Path(),
+            where,
             models_of(text, config.model),
             path,
             console_of(progress),
@@ -299,9 +309,10 @@ def campaign(
     overwrite
         Replace a campaign that is in the folder already.
     workers
-        Records side by side; by default as many as cores. The result does not depend on it.
+        Records side by side; default: all cores. The result does not depend on it.
     executor
-        Where they are fitted, as in :func:`bwbayes.fit`.
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python as in :func:`fit`.
+        The machines of a cluster must all see the folders by the same path.
     pictures
         Draw each run's figures and report too.
     progress

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
     from bwbayes.app.fit.plots import Plots
     from bwbayes.app.jobs.at_work import Scratch, at_work
-    from bwbayes.app.jobs.compensate import compensate as compensate_fit
+    from bwbayes.app.jobs.control import compensate as compensate_fit
+    from bwbayes.app.jobs.control import export as export_fit
+    from bwbayes.app.jobs.control import track as track_fit
     from bwbayes.app.jobs.design import design as design_fit
-    from bwbayes.app.jobs.export import export as export_fit
     from bwbayes.app.jobs.predict import predict as predict_record
-    from bwbayes.app.jobs.track import track as track_fit
     from bwbayes.app.problem.problem import Problem
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
@@ -46,20 +46,16 @@ if TYPE_CHECKING:
 
 
 class _JobOf:
-    """A job as the method of a fit, as ``at_work`` makes it, loaded when it is asked for.
+    """A job as the method of a fit, as ``at_work`` makes it, loaded when it is asked for."""
 
-    Its module has its name, and a function ``after`` of what it warns of, if any.
-    """
-
-    def __init__(self, name: str, *, carried: bool = True, after: str = "") -> None:
-        self.name, self.carried, self.after = name, carried, after
+    def __init__(self, module: str, name: str, *, carried: bool = True) -> None:
+        self.module, self.name, self.carried = module, name, carried
 
     def __get__(self, fit: Fit | None, _: object = None) -> Any:
         from bwbayes.app.jobs.at_work import at_work
 
-        module = import_module(f"bwbayes.app.jobs.{self.name}")
-        after = {"after": getattr(module, self.after)} if self.after else {}
-        method = at_work(getattr(module, self.name), carried=self.carried, **after)
+        job = getattr(import_module(f"bwbayes.app.jobs.{self.module}"), self.name)
+        method = at_work(job, carried=self.carried)
         return method if fit is None else MethodType(method, fit)
 
 
@@ -298,9 +294,10 @@ class Fit(Shown):
         export = at_work(export_fit)
         track = at_work(track_fit)
     else:
-        predict = _JobOf("predict", carried=False, after="prediction_notes")
-        compensate, design = _JobOf("compensate"), _JobOf("design")
-        export, track = _JobOf("export"), _JobOf("track")
+        predict = _JobOf("predict", "predict", carried=False)
+        design = _JobOf("design", "design")
+        compensate = _JobOf("control", "compensate")
+        export, track = _JobOf("control", "export"), _JobOf("control", "track")
 
     def compare(self, *others: Fit, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate
+from typing import TYPE_CHECKING, Concatenate
 
 import numpy as np
 from rich.console import Console
@@ -28,14 +28,11 @@ if TYPE_CHECKING:
 
 
 def at_work[**P, R](
-    job: Callable[Concatenate[Fit, P], R],
-    *,
-    carried: bool = True,
-    after: Callable[[Any], Iterable[str]] = lambda product: getattr(product, "remarks", ()),
+    job: Callable[Concatenate[Fit, P], R], *, carried: bool = True
 ) -> Callable[Concatenate[Fit, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints.
 
-    Of what the run's bands do not hold if that is ``carried``, and of what its product says.
+    Of what the run's bands do not hold if that is ``carried``, and of its product's notes.
     """
     options = [*signature(job).parameters][1:]
 
@@ -47,7 +44,7 @@ def at_work[**P, R](
         fit.require_converged()
         warn(fit.standing.said if carried else (), 3)
         product = job(fit, *args, **kwargs)
-        warn(after(product), 3)
+        warn(getattr(product, "notes", getattr(product, "remarks", ())), 3)
         return product
 
     return method

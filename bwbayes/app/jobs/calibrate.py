@@ -190,12 +190,12 @@ def _read(
             if isinstance(entry, _Request):
                 request = entry
                 continue
-            if ([*entry["ranks"]], [*entry["covered"]]) not in (statistics, ([], [])):
-                raise ValueError("has other statistics")
-            if not all(0 <= rank <= RANKED for rank in entry["ranks"].values()):
-                raise ValueError("has a rank that there is not")
-            if entry["number"] in entries:
-                raise ValueError("is there already")
+            if (
+                entry["number"] in entries
+                or ([*entry["ranks"]], [*entry["covered"]]) not in (statistics, ([], []))
+                or not all(0 <= rank <= RANKED for rank in entry["ranks"].values())
+            ):
+                raise ValueError
         except ValueError:
             raise InputError(
                 f"{folder.replicates}:{number}: is not one of these replicates; delete this line"

@@ -27,16 +27,8 @@ from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import Campaign, Row
-from bwbayes.app.running.campaign_folder import (
-    ENDED,
-    CampaignFolder,
-    Origin,
-    digest,
-    ended,
-    records_in,
-)
 from bwbayes.app.running.fingerprint import fingerprint
-from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, digest, ended
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
@@ -44,6 +36,7 @@ from bwbayes.diagnosis.standing import Standing
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.population import FEWEST, Population, population
 from bwbayes.population.specimen import Specimen, specimen_of
+from bwbayes.record.io.formats import SUFFIXES
 from bwbayes.report.outputs import save, write_summary
 
 
@@ -59,6 +52,27 @@ def config_text(path: Path) -> str:
         record["file"] = "each"
         return dump(checked(table, str(path)))
     return dump(load(path))
+
+
+def records_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be records, by name.
+
+    Hidden ones do not count, nor does the truth (``NAME.truth.csv``) beside a simulated record.
+
+    Raises InputError: no such folder, or no such file in it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder; give the one that the records are in")
+    files = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in SUFFIXES
+        and not path.name.startswith(".")
+        and not path.stem.endswith(".truth")
+    ]
+    if not files:
+        raise InputError(f"{folder}: has no record; records end in {', '.join(SUFFIXES)}")
+    return files
 
 
 def start(
@@ -78,7 +92,7 @@ def start(
     Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
-    origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
+    origin = Origin(str(records.absolute()), str(where.absolute()), pictures)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
@@ -89,18 +103,7 @@ def resume(
     workers: int | None = None,
     executor: str | Executor | None = None,
 ) -> Campaign:
-    """Fit the records that are missing, and write table and page over all.
-
-    Parameters
-    ----------
-    folder, console
-        The campaign's folder, and where progress goes.
-    workers
-        Records side by side; default: all cores. The result does not depend on it.
-    executor
-        local (default), threads, processes, dask, or dask://HOST:PORT. In Python any executor, as
-        in :func:`~bwbayes.app.running.workers.executor`. The machines of a cluster must all see the
-        campaign's folder and that of the records by the same path.
+    """Fit the records that are missing, and write table and page over all; options as Python's.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """

@@ -6,13 +6,12 @@ shows to be wrong with it, each with the line of config that deals with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
@@ -37,6 +36,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
 
     Raises InputError: the config or its record cannot be used.
     """
+    from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
+
     problem = resolve(config, folder)
     posterior, seed = problem.posterior, problem.config.seed
     point = pointfit.fit(posterior, generator(seed, "point fit"))
@@ -66,6 +67,11 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         f"{name}: {_facts(record)}" if several else _facts(record)
         for name, record in problem.records.items()
     )
+    pictures: list[Picture] = []
+    for name, record in problem.records.items():
+        training, found = problem.posterior.alone(name).only.training, problem.findings[name]
+        drawn = record_pictures(record, training, found, name if several else "")
+        pictures += drawn.values()
     name = problem.config.name or problem.record.origin
     report = Report(
         title=f"{name}, check",
@@ -84,7 +90,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         ],
         blocks=[
             Text(about, on="screen"),
-            *_pictures(problem),
+            *pictures,
             Section(
                 "Priors and MAP estimate",
                 [
@@ -103,28 +109,6 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     )
     save(report, out, "check", pictures="figures")
     return report
-
-
-def _pictures(problem: Problem) -> Iterator[Picture]:
-    """Yield the pictures of each record."""
-    from bwbayes.report.figures.record import record_drawings  # noqa: PLC0415  # slow to load
-
-    captions = {
-        "time": (
-            "Along time",
-            "Voltage and displacement. Gray: readings that are not fitted; colored: the parts of "
-            "the record with which something is wrong.",
-        ),
-        "loop": ("Hysteresis loop", "Displacement against voltage, colored by time."),
-        "drive": ("Spectrum of the drive", "Amplitude of the voltage at each frequency."),
-    }
-    several = len(problem.records) > 1
-    for name, record in problem.records.items():
-        training = problem.posterior.alone(name).only.training
-        for kind, draw in record_drawings(record, training, problem.findings[name]).items():
-            title, text = captions[kind]
-            picture = (f"{kind}_{name}", f"{title}: {name}") if several else (kind, title)
-            yield Picture(*picture, text, draw)
 
 
 def _facts(record: Record) -> str:

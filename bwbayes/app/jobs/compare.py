@@ -9,6 +9,7 @@ are those of :func:`bwbayes.compare`.
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -20,7 +21,6 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump
-from bwbayes.app.config.keywords import slug
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
@@ -134,7 +134,8 @@ def compare_models(
     folders: dict[str, RunFolder] = {}
     for name, model in models.items():
         problem = resolve(_with_model(config, model, name, [*wholes.values()]), where, in_memory)
-        folders[name] = _folder(out / slug(name), problem, overwrite)
+        folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
+        folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
     with one_thread(), executor_of(count, backend=executor) as pool:
         together = side_by_side(pool, workers, len(models))
@@ -174,26 +175,18 @@ def _require_same(pair: str, first: Problem, other: Problem) -> None:
     windows, held_out = [], []
     for problem in (first, other):
         windows.append([dataset.training for dataset in problem.posterior.datasets])
+        starts = {name: replace(v.start, hold=None) for name, v in problem.validations.items()}
         held_out.append(
             {
-                (
-                    name,
-                    v.windows,
-                    v.record and v.record.sha256,
-                    replace(v.start, hold=None),
-                    v.judged,
-                    v.of,
-                )
+                (name, v.windows, v.record and v.record.sha256, starts[name], v.judged, v.of)
                 for name, v in problem.validations.items()
             }
         )
     if windows[0] != windows[1]:
         raise InputError(f"{pair}: fitted to different windows; give both the same record.train")
-    different = {str(validation[0]) for validation in held_out[0] ^ held_out[1]}
-    if different:
+    if different := ", ".join(sorted({name for name, *_ in held_out[0] ^ held_out[1]})):
         raise InputError(
-            f"{pair}: differ in what is held out ({', '.join(sorted(different))}); give both the "
-            "same [validation]"
+            f"{pair}: differ in what is held out ({different}); give both the same [validation]"
         )
 
 

@@ -88,12 +88,14 @@ def design(
     # Of several records, what all of them taught of the actuator, seen from one.
     record = liveliest(problem)
     signals = candidates_of(candidates, problem.records[record], amplifier)
-    is_parameter = isinstance(target, str)
     quantity: str | FloatArray
-    if isinstance(target, Path):
-        quantity = _drive(str(target), problem.records[record].interval)
+    parameter, drive = None, None
+    if isinstance(target, str):
+        quantity = parameter = target
+    elif isinstance(target, Path):
+        quantity, drive = _drive(str(target), problem.records[record].interval), str(target)
     else:
-        quantity = target if isinstance(target, str) else np.asarray(target, dtype=np.float64)
+        quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
     promises = rank(
         problem.posterior.alone(record),
         problem.posterior.select_draws(fit.flat_draws, record),
@@ -109,8 +111,8 @@ def design(
         )
     return Design(
         fit.folder.path.name,
-        target if isinstance(target, str) else None,
-        None if is_parameter else str(target) if isinstance(target, Path) else "a voltage",
+        parameter,
+        drive,
         amplifier,
         signals,
         problem.records[record].interval,

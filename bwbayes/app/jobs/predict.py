@@ -107,12 +107,6 @@ def predict(
     return predict_another(problem, fit.flat_draws, record, start, name or "prediction", window, of)
 
 
-def prediction_notes(prediction: Prediction) -> list[str]:
-    """Return what is to be known of a prediction: where it extrapolates, and what does not hold."""
-    validation = Standing.of([prediction.verdict] if prediction.verdict else [])
-    return [*(f"{prediction.name}: {remark}" for remark in prediction.remarks), *validation.said]
-
-
 def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:
     """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
 

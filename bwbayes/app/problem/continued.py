@@ -50,12 +50,9 @@ def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[
 def _require_next(config: Config, before: str, name: str, records: Mapping[str, Record]) -> None:
     """Refuse a record that cannot go on where the one ``before`` ends."""
     others = [other for other in config.records if other != name]
-    reason = "the record itself; name the one measured before it"
-    if before != name:
-        reason = f"no other record {before!r}; "
-        reason += suggestion(before, others) if others else "remove it"
     if before not in others:
-        raise InputError(f"{place_of(name)}.continues: {reason}")
+        hint = suggestion(before, others) if others else "remove it"
+        raise InputError(f"{place_of(name)}.continues: no other record {before!r}; {hint}")
     rival = next(n for n, source in config.records.items() if source.continues == before)
     first, other, source = records[before], records[name], config.records[name]
     end = first.start + first.duration

@@ -301,7 +301,6 @@ def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
     # Whether Bouc-Wen hysteresis is passive says where its parameters may lie, not what they mean.
     if parts[0] != parts[1] and not all(isinstance(part, BoucWen) for part in parts):
         other |= {declared.name for declared in fitted.hysteresis.parameters}
-    creeps = stand.actuator.creep, fitted.creep
-    if creeps[0] and creeps[1] and creeps[0].times != creeps[1].times:
-        other |= {declared.name for declared in creeps[1].parameters}
+    if fitted.creep and stand.actuator.creep and fitted.creep.times != stand.actuator.creep.times:
+        other |= {declared.name for declared in fitted.creep.parameters}
     return {name: value for name, value in stand.parameters().items() if name not in other}

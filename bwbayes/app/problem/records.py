@@ -220,17 +220,11 @@ def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict
                 raise InputError(f"{where}: {error}") from None
             for other in slices.get("", cuts):
                 if cut.start < other.stop and other.start < cut.stop:
-                    kind, *pair = ("held-out", other, cut) if key else ("training", cut, other)
-                    first, second = (
-                        " to ".join(
-                            record.clock(record.start + record.interval * edge)
-                            for edge in (window.start, window.stop)
-                        )
-                        for window in pair
-                    )
+                    edges = record.start + record.interval * np.array([other.start, other.stop])
+                    window = " to ".join(map(record.clock, edges.tolist()))
                     raise InputError(
-                        f"training window {first} s: overlaps the {kind} window {second} s; move "
-                        f"one ({table}.train)"
+                        f"{where}: {start:g} to {stop:g} s overlaps the training window {window} s "
+                        f"({table}.train); move one of them"
                     )
             if not record.has_reading[cut].any():
                 first, last = (record.clock(time) for time in record.time[cut][[0, -1]])

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.campaign_folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import ExitStatus, InputError
@@ -298,7 +298,7 @@ class Campaign(Product):
         }
 
     def _draw(self) -> Figure:
-        from bwbayes.report.figures.campaign import draw_parameters  # noqa: PLC0415  # slow to load
+        from bwbayes.report.figures.studies import draw_parameters  # noqa: PLC0415  # slow to load
 
         estimates = {row.name: self._estimates(row) for row in self.rows if row.parameters}
         return draw_parameters(estimates, {name: s.new for name, s in self._spreads.items()})

@@ -12,8 +12,9 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from filelock import FileLock, Timeout
 
@@ -219,3 +220,103 @@ class CalibrationFolder(RunFolder):
     def is_of_its_kind(self) -> bool:
         """Tell a calibration's folder from a run's."""
         return self.has_records() and self.replicates.is_file()
+
+
+class Origin(NamedTuple):
+    """Where a campaign began: the folder of its records, the folder that its config's files are in.
+
+    ``pictures`` tells whether every run draws its figures.
+    """
+
+    records: str
+    where: str
+    pictures: bool
+
+
+@dataclass(frozen=True)
+class CampaignFolder(Folder):
+    """The files of one campaign: a run's folder for each record, and what is finished.
+
+    ``records/NAME/`` is the run of the record ``NAME.csv`` (or another suffix), as ``bwbayes run``
+    leaves it, with the digests of the record's file and of the run's summary in ``ended.json`` once
+    it came to its end. So a record that was changed is fitted again, and a run that was resumed by
+    itself is looked at again.
+    """
+
+    KIND: ClassVar[str] = "campaign"
+    BEGIN: ClassVar[str] = "bwbayes campaign RECORDS --out {path}"
+    RESUME: ClassVar[str] = "bwbayes campaign --resume {path}"
+
+    config = FileOf("campaign.toml")  # as it was given; empty if each record proposes its own
+    mark = FileOf("origin.json")
+    summary = FileOf("campaign.json")
+    page = FileOf("campaign.html")
+
+    def run(self, name: str) -> Path:
+        """Return the folder of a record's run."""
+        return self.path / "records" / name
+
+    @classmethod
+    def create(cls, path: Path, config: str, origin: Origin, *, overwrite: bool) -> Self:
+        """Make the folder of a new campaign, whole or not at all; or return one of the same begun.
+
+        ``config`` is its text, empty for none; ``overwrite`` replaces a campaign that is there
+        already, with all its runs.
+
+        Raises InputError: something else is there, or a campaign of another config or of other
+        records.
+        """
+        if path.exists() and not overwrite:
+            existing = cls.open(path)
+            if existing.config.read_text(encoding="utf-8") != config or existing.origin() != origin:
+                raise InputError(
+                    f"{path}: is a campaign of another config or other records; choose another "
+                    "folder, or give `overwrite=True`"
+                )
+            return existing
+        cls.require_free(path, overwrite)
+        folder = cls(path)
+        with folder.drafted() as draft:
+            draft.config.write_text(config, encoding="utf-8")
+            draft.mark.write_text(json.dumps(origin._asdict()), encoding="utf-8")
+        return folder
+
+    def is_of_its_kind(self) -> bool:
+        """Tell a campaign's folder from any other."""
+        return self.mark.is_file() and self.config.is_file()
+
+    def origin(self) -> Origin:
+        """Return where it began.
+
+        Raises InputError: the folder does not say it.
+        """
+        try:
+            noted = json.loads(self.mark.read_bytes())
+            return Origin(str(noted["records"]), str(noted["where"]), bool(noted["pictures"]))
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f"{self.mark}: does not say which records it is about; start again with "
+                "`overwrite=True`"
+            ) from None
+
+    def is_done(self, file: Path) -> bool:
+        """Tell whether a record's run has ended, and is about the file as it is now."""
+        run = self.run(file.stem)
+        try:
+            return (run / ENDED).read_text(encoding="utf-8") == ended(digest(file), run)
+        except (OSError, UnicodeError):
+            return False
+
+
+# What a run's folder has once it came to its end.
+ENDED = "ended.json"
+
+
+def digest(file: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return sha256(file.read_bytes()).hexdigest()
+
+
+def ended(record: str, run: Path) -> str:
+    """Return what the folder of a run that ended says: digests of its record and summary, JSON."""
+    return json.dumps({"record": record, "summary": digest(run / "summary.json")})

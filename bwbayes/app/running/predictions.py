@@ -19,6 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.standing import Standing
 from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
@@ -33,8 +34,8 @@ from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.report.figures import drawn
 from bwbayes.report.product import Shown
-from bwbayes.report.report import Figure, Report
-from bwbayes.report.run import prediction_report
+from bwbayes.report.report import Figure, Report, remarks_banner, standing_banner
+from bwbayes.report.tables import scores_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +55,16 @@ class Prediction(Shown, Bands):
     def holds(self) -> bool | None:
         """Whether the bands hold on the readings; None if that cannot be told."""
         return None if self.verdict is None else self.verdict.holds
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the bands hold, as one carries that along."""
+        return Standing.of([self.verdict] if self.verdict else [])
+
+    @property
+    def notes(self) -> list[str]:
+        """What is to be known: where the drive extrapolates, and what does not hold."""
+        return [*(f"{self.name}: {remark}" for remark in self.remarks), *self.standing.said]
 
     @property
     def residuals(self) -> FloatArray:
@@ -90,8 +101,13 @@ class Prediction(Shown, Bands):
 
     def report(self) -> Report:
         """Return how the prediction turned out, and what to know of it."""
-        notes = self.verdict.notes if self.verdict else ()
-        return prediction_report(self.name, self.scores, self.verdict, [*self.remarks, *notes])
+        tables, notes, name = [], self.verdict.notes if self.verdict else (), self.name
+        if self.scores is not None and self.verdict is not None:
+            tables = [scores_table({name: self.scores}, {name: self.verdict}, {name: name})]
+        remarks = remarks_banner([*self.remarks, *notes])
+        return Report(
+            title=name, banners=[*standing_banner(self.standing), *remarks], blocks=tables
+        )
 
     @property
     def heading(self) -> str:

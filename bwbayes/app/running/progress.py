@@ -68,32 +68,6 @@ class StepProgress(_Line):
         self.show(f"{step} {share:.0%}   ETA {remaining}")
 
 
-class CountProgress(_Line):
-    """Watches replicates or records (``kind``), of which ``done`` are there and some missing.
-
-    ``short`` counts those that came to less than they should, by what they are.
-    """
-
-    def __init__(
-        self, console: Console, kind: str, done: int, missing: int, short: Mapping[str, int]
-    ) -> None:
-        super().__init__(console)
-        self.kind, self.before, self.done = kind, done, done
-        self.total, self.short = done + missing, dict(short)
-
-    def __call__(self, short: str = "") -> None:
-        """Take note of a finished one, and of what it is short of, if anything."""
-        self.done += 1
-        if short:
-            self.short[short] += 1
-        rate = (self.done - self.before) / max(time.monotonic() - self.begun, 1e-9)
-        counts = "   ".join(f"{name} {count}" for name, count in self.short.items())
-        self.show(
-            f"{self.kind} {self.done} of {self.total}   {60 * rate:.1f} a minute   "
-            f"ETA {_minutes((self.total - self.done) / rate)}   {counts}"
-        )
-
-
 class Progress(_Line):
     """Watches a sampling; use it as a context manager and as the sampler's watcher."""
 
@@ -171,12 +145,17 @@ def batch[T](
     """
     if not arguments:
         return
-    count = min(workers or os.cpu_count() or 1, len(arguments))
-    with (
-        executor(count, backend=backend) as pool,
-        CountProgress(console, kind, done, len(arguments), short) as progress,
-    ):
+    count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
+    short = dict(short)
+    with executor(count, backend=backend) as pool, _Line(console) as line:
         together = side_by_side(pool, workers, len(arguments))
-        for result in as_done(pool, together, call, arguments):
+        for fresh, result in enumerate(as_done(pool, together, call, arguments), start=1):
             yield result
-            progress(label(result))
+            if label(result):
+                short[label(result)] += 1
+            rate = fresh / max(time.monotonic() - line.begun, 1e-9)
+            counts = "   ".join(f"{name} {number}" for name, number in short.items())
+            line.show(
+                f"{kind} {done + fresh} of {total}   {60 * rate:.1f} a minute   "
+                f"ETA {_minutes((len(arguments) - fresh) / rate)}   {counts}"
+            )

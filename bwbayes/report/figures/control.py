@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
     FuncFormatter,
-    Locator,
     LogLocator,
     MaxNLocator,
     NullFormatter,
@@ -63,18 +62,14 @@ def draw_error(reference: FloatArray, commands: Commands, limit: float | None) -
     for label, command in commands.items():
         spread.hist(command.rms, bins=bins, color=COLOR_OF[label], alpha=0.6, label=label)
     spread.set(xlabel="rms of the error (µm)", ylabel="draws", xscale="log")
-    spread.xaxis.set_major_locator(_few_ticks(float(np.log10(bins[-1] / bins[0]))))
+    # Two to five ticks; one decade may hold no power of ten.
+    decades = float(np.log10(bins[-1] / bins[0]))
+    powers = LogLocator(numticks=5) if decades > 2 else LogLocator(subs=(1, 3))
+    spread.xaxis.set_major_locator(MaxNLocator(3) if decades < 1 else powers)
     spread.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     spread.xaxis.set_minor_formatter(NullFormatter())
     style.share_legend(figure)
     return figure
-
-
-def _few_ticks(decades: float) -> Locator:
-    """Return what puts two to five ticks on a logarithmic axis; one decade may hold no power."""
-    if decades < 1:
-        return MaxNLocator(3)
-    return LogLocator(numticks=5) if decades > 2 else LogLocator(subs=(1, 3))
 
 
 def draw_loops(reference: FloatArray, commands: Commands) -> Figure:

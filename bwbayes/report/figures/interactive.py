@@ -210,7 +210,7 @@ def _loop(bands: Bands) -> figure:
         }
         plot.patches("x", "y", source=source, **look)
     if bands.measured is not None:
-        read = _one_in_each_cell(bands.voltage, bands.measured)
+        read = kept(bands, bands.time.size)
         x, y = (values[read].astype(np.float32) for values in (bands.voltage, bands.measured))
         look = {"color": style.Color.MEASURED, "legend_label": "measured"}
         plot.scatter(x, y, size=2, alpha=0.4, **look)
@@ -228,13 +228,3 @@ def _loop(bands: Bands) -> figure:
     plot.add_tools(HoverTool(renderers=means, line_policy="nearest", tooltips=_tips(bands)))
     _legend(plot, 1)
     return plot
-
-
-def _one_in_each_cell(x: FloatArray, y: FloatArray, cells: int = 200) -> IntArray:
-    """Return one point of each cell of a grid over all points, so that what is seen stays."""
-    finite = np.flatnonzero(np.isfinite(y))
-    row, column = (
-        np.floor(cells * (v - v.min()) / max(float(np.ptp(v)), 1e-300)).astype(np.int64)
-        for v in (x[finite], y[finite])
-    )
-    return finite[np.unique(row * (cells + 1) + column, return_index=True)[1]]

@@ -36,15 +36,15 @@ def pictures(result: Result) -> Pictures:
                 shown[f"{kind}_{name}" if several else kind] = (innovations,)
         shown["corner"] = (result,)
     shown |= {"trace": (result,), "ranks": (result,)}
-    return {name: _picture(name, *what) for name, what in shown.items() if what[0]}
-
-
-def _picture(name: str, *shown: Any) -> Picture:
-    kind, _, record = name.partition("_")
-    _, title, caption, alt = PICTURES[kind]
-    if record:
-        title, alt = f"{title}: {record}", f"{alt} ({record})"
-    return Picture(name, title, caption, partial(draw_kind, kind, *shown), alt)
+    known: Pictures = {}
+    for name, what in shown.items():
+        kind, _, record = name.partition("_")
+        _, title, caption, alt = PICTURES[kind]
+        if record:
+            title, alt = f"{title}: {record}", f"{alt} ({record})"
+        if what[0]:
+            known[name] = Picture(name, title, caption, partial(draw_kind, kind, *what), alt)
+    return known
 
 
 def draw_kind(kind: str, *shown: Any) -> Figure:
@@ -65,7 +65,7 @@ PICTURES = {
         "Displacement against voltage: readings, their mean, and the 95 % bands around it",
     ),
     "loops": (
-        "measured",
+        "fit",
         "Major loop, minor loop and initial curve",
         "The model driven slowly, without dynamics, creep and offset. Left: displacement against "
         "voltage. Right: the same minus the straight line between the major loop's turning "
@@ -73,7 +73,7 @@ PICTURES = {
         "Displacement against voltage of major loop, minor loop and initial curve, with bands",
     ),
     "agreement": (
-        "residuals",
+        "fit",
         "Consistency of the records",
         "What each record's readings are off the joint fit, and off a fit of that record alone. "
         "The chi-square compares where both fits have the shared parameters with how far apart "
@@ -81,7 +81,7 @@ PICTURES = {
         "Residuals of each record in the joint fit and in a fit of its own, against time",
     ),
     "steps": (
-        "measured",
+        "fit",
         "Step responses",
         "Displacement after a voltage step from zero, over the logarithm of time; on the right its "
         "growth from 0.1 s on. The step is ideal, whatever the amplifier did. Bands: 95 %, of the "
@@ -98,7 +98,7 @@ PICTURES = {
         "Voltage, displacement with its 95 % bands, and readings minus mean, against time",
     ),
     "coverage": (
-        "coverage",
+        "fit",
         "Coverage and PIT",
         "Left: measured against nominal coverage of the bands; whiskers are one "
         "block-bootstrap standard error. It does not include that a record has one offset, and a "
@@ -109,7 +109,7 @@ PICTURES = {
         "Measured against nominal coverage of the bands, and a histogram of the readings' PIT",
     ),
     "innovations": (
-        "residuals",
+        "fit",
         "Innovations",
         "One-step prediction errors, standardized: each fitted reading's residual minus what those "
         "before it predict. For a correct model they are independent standard normal, of one size "
@@ -117,7 +117,7 @@ PICTURES = {
         "Autocorrelation, normal quantiles, course in time and size by drive of the innovations",
     ),
     "spectrum": (
-        "residuals",
+        "fit",
         "Spectrum of the residuals",
         "Amplitude spectral density of the residuals, and that of the noise model at the most "
         "probable draw. A peak above it is an oscillation that the noise model does not describe.",

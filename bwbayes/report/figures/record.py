@@ -13,22 +13,42 @@ from matplotlib.figure import Figure
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.record import Record
 from bwbayes.report.figures import style
+from bwbayes.report.report import Picture
 
 
-def record_drawings(
-    record: Record, training: Sequence[slice] = (), findings: Sequence[Finding] = ()
-) -> dict[str, Callable[[], Figure]]:
-    """Return what draws a record's figures, by name: ``time``, ``loop`` and ``drive``.
+def record_pictures(
+    record: Record, training: Sequence[slice], findings: Sequence[Finding], name: str = ""
+) -> dict[str, Picture]:
+    """Return the pictures of a record: ``time``, ``loop``, ``drive``; ``name`` is one of several.
 
     What lies outside of the ``training`` windows is shown in gray; where only a part of the record
     has a finding, the part is marked.
     """
-    drawings: dict[str, Callable[[], Figure]] = {
-        "time": partial(_draw_time, record, training, findings)
+    kinds: dict[str, tuple[str, str, Callable[[], Figure]]] = {
+        "time": (
+            "Along time",
+            "Voltage and displacement. Gray: readings that are not fitted; colored: the parts of "
+            "the record with which something is wrong.",
+            partial(_draw_time, record, training, findings),
+        ),
+        "loop": (
+            "Hysteresis loop",
+            "Displacement against voltage, colored by time.",
+            partial(_draw_loop, record),
+        ),
+        "drive": (
+            "Spectrum of the drive",
+            "Amplitude of the voltage at each frequency.",
+            partial(_draw_drive, record),
+        ),
     }
-    if record.displacement is not None:
-        drawings["loop"] = partial(_draw_loop, record)
-    return drawings | {"drive": partial(_draw_drive, record)}
+    return {
+        kind: Picture(f"{kind}_{name}", f"{title}: {name}", caption, draw)
+        if name
+        else Picture(kind, title, caption, draw)
+        for kind, (title, caption, draw) in kinds.items()
+        if kind != "loop" or record.displacement is not None
+    }
 
 
 def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Finding]) -> Figure:

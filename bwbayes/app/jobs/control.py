@@ -1,12 +1,16 @@
-"""The voltage for a displacement, and its predicted error: ``fit.compensate()``.
+"""A fitted model at work: ``fit.compensate()``, ``fit.export()`` and ``fit.track()``.
 
-Its files are the command as a record, ``command.csv``, which a signal generator can play; the
-numbers, ``compensation.json``; everything along time, ``compensation.csv``; and a page with
-pictures, ``compensation.html``.
+The files of a compensation are the command as a record, ``command.csv``, which a signal generator
+can play; the numbers, ``compensation.json``; everything along time, ``compensation.csv``; and a
+page with pictures, ``compensation.html``. An export writes two: ``model.json`` has the parts, all
+coefficients with units, and the linear part as matrices; ``actuator.c`` is the model and its
+inverse, one sample a call. Of a closed loop the posterior's draws are the actuators, on the virtual
+test stand, and its mean is the model that a controller has.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,17 +22,26 @@ import numpy as np
 from bwbayes.app.jobs.at_work import command_limits
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
+from bwbayes.control.exported import Exported, exported
+from bwbayes.control.gains import Robustness
+from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
+from bwbayes.control.tracking import Tracking
+from bwbayes.control.tracking import track as tracked
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.errors import InputError, suggestion
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.limits import Limits
-from bwbayes.model.linear import parse_hold
+from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.formats import read_reference
+from bwbayes.report.outputs import refuse_existing
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
+
+FILES = ("model.json", "actuator.c")  # of an export
 
 
 def compensate(
@@ -178,3 +191,144 @@ def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> R
             f"reference: {given} is none; give one of {shapes}, a file, or displacements in um"
         )
     return Reference(values, options.get("interval", interval), smoothed=smoothed)
+
+
+def export(
+    fit: Fit,
+    folder: str | Path,
+    *,
+    voltage: tuple[float, float] | None = None,
+    rate: float | None = None,
+    hold: str = "zoh",
+    overwrite: bool = False,
+) -> Exported:
+    """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
+
+    0 um is where the demagnetized actuator stands at zero volts. What is returned has the
+    ``linear`` part as a discrete ``scipy.signal`` system.
+
+    Parameters
+    ----------
+    fit
+        What is built on; of several records the first, as what belongs to a record matters little
+        to a controller.
+    folder
+        Where the files go.
+    voltage
+        Lowest and highest voltage of the inverse, V; default: what was fitted, and 0 V.
+    rate
+        The controller's samples a second; default: the record's.
+    hold
+        Voltage between samples: held, as a DAC does (zoh), or straight lines (foh). The latter is
+        for a model beside a measured voltage; neither need be that of the record.
+    overwrite
+        Replace existing files.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        A hysteresis that has no step of bounded time, options that make no sense, or files that
+        exist or cannot be written.
+    """
+    problem, posterior = fit.problem, fit.problem.posterior
+    dataset, theta = posterior.datasets[0], posterior.prior.theta(fit.flat_draws)
+    theta = dataset.table.actuator(posterior.table.of(theta, dataset.name))
+    actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
+    sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
+    name = problem.config.name or problem.record.origin
+    model = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
+    model = replace(model, standing=fit.standing)
+    numbers, code = (Path(folder) / name for name in FILES)
+    refuse_existing([numbers, code], overwrite=overwrite)
+    try:
+        numbers.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(model.numbers(), indent=2, allow_nan=False)
+        numbers.write_text(f"{text}\n", encoding="utf-8")
+        code.write_text(model.c_code(), encoding="ascii")
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
+    return model
+
+
+def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
+    """Return an actuator at a controller's pace: samples a second up to 10 MHz, with this hold.
+
+    Raises InputError: a rate that is not above zero, or is too high.
+    """
+    if rate is not None and not 0 < rate <= 1e7:
+        raise InputError(f"rate: {rate:g} Hz; give a number above 0 and up to {1e7:g}")
+    interval = actuator.interval if rate is None else 1 / rate
+    return replace(actuator, interval=interval, hold=hold)
+
+
+def track(
+    fit: Fit,
+    *,
+    frequencies: tuple[float, ...] | None = None,
+    amplitude: float | None = None,
+    voltage: tuple[float, float] | None = None,
+    rate: float = 1000.0,
+    delay: int = 1,
+    gain_margin: float = 2.0,
+    phase_margin: float = 60.0,
+    draws: int = 200,
+) -> Tracking:
+    """Say how well a closed loop would follow the paper's signals, with and without the model.
+
+    Parameters
+    ----------
+    fit
+        What is built on; of several records the first.
+    frequencies
+        Frequency of the references, Hz; may be given again; default: 0.1 Hz to where dynamics
+        matter.
+    amplitude
+        Amplitude of the references, um; default: 80 % of the mean model's reach.
+    voltage
+        Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
+    rate
+        Samples a second.
+    delay
+        Whole samples from a reading to the command that answers it.
+    gain_margin
+        Gain margin that all draws keep, a factor.
+    phase_margin
+        Phase margin that all draws keep, degrees.
+    draws
+        Simulated actuators. The margins hold for a thousand draws.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        A model that cannot be stepped or inverted, or options that make no sense.
+    """
+    if not 0 <= delay <= 100:
+        raise InputError(f"delay: {delay} samples; give 0 to 100")
+    if draws < 2:
+        raise InputError(f"draws: {draws} is too few for an uncertainty estimate; use at least 2")
+    problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
+    dataset = posterior.datasets[0]
+    free = thinned(fit.flat_draws, generator(seed, "draws"))
+    theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
+    alone = posterior.alone(dataset.name)
+    parameters = alone.noise_of_new(theta[:draws], generator(seed, "noise"))
+    discrepancy, sensor = dataset.noise.marginal_sd(parameters)
+    memory = dataset.noise.correlation_time(parameters)
+    tracking = tracked(
+        at_rate(dataset.actuator, rate, "zero"),
+        dataset.table.actuator(theta[:draws]),
+        # A white noise has no discrepancy, so that any time will do.
+        LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0)),
+        Stand(command_limits(problem, voltage), delay),
+        generator(seed, "track"),
+        robustness=Robustness(gain_margin, phase_margin),
+        frequencies=frequencies or None,
+        amplitude=amplitude,
+        all_theta=dataset.table.actuator(theta),
+    )
+    name = problem.config.name or problem.record.origin
+    return replace(tracking, standing=fit.standing, name=name)

@@ -1,8 +1,8 @@
-"""Residuals: whether innovations are pure chance, their spectrum, and those of several records."""
+"""A fit in pictures, besides series and draws: coverage, residuals, measured loops and steps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
@@ -12,7 +12,59 @@ from matplotlib.figure import Figure
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.consistency import Agreement
 from bwbayes.diagnosis.innovations import Innovations
+from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.loops import Loops
+from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.steps import CREEP_FROM, StepResponse
 from bwbayes.report.figures import style
+
+BAND = "95 % parameters"
+
+
+def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) -> Figure:
+    """Draw the coverage of the 50, 90 and 95 % bands, and the histogram of the PIT.
+
+    Whiskers are one block-bootstrap standard error either way. Where the sensor's distribution is
+    right the PIT, its probability below each reading, is spread evenly: a hump tells of bands that
+    are too wide, a bowl of bands that are too narrow, a slope of a bias.
+    """
+    scored = [bands for bands in predictions if bands.name in scores]
+    figure, ((nominal, pit),) = style.new_figure(11, 4.2, 1, 2)
+    x = np.arange(len(LEVELS))
+    expected: style.Look = {"color": style.Color.EXPECTED, "lw": 1}
+    nominal.hlines(LEVELS, x - 0.4, x + 0.4, ls="--", label="nominal", **expected)
+    for i, bands in enumerate(scored):
+        color, name = style.COLORS[i % len(style.COLORS)], style.plain(style.title(bands))
+        score, center = scores[bands.name], x + 0.14 * (i - (len(scored) - 1) / 2)
+        # Filled is what a measurement can check, open what only a simulation can.
+        for kind, shift, marker, fill in (
+            ("sensor", -0.03, "o", "full"),
+            ("displacement", 0.03, "s", "none"),
+        ):
+            covered, error = score.coverage[kind], score.coverage_error[kind]
+            if covered is not None:
+                nominal.errorbar(
+                    center + shift,
+                    [100 * covered[level] for level in LEVELS],
+                    [100 * error[level] if error else 0.0 for level in LEVELS],
+                    fmt=marker,
+                    fillstyle=fill,
+                    ms=5,
+                    capsize=3,
+                    color=color,
+                    label=f"{name}: {kind} band",
+                )
+        if bands.pit is not None:
+            judged = bands.pit[bands.scored_from :]
+            heights, edges = np.histogram(judged, 20, range=(0, 1), density=True)
+            pit.stairs(heights, edges, baseline=None, color=color, lw=1.4, label=name)
+    nominal.set_xticks(x, [f"{level} %" for level in LEVELS])
+    nominal.set(xlabel="nominal coverage (%)", ylabel="measured coverage (%)")
+    nominal.legend(loc="lower right")
+    pit.axhline(1.0, **expected)
+    pit.set(xlim=(0, 1), xlabel="PIT: predicted probability below the reading (-)")
+    pit.set(ylim=(0, None), ylabel="density (expected: 1)")
+    return figure
 
 
 def draw_innovations(innovations: Innovations) -> Figure:
@@ -145,4 +197,62 @@ def draw_agreement(agreements: Mapping[str, Agreement]) -> Figure:
         panel.set(title=f"{name}: {verdict} with the others {chance}", ylabel="residual (µm)")
         panel.legend(loc="upper right", markerscale=4)
     panels[-1, 0].set_xlabel("time (s)")
+    return figure
+
+
+def draw_loops(loops: Loops) -> Figure:
+    """Draw displacement against voltage, and on the right less the major loop's straight line.
+
+    On the scale of the whole loop its band is a line's width; less the line it can be seen.
+    """
+    figure, ((whole, tilted),) = style.new_figure(11, 4.8, 1, 2)
+    major, minor = loops.major, loops.minor
+    branches = (
+        ("major loop", 0, "-", major.voltage, major.rising),
+        ("_nolegend_", 0, "-", major.voltage, major.falling),
+        ("minor loop", 1, "-", minor.voltage, minor.rising),
+        ("_nolegend_", 1, "-", minor.voltage, minor.falling),
+        ("initial curve", 2, "--", loops.initial_voltage, loops.initial),
+    )
+    ends = major.falling.mean[0], major.rising.mean[-1]
+    line = np.polyfit(major.voltage[[0, -1]], ends, 1)
+    for panel, subtracted in ((whole, 0 * line), (tilted, line)):
+        for label, color, dashes, voltage, curve in branches:
+            mean, *edges = (
+                values - np.polyval(subtracted, voltage)
+                for values in (curve.mean, curve.lower, curve.upper)
+            )
+            style.draw_band(panel, voltage, mean, edges, label, style.COLORS[color], dashes)
+        panel.set_xlabel("voltage (V)")
+    whole.set(ylabel="displacement (µm)", title="driven slowly, without offset")
+    tilted.set(ylabel="displacement − straight line (µm)")
+    tilted.set(title="less the line between the major loop's turns")
+    style.share_legend(figure, band=BAND)
+    return figure
+
+
+def draw_steps(responses: Mapping[str, StepResponse]) -> Figure:
+    """Draw the displacement since each step, and beside it the creep, if there is any."""
+    creeps = any(response.crept is not None for response in responses.values())
+    figure, (panels,) = style.new_figure(11 if creeps else 6.4, 4.8, 1, 1 + creeps)
+    first = np.inf
+    for number, (name, response) in enumerate(responses.items()):
+        color = style.COLORS[number % len(style.COLORS)]
+        label = style.plain(f"{name}, {response.step.height:g} V")
+        # The rise is drawn from this part of its final value on.
+        started = np.abs(response.response.mean) > 1e-3 * abs(float(response.response.mean[-1]))
+        # Without dynamics there is no rise to be seen.
+        start = CREEP_FROM / 10 if started[0] else float(response.time[int(np.argmax(started))])
+        first = min(first, start)
+        for panel, curve in zip(panels, (response.response, response.crept), strict=False):
+            if curve is not None:
+                edges = curve.lower, curve.upper
+                style.draw_band(panel, response.time, curve.mean, edges, label, color)
+    last = max(response.step.held for response in responses.values())
+    for panel in panels:
+        panel.set(xscale="log", xlabel="time since the step (s)", xlim=(CREEP_FROM, last))
+    panels[0].set(xlim=(first, last), ylabel="displacement (µm)", title="rise")
+    if creeps:
+        panels[1].set(ylabel="growth since 0.1 s (µm)", title="creep")
+    style.share_legend(figure, band=BAND)
     return figure
