@@ -7,7 +7,6 @@ are ``--overwrite`` and ``bwbayes resume results/a --steps 100``.
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -102,34 +101,22 @@ def finish(
     return fit.standing.exit_status
 
 
-# Functions and arguments that are called otherwise there.
-COMMANDS = {"bwbayes.fit": "bwbayes run", "bwbayes.resume": "bwbayes resume"}
-OPTIONS = {"folder": "out"}
+# What is called otherwise there.
+OTHERWISE = {"fit": "run", "folder": "out"}
 
 
 def as_typed(text: str) -> str:
     """Return a text with what is in backticks, arguments and calls, as it is typed in a shell."""
-    return re.sub(r"`([^`]*)`", lambda match: f"`{_typed(match[1])}`", text)
+    arguments = r"\w+=[^\s,]+(?:, \w+=[^\s,]+)*"
+    pattern = rf"`(?:bwbayes\.(?P<call>fit|resume)\((?P<inside>[^`]*)\)|(?P<alone>{arguments}))`"
 
+    def typed(code: re.Match[str]) -> str:
+        call = code["call"]
+        words = [f"bwbayes {OTHERWISE.get(call, call)}"] if call else []
+        for argument in (code["alone"] or code["inside"]).split(", "):
+            name, sign, value = argument.rpartition("=")
+            words += [f"--{OTHERWISE.get(name, name)}".replace("_", "-")] if sign else []
+            words += [value.strip("'\"")] if value != "True" else []
+        return f"`{' '.join(words)}`"
 
-def _typed(code: str) -> str:
-    """Return a call or a keyword argument as a command or an option; all else as it is."""
-    is_call = any(code.startswith(f"{name}(") for name in COMMANDS)
-    try:
-        call = ast.parse(code if is_call else f"_({code})", mode="eval").body
-    except (SyntaxError, ValueError):
-        return code
-    # TOML has blanks about the sign.
-    if not isinstance(call, ast.Call) or not (is_call or (call.keywords and " = " not in code)):
-        return code
-    words = [COMMANDS[ast.unparse(call.func)]] if is_call else []
-    words += [_value(argument) for argument in call.args]
-    for keyword in call.keywords:
-        name = str(keyword.arg)
-        words.append(f"--{OPTIONS.get(name, name).replace('_', '-')}")
-        words += [] if _value(keyword.value) == "True" else [_value(keyword.value)]
-    return " ".join(words)
-
-
-def _value(node: ast.expr) -> str:
-    return str(node.value) if isinstance(node, ast.Constant) else ast.unparse(node)
+    return re.sub(pattern, typed, text)
