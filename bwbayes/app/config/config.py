@@ -11,7 +11,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import tomlkit
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
@@ -143,7 +143,14 @@ def load(path: str | Path) -> Config:
     Raises InputError: the file cannot be read, is not valid TOML, or says something that no config
     can say.
     """
-    path = Path(path)
+    return checked(read_toml(Path(path)), str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises InputError: the file cannot be read, or is not valid TOML.
+    """
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise InputError(f"{path}: is not a regular file; give one")
@@ -153,7 +160,7 @@ def load(path: str | Path) -> Config:
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "is not UTF-8 text"
         raise InputError(f"{path}: {reason}; check the config's path") from None
-    return parse(text, str(path))
+    return _tables(text, str(path))
 
 
 def is_config(path: Path) -> bool:
@@ -180,16 +187,20 @@ def parse(text: str, where: str) -> Config:
     >>> config.model.hysteresis, config.model.dynamics
     ('bouc-wen', 'lag')
     """
+    return checked(_tables(text, where), where)
+
+
+def _tables(text: str, where: str) -> dict[str, Any]:
+    """Return the tables of a text in TOML."""
     try:
         # Python's TOML reader takes time and memory by the square of a key's parts.
         lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
         if any(name.count(".") > 100 for line in lines for name in re.split("[=,{]", line)):
             raise ValueError("a key has too many parts")
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         # Besides its own error, a ValueError for a whole number that is too long for Python.
         raise InputError(f"{where}: invalid TOML: {error}; correct the config") from None
-    return checked(table, where)
 
 
 def checked(table: Mapping[str, object], where: str) -> Config:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tomllib
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, checked, dump, load, parse
+from bwbayes.app.config.config import Config, checked, dump, load, parse, read_toml
 from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
@@ -42,16 +41,11 @@ from bwbayes.report.outputs import save, write_summary
 
 def config_text(path: Path) -> str:
     """Return the config of all records as TOML, every default explicit; it need name no record."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        record = table.setdefault("record", {})
-        bare = isinstance(record, dict) and not {"file", "signal"} & set(record)
-    except (OSError, ValueError, RecursionError):
-        bare = False
-    if bare:
+    table = read_toml(path)
+    record = table.setdefault("record", {})
+    if isinstance(record, dict) and not {"file", "signal"} & set(record):
         record["file"] = "each"
-        return dump(checked(table, str(path)))
-    return dump(load(path))
+    return dump(checked(table, str(path)))
 
 
 def records_in(folder: Path) -> list[Path]:

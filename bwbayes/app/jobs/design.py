@@ -7,7 +7,6 @@ parameter band's width along a drive.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import ValidationError
 
+from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.jobs.at_work import limits_of
@@ -175,23 +175,16 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
 
 def _from_file(path: Path) -> dict[str, Waveform]:
     """Read a table for each signal."""
-    name = ""
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-        if not tables:
-            raise InputError("has no candidate; write a table for each signal")
-        waveforms = {}
-        for name, table in tables.items():
+    waveforms = {}
+    for name, table in read_toml(path).items():
+        try:
             waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
-    except ValidationError as error:
-        raise InputError(one_line(f"{path}: {name}", error, SignalConfig)) from None
-    except InputError as error:
-        raise InputError(": ".join(filter(None, [str(path), name, str(error)]))) from None
-    except OSError as error:
-        reason = f'{error.strerror}; give a file of candidates, or "standard"'
-        raise InputError(f"{path}: {reason}") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: invalid TOML: {error}; correct the file") from None
+        except ValidationError as error:
+            raise InputError(one_line(f"{path}: {name}", error, SignalConfig)) from None
+        except InputError as error:
+            raise InputError(f"{path}: {name}: {error}") from None
+    if not waveforms:
+        raise InputError(f"{path}: has no candidate; write a table for each signal")
     return waveforms
 
 
