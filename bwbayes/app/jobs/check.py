@@ -16,7 +16,6 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.record import Record
 from bwbayes.report.outputs import save
 from bwbayes.report.report import (
     Banner,
@@ -63,10 +62,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     }
     nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
-    about = "; ".join(
-        f"{name}: {_facts(record)}" if several else _facts(record)
-        for name, record in problem.records.items()
-    )
+    facts = problem.facts.items()
+    about = "; ".join(fact for subject, fact in facts if subject.startswith("record"))
     pictures: list[Picture] = []
     for name, record in problem.records.items():
         training, found = problem.posterior.alone(name).only.training, problem.findings[name]
@@ -109,14 +106,3 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     )
     save(report, out, "check", pictures="figures")
     return report
-
-
-def _facts(record: Record) -> str:
-    """Say what a record is."""
-    low, high = record.range_voltage
-    missing = record.samples - record.readings
-    return (
-        f"{record.origin}; {record.samples} samples every {record.interval:g} s; "
-        f"{low:.4g} to {high:.4g} V ({record.voltage_is}); {record.readings} readings"
-        + (f", {missing} missing" if missing else "")
-    )

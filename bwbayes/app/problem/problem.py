@@ -136,8 +136,10 @@ class Problem:
         facts = {}
         for name, record in self.records.items():
             which = "" if len(self.records) == 1 else f" {name}"
+            low, high = record.range_voltage
             facts[f"record{which}"] = (
-                f"{record.origin}: {record.samples} samples every {record.interval:g} s"
+                f"{record.origin}: {record.samples} samples every {record.interval:g} s, "
+                f"{low:.4g} to {high:.4g} V ({record.voltage_is}), {record.readings} readings"
             )
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
