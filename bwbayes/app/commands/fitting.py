@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
-from rich.markup import escape
 
 from bwbayes.app.commands.ending import finish, show_report
 from bwbayes.app.commands.options import (
@@ -198,10 +197,11 @@ def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> 
 
 def _show(proposal: ConfigProposal, conclusion: str) -> None:
     """Show what was said of the record, with what to do."""
-    from bwbayes.report.report import Report, remarks_banner
+    from bwbayes.report.report import Banner, Report, Text, remarks_banner
 
-    show_report(Report(title="remarks", banners=remarks_banner(proposal.remarks)))
-    console = Console(highlight=False, soft_wrap=True)
-    for finding in proposal.findings:
-        console.print(escape(f"{finding.kind}: {finding.text}\n    fix: {finding.fix}"))
-    console.print(escape(conclusion))
+    findings = [
+        Banner("note", finding.kind, [finding.text, f"    fix: {finding.fix}"])
+        for finding in proposal.findings
+    ]
+    banners = [*remarks_banner(proposal.remarks), *findings]
+    show_report(Report(title="", banners=banners, blocks=[Text(conclusion, on="screen")]))

@@ -46,20 +46,16 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     shown = {f"{name}: {issue}" for name, issues in problem.findings.items() for issue in issues}
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
-    explanations: list[str] = []
+    remarks += map(str, identifiability.undetermined(posterior, point))
     for name, alone, theta in posterior.each(free):
         odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))
-        explanations += lines(explained(problem, name, point.optima, thorough=odd))
+        remarks += lines(explained(problem, name, point.optima, thorough=odd))
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)
         for issues in problem.findings.values()
         for finding in issues
     ]
-    lists = {
-        "warning": [*map(str, identifiability.undetermined(posterior, point))],
-        "note": explanations,
-    }
     nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
     facts = problem.facts.items()
@@ -70,6 +66,11 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         drawn = record_pictures(record, training, found, name if several else "")
         pictures += drawn.values()
     name = problem.config.name or problem.record.origin
+    priors = priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True)))
+    meaning = Markup(
+        "The MAP estimate is the most probable set of parameters, without intervals; these take "
+        "sampling: <code>bwbayes run</code>."
+    )
     report = Report(
         title=f"{name}, check",
         heading=f"Check: {name}",
@@ -79,29 +80,11 @@ def check(config: Config, folder: Path, out: Path) -> Report:
             if problems
             else Banner("good", "No issues found", [nothing]),
             *remarks_banner(remarks),
-            *(
-                Banner("note", title, items=lists[label], label=label)
-                for title, label in (("Warnings", "warning"), ("Explanations", "note"))
-                if lists[label]
-            ),
         ],
         blocks=[
             Text(about, on="screen"),
             *pictures,
-            Section(
-                "Priors and MAP estimate",
-                [
-                    priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True))),
-                    Text(
-                        Markup(
-                            "The MAP estimate is the most probable set of parameters, without "
-                            "intervals; these take sampling: <code>bwbayes run</code>."
-                        ),
-                        note=True,
-                    ),
-                ],
-                folded=False,
-            ),
+            Section("Priors and MAP estimate", [priors, Text(meaning, note=True)], folded=False),
         ],
     )
     save(report, out, "check", pictures="figures")
