@@ -235,17 +235,10 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
 
 def _about(result: Result) -> str:
     """Return what was fitted to what, in a line."""
-    facts = result.facts
-    texts = [
-        f"{subject.capitalize()}: {fact}"
-        for subject, fact in facts.items()
-        if subject.partition(" ")[0] == "record"
-    ]
-    texts += [f"fitted {facts['fitted']}"] if "fitted" in facts else []
+    shown = ("record", "fitted", "model", "noise")
+    facts = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
     held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
-    texts += [f"predicted {', '.join(held_out)}"] if held_out else []
-    texts += [f"{subject} {facts[subject]}" for subject in ("model", "noise") if subject in facts]
-    return "; ".join(texts)
+    return "; ".join([*facts, *[f"predicted: {', '.join(held_out)}"] * bool(held_out)])
 
 
 def _span(bands: Bands) -> str:
