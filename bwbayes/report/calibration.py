@@ -11,7 +11,7 @@ from bwbayes.calibration.evaluation import FAMILY_LEVEL, JUDGED_FROM, Calibratio
 from bwbayes.calibration.replicates import RANKED
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
-from bwbayes.report.words import symbol, unit_text
+from bwbayes.report.words import circumstances, symbol, unit_text
 
 # What is ranked besides parameters: its name, and its unit.
 EXTRA_WORDS = {
@@ -24,6 +24,7 @@ EXTRA_WORDS = {
 def calibration_report(calibration: Calibration) -> Report:
     """Return what a calibration says: whether it has passed, the tests, and what was run."""
     bands = _bands(calibration)
+    facts = [*calibration.facts, *circumstances(calibration.provenance)]
     free = [
         {"name": p.name, "symbol": symbol(p), "prior": p.prior, "unit": unit_text(p.unit)}
         for p in calibration.parameters
@@ -42,7 +43,7 @@ def calibration_report(calibration: Calibration) -> Report:
             Section("Pictures", _pictures(calibration), folded=False),
             Section("Tests", _tests(calibration), folded=False),
             Section("Priors", [Table.of("priors", "Priors", free, columns)]),
-            Section("Settings", [Facts(calibration.facts)]),
+            Section("Settings", [Facts(facts)]),
         ],
         numbers=calibration.numbers,
     )

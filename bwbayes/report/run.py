@@ -31,7 +31,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.result import Result
 from bwbayes.report.tables import priors_table
-from bwbayes.report.words import covered, error_text, length_text, mark
+from bwbayes.report.words import circumstances, covered, error_text, length_text, mark
 
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
@@ -230,7 +230,7 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
         chains = [pictures[name] for name in ("trace", "ranks")]
         yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
     yield Section("Moves", [tables.moves_table(result)])
-    yield Section("Run details", [Facts([*result.facts.items(), *_circumstances(numbers)])])
+    yield Section("Run details", [Facts([*result.facts.items(), *circumstances(numbers)])])
 
 
 def _about(result: Result) -> str:
@@ -244,18 +244,6 @@ def _about(result: Result) -> str:
 def _span(bands: Bands) -> str:
     windows = [bands.time[window] for window in bands.windows]
     return ", ".join(f"{time[0]:g} to {time[-1]:g}" for time in windows) + " s"
-
-
-def _circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield what the summary knows of the run besides its results."""
-    if "seed" in numbers:
-        yield "seed", str(numbers["seed"])
-    if isinstance(wall := numbers.get("wall_s"), int | float):
-        yield "wall time", f"{wall:.0f} s"
-    if "data_sha256" in numbers:
-        yield "data, SHA-256", str(numbers["data_sha256"])
-    if isinstance(versions := numbers.get("versions"), Mapping):
-        yield "versions", ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
 SCORE_TERMS = {

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from markupsafe import Markup
 
@@ -96,3 +97,15 @@ def error_text(scores: Scores) -> str:
     if full is None or abs(full - scores.nrmse) <= 0.05 * scores.nrmse:
         return text
     return f"{text} ({100 * full:.2f}% of the training range)"
+
+
+def circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what the summary knows of the run besides its results."""
+    if "seed" in numbers:
+        yield "seed", str(numbers["seed"])
+    if isinstance(wall := numbers.get("wall_s"), int | float):
+        yield "wall time", f"{wall:.0f} s"
+    if "data_sha256" in numbers:
+        yield "data, SHA-256", str(numbers["data_sha256"])
+    if isinstance(versions := numbers.get("versions"), Mapping):
+        yield "versions", ", ".join(f"{name} {version}" for name, version in versions.items())

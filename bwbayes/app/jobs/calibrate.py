@@ -136,7 +136,6 @@ def resume(
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         plan, packages = problem.plan, versions(problem.posterior.engine)
-        provenance = {"seed": seed, "data_sha256": problem.sha256, "versions": packages}
         calibration = replace(
             judge(ordered, generator(seed, "ranks")),
             name=problem.config.name or "calibration",
@@ -149,11 +148,8 @@ def resume(
                     f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
                     f"at most {plan.most_steps} steps",
                 ),
-                ("seed", str(seed)),
-                ("data, SHA-256", problem.sha256),
-                ("versions", ", ".join(f"{name} {text}" for name, text in packages.items())),
             ],
-            provenance=provenance,
+            provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
         )
         # Nothing in its files depends on when or how it was computed.
         save(calibration_report(calibration), folder.path, "calibration", pictures="figures")
