@@ -385,7 +385,7 @@ def converged(path: Path) -> Fit:
 
     Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
     """
-    folder = RunFolder.open(path)
-    fit = finished(folder)
+    fit = finished(RunFolder.open(path))
     fit.require_converged()
-    return fit.knowing(standing=folder.standing())
+    fit.folder.require_finished()
+    return fit

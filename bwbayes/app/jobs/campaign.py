@@ -9,7 +9,6 @@ with how many workers a campaign is done, and records that come later are fitted
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import warnings
@@ -156,8 +155,7 @@ def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
     """Return the row of a record."""
     if refusal:
         return Row(file.stem, file.name, "refused", refusal, {})
-    path = folder.run(file.stem)
-    numbers = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    numbers = RunFolder(folder.run(file.stem)).numbers()
     if not numbers["converged"]:
         reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
         return Row(file.stem, file.name, "not converged", reason, numbers)

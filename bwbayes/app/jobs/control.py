@@ -10,7 +10,6 @@ test stand, and its mean is the model that a controller has.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -36,7 +35,7 @@ from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.formats import read_reference
-from bwbayes.report.outputs import refuse_existing
+from bwbayes.report.outputs import refuse_existing, write_summary
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.fitted import Fit
@@ -244,8 +243,7 @@ def export(
     refuse_existing([numbers, code], overwrite=overwrite)
     try:
         numbers.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(model.numbers(), indent=2, allow_nan=False)
-        numbers.write_text(f"{text}\n", encoding="utf-8")
+        write_summary(numbers, model.numbers())
         code.write_text(model.c_code(), encoding="ascii")
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; choose another folder") from None

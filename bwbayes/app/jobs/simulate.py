@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -13,7 +12,7 @@ from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform
 from bwbayes.record.waveforms import signal as named
-from bwbayes.report.outputs import refuse_existing
+from bwbayes.report.outputs import refuse_existing, write_summary
 
 
 def simulate(
@@ -74,7 +73,7 @@ def simulate(
     record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
     write_record(record, out)
     try:
-        parameters.write_text(json.dumps(stand.parameters(), indent=2) + "\n", encoding="utf-8")
+        write_summary(parameters, stand.parameters())
     except OSError as error:
         raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
     return [out, *([truth_file] if truth_file.exists() else []), parameters]
