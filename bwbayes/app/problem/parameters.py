@@ -32,7 +32,6 @@ from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, made
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Waveform
 
 
 def parameters_of(
@@ -266,12 +265,6 @@ def in_words(model: ModelConfig) -> str:
     if model.creep:
         parts.append("creep that grows with the voltage" if model.creep_growth else "creep")
     return f"{', '.join(parts)}, dynamics {model.dynamics}, {model.hold} hold"
-
-
-def planned(waveform: Waveform, rate: float, stop: float | None) -> Record:
-    """Return the part of a signal's command, up to ``stop`` in s, that a training record has."""
-    record = Record(waveform.sample(rate)[1], None, 1 / rate, voltage_is="command")
-    return record if stop is None else record.upto(stop)
 
 
 def stand_of(config: Config, training: Sequence[Record]) -> VirtualTestStand:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationConfig
-from bwbayes.app.problem.parameters import place_of, planned, stand_of
+from bwbayes.app.problem.parameters import place_of, stand_of
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError
@@ -74,7 +74,9 @@ def training_records(
         else:
             signals[name] = source.signal
             rate = config.stand.sample_rate
-            records[name] = planned(sampled_waveform(source.signal), rate, source.stop)
+            command = sampled_waveform(source.signal).sample(rate)[1]
+            planned = Record(command, None, 1 / rate, voltage_is="command")
+            records[name] = planned if source.stop is None else planned.upto(source.stop)
     stand = None
     if signals:
         stand = stand_of(config, list(records.values()))
