@@ -25,7 +25,7 @@ from bwbayes.report.report import (
     kind_of,
     standing_banner,
 )
-from bwbayes.report.words import mark
+from bwbayes.report.words import mark, with_error
 
 # The columns of the models' table: title, text with the numbers of a model, and where it is shown.
 COLUMNS: tuple[tuple[str, str, Target], ...] = (
@@ -149,8 +149,7 @@ class Comparison(Product):
             title="Comparison of models",
             heading="Which model",
             banners=[
-                # The screen has it among what speaks against the recommendation.
-                *standing_banner(self.standing, on="page"),
+                *standing_banner(self.standing),
                 Banner(kind_of(self.standing) if self.recommended else "bad", first, others),
                 *[Banner("note", "Caveats", items=self.caveats, label="caveat")]
                 * bool(self.caveats),
@@ -212,7 +211,8 @@ class Comparison(Product):
     def _difference_texts(
         self, model: Candidate, best: Candidate, parts: tuple[str, ...]
     ) -> list[str]:
-        texts = ["{value:+.3g} ± {error:.2g}".format_map(vars(self.differences[model.name]))]
+        apart = self.differences[model.name]
+        texts = [f"{'+' * (apart.value > 0)}{with_error(apart.value, apart.error)}"]
         for name in parts:
             gain = model.log_score([name]) - best.log_score([name]) if name in model.parts else None
             text = "{gain:+.3g}" if name in self.voting else "({gain:+.3g})"

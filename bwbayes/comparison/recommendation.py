@@ -19,6 +19,7 @@ import scipy
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison, Difference
+from bwbayes.report.words import with_error
 
 # Independent readings that a part must be worth to have a vote: as many blocks tell its error.
 MIN_WORTH = 5
@@ -160,7 +161,7 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
         which = f"{worse[0]} " if len(worse) > 1 else ""
         yield (
             f"by the {comparison.measure} {_listed(worse)} {'is' if len(worse) == 1 else 'are'} "
-            f"worse, {which}by {-nearest.value:.3g} ± {nearest.error:.2g} nats"
+            f"worse, {which}by {with_error(-nearest.value, nearest.error)} nats"
         )
     others = [n for n in comparison.differences if n not in (*worse, recommended.name, *tied)]
     if others:
@@ -183,9 +184,8 @@ def _list_caveats(comparison: Comparison) -> Iterator[str]:
         behind = comparison.differences[recommended.name]
         yield (
             f"{comparison.best} has the best {comparison.measure}, "
-            f"by {-behind.value:.2g} ± {behind.error:.2g} nats"
+            f"by {with_error(-behind.value, behind.error)} nats"
         )
-    yield from comparison.standing.said
     if not comparison.voting:
         yield "the evidence decides alone, which takes priors and noise at their word"
         return

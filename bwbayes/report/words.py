@@ -71,6 +71,11 @@ def digits(value: float, sd: float) -> str:
     return f"{round(value, -exponent) + 0.0:.{max(-exponent, 0)}f}"
 
 
+def with_error(value: float, sd: float) -> str:
+    """Write a value and its standard error, both as exactly as that is known."""
+    return f"{digits(value, sd)} ± {digits(sd, sd)}"
+
+
 def length_text(um: float) -> str:
     """Write a length or an error, um, with three digits: of nanometers there are as many."""
     return f"{digits(um, abs(um) / 10)} µm"

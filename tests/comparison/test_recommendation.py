@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
+from bwbayes.diagnosis.standing import Standing
+from bwbayes.report.screen import as_text
 
 
 def noise(seed: int, size: int = 10) -> FloatArray:
@@ -137,3 +140,18 @@ def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
     comparison = recommend([lost])
     assert comparison.recommended is None
     assert "not converged" in str(comparison)
+
+
+@pytest.mark.parametrize(("holds", "status"), [(False, "VALIDATION FAILED"), (None, "Validation")])
+def test_what_does_not_hold_is_said_before_what_is_recommended(
+    holds: bool | None, status: str
+) -> None:
+    standing = Standing(holds, ("next: the bands cover 55 %",))
+    wide = replace(model("wide", COMMON - 700 + 60 * noise(2)), standing=Standing())
+    comparison = recommend([replace(model("good", COMMON), standing=standing), wide])
+    first, second, *_ = as_text(comparison.report()).splitlines()
+    assert re.match(rf"{status}.*: next: the bands cover 55 %", first)
+    # No more digits than are known, and no powers of ten.
+    assert re.match(
+        r"good is recommended: by the log score wide is worse, by \d+0 ± \d+0 nats", second
+    )
