@@ -6,7 +6,7 @@ The numbers are those of :func:`~bwbayes.comparison.design.promises`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar, overload
 
@@ -140,7 +140,8 @@ class Design(Product, Sequence[Promise]):
 
     def report(self) -> Report:
         """Return which signal teaches most, by how much, and what it looks like, to be shown."""
-        from bwbayes.report.figures.control import draw_promises, draw_signal  # noqa: PLC0415
+        from bwbayes.report.figures.control import draw_promises  # noqa: PLC0415
+        from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415
 
         best, amplifier = self.best, self.amplifier
         feasible = [promise for promise in self.promises if not promise.refused]
@@ -157,7 +158,8 @@ class Design(Product, Sequence[Promise]):
             ("Amplifier", "{:.4g} to {:.4g} V".format(*limits) + rate),
             ("Sampling interval", f"{self.interval:g} s"),
         ]
-        signal = self.signals[best.name]
+        signal = record_pictures(self.records()["best"], (), ())["time"]
+        shown = "Its voltage, as best.csv has it for the signal generator."
         return Report(
             title="What to measure next",
             banners=[
@@ -177,13 +179,7 @@ class Design(Product, Sequence[Promise]):
                     "Carlo errors to either side; at 100 % a signal teaches nothing new.",
                     partial(draw_promises, names, remaining, error, self.left),
                 ),
-                Picture(
-                    "best",
-                    "The best signal",
-                    "Its voltage, as best.csv has it for the signal generator; dotted, the "
-                    "amplifier's limits.",
-                    partial(draw_signal, best.name, signal, self.interval, limits),
-                ),
+                replace(signal, name="best", title=f"The best signal: {best.name}", caption=shown),
                 Section("Request", [Facts(facts)], folded=False),
             ],
             numbers=self.numbers(),

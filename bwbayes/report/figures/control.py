@@ -140,16 +140,3 @@ def draw_promises(
     panel.invert_yaxis()
     panel.set(xlim=(0, 104), xlabel=style.plain(f"{label} (%)"))
     return figure
-
-
-def draw_signal(
-    name: str, voltage: FloatArray, interval: float, limits: tuple[float, float]
-) -> Figure:
-    """Draw a voltage (samples,), V, every ``interval`` s, between the amplifier's limits."""
-    figure, ((panel,),) = style.new_figure(7, 2.8)
-    time = interval * np.arange(voltage.size, dtype=np.float64)
-    panel.plot(*style.zigzag(time, voltage), color=style.Color.MEAN)
-    for limit in limits:
-        panel.axhline(limit, color="#222222", lw=1, ls=":")
-    panel.set(title=style.plain(name), xlabel="time (s)", ylabel="voltage (V)")
-    return figure
