@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import (
     Prediction,
     predict_after,
     predict_another,
-    training_record,
 )
 from bwbayes.diagnosis.standing import Standing
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, suggestion
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
@@ -86,7 +86,11 @@ def predict(
         raise InputError(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
-    problem, of = fit.problem, training_record(fit.problem, of)
+    problem = fit.problem
+    of = of or next(iter(problem.records))
+    if of not in problem.records:
+        hint = suggestion(of, problem.records)
+        raise InputError(f"predict: no training record {of!r}; {hint}")
     if signal is not None:
         name, interval = name or signal, problem.records[of].interval
         voltage = named_signal(signal).sample(1 / interval)[1]
@@ -104,7 +108,8 @@ def predict(
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
     start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
-    return predict_another(problem, fit.flat_draws, record, start, name or "prediction", window, of)
+    other = Validation((), record, start, window, of)
+    return predict_another(problem, fit.flat_draws, other, name or "prediction")
 
 
 def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from bwbayes.app.problem.records import generator
+from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
@@ -195,8 +195,9 @@ class Campaign(Product):
             record = read_record(record, need_displacement=False)
         source = generator(problem.config.seed, "next specimen")
         draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
-        start = Start(from_rest, True, lead_in)
-        return predict_another(problem, draws, record, start, "next specimen")
+        start, like = Start(from_rest, True, lead_in), next(iter(problem.records))
+        other = Validation((), record, start, of=like)
+        return predict_another(problem, draws, other, "next specimen")
 
     def plot(self) -> Figure:
         """Draw each parameter's intervals side by side, with the population.

@@ -14,20 +14,18 @@ from typing import Any
 import numpy as np
 
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.problem.records import generator
+from bwbayes.app.problem.records import Validation, generator
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.diagnosis.validation import Background, Verdict, assess
-from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.untried import with_creep
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import forecast, predict_record, predict_windows, thinned
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
@@ -122,30 +120,20 @@ class Prediction(Shown, Bands):
         )
 
 
-def predict_another(
-    problem: Problem,
-    flat: FloatArray,
-    record: Record,
-    start: Start,
-    name: str,
-    window: tuple[float, float] | None = None,
-    of: str | None = None,
-) -> Prediction:
+def predict_another(problem: Problem, flat: FloatArray, other: Validation, name: str) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
     ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
-    which a thousand are used. Of the record, at any sampling interval, ``start`` is what is known
-    of its start, ``window`` the start and stop in s of the part that is predicted and judged, if
-    not all of it, and ``of`` the training record whose own parameters it takes where nothing tells
-    its own, by default the first. ``name`` is that of the bands.
+    which a thousand are used. The ``other`` record may have any sampling interval; ``name`` is that
+    of the bands.
 
     Raises InputError: a lead-in or window that does not fit into the record.
     """
-    posterior, seed = problem.posterior, problem.config.seed
-    beyond = beyond_training(posterior, record.voltage, record.interval)
-    chosen = thinned(flat, generator(seed, "draws"))
-    of = training_record(problem, of)
-    bands = _of_another(problem, chosen, of, beyond, record, start, name, window)
+    assert other.record is not None
+    posterior = problem.posterior
+    beyond = beyond_training(posterior, other.record.voltage, other.record.interval)
+    chosen = thinned(flat, generator(problem.config.seed, "draws"))
+    bands = _of_another(problem, chosen, other, name, beyond)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
@@ -154,16 +142,14 @@ def predict_another(
 
 
 def predict_after(
-    problem: Problem, flat: FloatArray, voltage: FloatArray, name: str, of: str | None = None
+    problem: Problem, flat: FloatArray, voltage: FloatArray, name: str, of: str
 ) -> Prediction:
     """Predict what follows on a training record whose last sample goes on into a planned voltage.
 
-    ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name, by default the
-    first. All else is as in :func:`predict_another`; see
-    :func:`~bwbayes.prediction.prediction.forecast`.
+    ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name. All else is as
+    in :func:`predict_another`; see :func:`~bwbayes.prediction.prediction.forecast`.
     """
-    seed, of = problem.config.seed, training_record(problem, of)
-    record = problem.records[of]
+    seed, record = problem.config.seed, problem.records[of]
     joined = np.concatenate([record.voltage, voltage])
     after = slice(record.samples, None)
     beyond = beyond_training(problem.posterior, joined, record.interval, after)
@@ -173,17 +159,6 @@ def predict_after(
     alone, own_draws = _reaching(problem, chosen, of, longer, beyond)
     bands = forecast(alone, own_draws, record, voltage, source, name)
     return Prediction(**vars(bands), remarks=tuple(finding.note for finding in beyond))
-
-
-def training_record(problem: Problem, name: str | None) -> str:
-    """Return the name of a training record, by default of the first.
-
-    Raises InputError: no training record is called so.
-    """
-    if name is not None and name not in problem.records:
-        hint = suggestion(name, list(problem.records))
-        raise InputError(f"predict: no training record {name!r}; {hint}")
-    return name or next(iter(problem.records))
 
 
 def predictions(
@@ -217,27 +192,25 @@ def predictions(
             bands += predict_windows(alone, own_draws, record, windows, source, more)
     for name, held_out in problem.validations.items():
         if held_out.record is not None:
-            other = held_out.record, held_out.start, name, held_out.judged
             beyond = problem.extrapolations(name)
-            bands.append(_of_another(problem, chosen, held_out.of, beyond, *other, more))
+            bands.append(_of_another(problem, chosen, held_out, name, beyond, more))
     return tuple(bands)
 
 
 def _of_another(
     problem: Problem,
     draws: FloatArray,
-    of: str,
-    beyond: Iterable[Finding],
-    record: Record,
-    start: Start,
+    other: Validation,
     name: str,
-    window: tuple[float, float] | None,
+    beyond: Iterable[Finding],
     more: Callable[[int], None] = lambda _: None,
 ) -> Bands:
     """Return the bands of a record that was not fitted, from the draws of one that was."""
-    alone, own_draws = _reaching(problem, draws, of, record, beyond)
+    record = other.record
+    assert record is not None
+    alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
     source = generator(problem.config.seed, f"predict {record.sha256}")
-    return predict_record(alone, own_draws, record, start, source, name, window, more)
+    return predict_record(alone, own_draws, record, other.start, source, name, other.judged, more)
 
 
 def _reaching(
