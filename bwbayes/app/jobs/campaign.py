@@ -101,8 +101,7 @@ def resume(
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        origin, config = folder.origin(), folder.config.read_text(encoding="utf-8")
-        files = records_in(Path(origin.records))
+        files = records_in(Path(folder.origin().records))
         stems = Counter(file.stem.lower() for file in files)
         refused = {
             file.name: f"{file}: shares its name with another record; rename one of them"
@@ -110,11 +109,8 @@ def resume(
             if stems[file.stem.lower()] > 1
         }
         fitted = [file for file in files if file.name not in refused]
-        tasks = [
-            (file, config, Path(origin.where), folder.run(file.stem).absolute(), origin.pictures)
-            for file in fitted
-            if not folder.is_done(file)
-        ]
+        anywhere = CampaignFolder(folder.path.absolute())
+        tasks = [(file, anywhere) for file in fitted if not folder.is_done(file)]
         folder.summary.unlink(missing_ok=True)
         outcome: Ended
         for outcome in batch(
@@ -176,22 +172,22 @@ class Ended(NamedTuple):
     refused: bool = False
 
 
-def fit_record(file: Path, config: str, where: Path, run: Path, pictures: bool) -> Ended:
-    """Fit a record to its end in the folder ``run``, from wherever that stands.
+def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
+    """Fit a record of a campaign to its end, from wherever its run stands.
 
-    A run of an earlier form of the record or config is replaced. ``config`` is that of all records
-    in TOML, its files relative to the folder ``where``; empty for one that is proposed from the
-    record. Figures, report and bands are written with ``pictures`` alone.
+    A run of an earlier form of the record or config is replaced. Figures, report and bands are
+    written if the campaign has pictures.
     """
+    origin, run = campaign.origin(), campaign.run(file.stem)
     with warnings.catch_warnings():
         # They are the run's remarks, and a hundred records of one kind say the same.
         warnings.simplefilter("ignore", InputWarning)
         try:
             record = digest(file)
-            problem = resolve(_config_of(file, config, where), where)
+            problem = resolve(_config_of(file, campaign), Path(origin.where))
             folder = _run_folder(run, problem)
-            fit = resume_run(folder, Console(quiet=True), workers=1, files=pictures)
-            if not pictures:
+            fit = resume_run(folder, Console(quiet=True), workers=1, files=origin.pictures)
+            if not origin.pictures:
                 write_summary(folder.summary, fit.numbers)
             if fit.converged:
                 source = generator(fit.problem.config.seed, "specimen")
@@ -207,12 +203,12 @@ def fit_record(file: Path, config: str, where: Path, run: Path, pictures: bool) 
             return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
 
 
-def _config_of(file: Path, text: str, where: Path) -> Config:
+def _config_of(file: Path, campaign: CampaignFolder) -> Config:
     """Return the config of a record."""
-    if text:
+    if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = propose(file, where)
+        proposal = propose(file, Path(campaign.origin().where))
         if proposal.pointless is not None:
             raise InputError(f"{file}: {proposal.pointless.error}")
         config = proposal.config
