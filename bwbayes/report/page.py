@@ -10,7 +10,6 @@ import re
 import struct
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from itertools import groupby
 from operator import attrgetter
@@ -23,18 +22,6 @@ from markupsafe import Markup, escape
 from bwbayes.report.report import Report, Table
 
 
-@dataclass(frozen=True)
-class Script:
-    """A script of the page, and the digest by which the page allows it and no other."""
-
-    text: Markup
-
-    @property
-    def digest(self) -> str:
-        """The SHA-256, as a Content-Security-Policy names it."""
-        return "sha256-" + b64encode(sha256(self.text.encode()).digest()).decode("ascii")
-
-
 class PagePlots(NamedTuple):
     """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
 
@@ -42,7 +29,7 @@ class PagePlots(NamedTuple):
     """
 
     drawn: Mapping[str, Markup]
-    scripts: Sequence[Script]
+    scripts: Sequence[Markup]
 
 
 NO_PLOTS = PagePlots({}, ())
@@ -81,6 +68,8 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
     environment.globals |= {"pictures": pictures, "plots": plots.drawn}
     filters: dict[str, Callable[..., Any]] = {
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
+        # What a Content-Security-Policy calls a script that it allows.
+        "digest": lambda script: "sha256-" + b64encode(sha256(script.encode()).digest()).decode(),
         # A picture's width and height, if it is a whole one.
         "pixels": lambda png: struct.unpack(">2I", png[16:24]) if len(png) > 24 else None,
         "csv_link": csv_link,

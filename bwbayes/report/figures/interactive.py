@@ -26,17 +26,16 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.figures import style
 from bwbayes.report.figures.series import LOOP_KINDS, path, polygons
-from bwbayes.report.page import Script
 from bwbayes.report.result import Result
 
 FONT_SIZE = "13px"
 
 
-def scripts() -> list[Script]:
+def scripts() -> list[Markup]:
     """Return what draws the plots: Bokeh, and the lines that hand it what is in the page."""
     script = files("bwbayes.report").joinpath("templates/plots.js").read_text(encoding="utf-8")
     core = INLINE.js_raw[0]  # without widgets, tables and mathematics
-    return [Script(Markup(text)) for text in (core, script)]
+    return [Markup(text) for text in (core, script)]
 
 
 def draw(result: Result) -> dict[str, Markup]:
