@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from bwbayes.app.config.config import Config, dump, load, parse
+from bwbayes.app.config.config import Config, dump, is_config, load, parse
 from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.errors import InputError
@@ -62,7 +64,7 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
         ("", "record: is missing"),
         (
             '[record]\nfile = "a.csv"\nsignal = "identification"\n',
-            "record: give either file or signal; correct the config",
+            "record: give either file or signal; correct it",
         ),
         (
             RECORD + "[validation.a]\nfile = 'a.csv'\nsignal = 'step10'",
@@ -128,7 +130,7 @@ def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
     said = refused(text)
     assert said.startswith(f"{path}")
     assert re.match(r"[:.]", said.removeprefix(path))
-    assert said.endswith("; correct the config")
+    assert said.endswith("; correct it")
 
 
 @pytest.mark.parametrize(
@@ -156,6 +158,28 @@ def test_number_that_is_not_finite_is_refused(text: str) -> None:
 )
 def test_text_that_is_no_toml_is_refused(text: str) -> None:
     assert refused(text).startswith("invalid TOML")
+
+
+@given(
+    above=st.lists(
+        st.sampled_from(
+            ["[s];[V];[um]", "record 17", "[data]", "t;u;x", "# a", "", "[ms] [V] [um]"]
+        ),
+        max_size=8,
+    ),
+    row=st.sampled_from(
+        ["0.1;2.5;3", "-1e-3\t4,5\t6", " 1.5D+00  2  3", '"1";"2";"3"', "2026-03-03T11:59;1;2;good"]
+    ),
+    suffix=st.sampled_from(["csv", "txt", "toml", ""]),
+)
+def test_a_record_is_no_config_whatever_is_above_its_numbers(
+    tmp_path_factory: pytest.TempPathFactory, above: list[str], row: str, suffix: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"a.{suffix}"
+    path.write_text("\n".join([*above, *20 * [row]]))
+    assert not is_config(path)
+    path.write_text(RECORD + "# 1\n\n[model]\nexponent = 2\n")
+    assert is_config(path)
 
 
 def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:

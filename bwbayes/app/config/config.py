@@ -171,11 +171,11 @@ def is_config(path: Path) -> bool:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError):
         return path.suffix == ".toml"
-    if path.suffix == ".toml":
-        # A record may be called so by mistake: it is mostly rows of numbers.
-        rows = re.findall(r"^[-+\d.,;\s]*\d[-+\d.,;eE \t]*$", text, re.MULTILINE)
-        return 2 * len(rows) <= len(text.splitlines())
-    return re.search(r"^\s*(\[+[a-z]|record\b)", text, re.MULTILINE) is not None
+    # A record, which may be called .toml by mistake and have a line [s];[V];[um], is mostly rows
+    # that begin with a number.
+    rows = re.findall(r"^[ \t,;|\"']*[-+.]?\d", text, re.MULTILINE)
+    has_table = re.search(r"^\s*(\[+[a-z]|record\b)", text, re.MULTILINE) is not None
+    return 2 * len(rows) <= len(text.splitlines()) and (path.suffix == ".toml" or has_table)
 
 
 def parse(text: str, where: str) -> Config:

@@ -177,7 +177,7 @@ def one_line(where: str, error: ValidationError, root: type[BaseModel]) -> str:
         got = "" if isinstance(first["input"], dict) else f", got {first['input']!r:.60}"
     except ValueError:  # Python writes no whole number of more than 4300 digits
         got = ", got a very long number"
-    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct the config"
+    return f"{where}: {path}: {message[:1].lower()}{message[1:]}{got}; correct it"
 
 
 def _names_in(path: Sequence[str], root: type[BaseModel]) -> list[str]:
