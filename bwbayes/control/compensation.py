@@ -76,8 +76,11 @@ class _Plan:
         size = max(500_000 // voltage.size, 1)
         for start in range(0, len(states.model), size):
             rows = slice(start, start + size)
-            names = ("which", "model", "unrest", "offset_sd")
-            subset = replace(states, **{name: getattr(states, name)[rows] for name in names})
+            histories = replace(states.histories, which=states.histories.which[rows])
+            fields = {
+                name: getattr(states, name)[rows] for name in ("model", "unrest", "offset_sd")
+            }
+            subset = replace(states, histories=histories, **fields)
             yield rows, subset.displacement(voltage)
 
     def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
@@ -174,7 +177,8 @@ def compensate(
     slope, _ = np.polyfit(record.voltage[record.readings.rows], record.readings.values, 1)
     linear = np.clip(requested / slope, limits.low, limits.high)
     states = plan.initial_states(linear)
-    actuator, model = states.actuators[-1], states.model.mean(axis=0)
+    actuator = states.histories.likelihoods[-1].actuator
+    model = states.model.mean(axis=0)
     # The mean model's own place at zero volts, where all begin, is not the mean of the places.
     at_zero = actuator.displacement(model, [0.0], from_rest=from_rest)[0, 0]
     model[actuator.parameters.index("offset")] -= at_zero

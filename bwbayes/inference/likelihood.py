@@ -9,7 +9,7 @@ of the record's own. Given the other parameters all of these are jointly normal,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -213,14 +213,34 @@ class Likelihood:
         ``model`` is (models, parameters of the actuator); ``unrest`` (models, unknowns), um, is how
         far dynamics and creep are from rest at the first sample.
         """
+        return self.walk(model, voltage, unrest)(voltage.size)
+
+    def walk(
+        self, model: FloatArray, voltage: FloatArray, unrest: FloatArray | None = None
+    ) -> Callable[[int], FloatArray]:
+        """Put models to a voltage's first sample; what is returned walks them on to a sample.
+
+        Called with growing numbers of samples, it returns the displacement (models, samples), um,
+        from where they are. The others are as in :meth:`simulate`.
+        """
         if self.engine == "numba":
             # Here, because it is slow to load.
             from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
 
-            state = walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
-            if state is not None:
-                return state.to(voltage.size)
-        return self.actuator.advance(model, voltage, None, unrest, from_rest=self.from_rest)[0]
+            compiled = walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
+            if compiled is not None:
+                return compiled.to
+        state, now = None, 0
+
+        def onwards(last: int) -> FloatArray:
+            nonlocal state, now
+            piece, now = voltage[now:last], last
+            moved, state = self.actuator.advance(
+                model, piece, state, unrest, from_rest=self.from_rest
+            )
+            return moved
+
+        return onwards
 
     def _products(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return Σ zᵢ zⱼ (models, series, series) of whitened residual and responses.

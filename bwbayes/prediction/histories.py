@@ -34,17 +34,19 @@ class Histories:
     likelihoods: tuple[Likelihood, ...]
     which: IntArray
 
+    @property
+    def groups(self) -> list[tuple[Likelihood, IntArray]]:
+        """The histories that any draw has, and those draws."""
+        rows = (np.flatnonzero(self.which == number) for number in range(len(self.likelihoods)))
+        pairs = zip(self.likelihoods, rows, strict=True)
+        return [(likelihood, draws) for likelihood, draws in pairs if draws.size]
+
     def each(
         self, theta: FloatArray, ask: Callable[[Likelihood, FloatArray], tuple[FloatArray, ...]]
     ) -> tuple[FloatArray, ...]:
         """Ask every draw's own likelihood about it; return answers (draws, ...)."""
-        groups = [np.flatnonzero(self.which == k) for k in range(len(self.likelihoods))]
-        answers = [
-            ask(likelihood, theta[rows])
-            for likelihood, rows in zip(self.likelihoods, groups, strict=True)
-            if rows.size
-        ]
-        order = np.argsort(np.concatenate(groups))
+        answers = [ask(likelihood, theta[rows]) for likelihood, rows in self.groups]
+        order = np.argsort(np.concatenate([rows for _, rows in self.groups]))
         return tuple(np.concatenate(answer)[order] for answer in zip(*answers, strict=True))
 
     def with_states(self, theta: FloatArray, quantile: FloatArray) -> FloatArray:

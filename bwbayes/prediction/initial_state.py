@@ -9,19 +9,17 @@ Whether the lead-in fits the model at all is tested.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
@@ -113,26 +111,22 @@ class Start:
 class Started:
     """What every draw takes for a record's start.
 
-    ``actuators`` with the record's interval and hold, one for each history, and ``which`` (draws,)
-    of them it is; ``model`` (draws, parameters of the actuator) with initial state and offset;
-    ``unrest`` (draws, unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of
-    the offset still; ``from_rest`` if the record starts so; ``lead_in`` says how that went, if
-    there is one, and ``judged_from`` is the first sample after it; ``carried`` is what its readings
-    leave of the discrepancy, for a forecast. ``engine`` is what simulates.
+    ``histories`` with the record's interval and hold, and which of them each draw has; ``model``
+    (draws, parameters of the actuator) with initial state and offset; ``unrest`` (draws, unknowns)
+    of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of the offset still; ``lead_in``
+    says how that went, if there is one, and ``judged_from`` is the first sample after it;
+    ``carried`` is what its readings leave of the discrepancy, for a forecast.
     """
 
     __repr__ = brief
 
-    actuators: tuple[Actuator, ...]
-    which: IntArray
+    histories: Histories
     model: FloatArray
     unrest: FloatArray
     offset_sd: FloatArray
-    from_rest: bool
     lead_in: LeadIn | None = None
     judged_from: int = 0
     carried: Carried | None = None
-    engine: Engine = "numpy"
 
     def displacement(self, voltage: FloatArray) -> FloatArray:
         """Displacement (draws, samples) along a voltage, um."""
@@ -140,11 +134,9 @@ class Started:
 
     def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
         """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
-        groups = [np.flatnonzero(self.which == number) for number in range(len(self.actuators))]
         walks = [
-            (rows, self._walk(actuator, rows, voltage))
-            for rows, actuator in zip(groups, self.actuators, strict=True)
-            if rows.size
+            (rows, likelihood.walk(self.model[rows], voltage, self.unrest[rows]))
+            for likelihood, rows in self.histories.groups
         ]
         for first in range(0, voltage.size, size):
             last = min(first + size, voltage.size)
@@ -156,27 +148,6 @@ class Started:
             for rows, displacement in parts:
                 simulated[rows] = displacement
             yield simulated
-
-    def _walk(
-        self, actuator: Actuator, rows: IntArray, voltage: FloatArray
-    ) -> Callable[[int], FloatArray]:
-        """Put draws to the start; what is returned walks them on to a sample."""
-        model, unrest, state, now = self.model[rows], self.unrest[rows], None, 0
-        if self.engine == "numba":
-            # Here, because it is slow to load.
-            from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
-
-            compiled = walk(actuator, model, voltage, unrest, from_rest=self.from_rest)
-            if compiled is not None:
-                return compiled.to
-
-        def onwards(last: int) -> FloatArray:
-            nonlocal state, now
-            piece, now = voltage[now:last], last
-            moved, state = actuator.advance(model, piece, state, unrest, from_rest=self.from_rest)
-            return moved
-
-        return onwards
 
 
 def started(
@@ -253,7 +224,7 @@ def going_on(
 
     What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
     """
-    column = start.actuators[0].parameters.index("offset")
+    column = likelihood.actuator.parameters.index("offset")
     model = start.model.copy()
     if start.offset_sd.any():
         model[:, column] += start.offset_sd * scipy.special.ndtri(uniform(generator, len(model)))
@@ -270,10 +241,8 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
     if likelihood.unknowns:
         start = likelihood.start(theta)
         unrest = _normal(start.mean, start.covariance, generator)
-    model, none = posterior.only.table.actuator(theta), np.zeros(len(theta))
-    which = np.zeros(len(theta), dtype=np.int64)
-    actuators, from_rest = (likelihood.actuator,), posterior.only.from_rest
-    return Started(actuators, which, model, unrest, none, from_rest, engine=posterior.engine)
+    histories = Histories((likelihood,), np.zeros(len(theta), dtype=np.int64))
+    return Started(histories, likelihood.table.actuator(theta), unrest, np.zeros(len(theta)))
 
 
 def _unseen(
@@ -294,9 +263,8 @@ def _unseen(
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
     start_theta = histories.with_states(theta, uniform(generator, draws))
-    model, none = first.table.actuator(start_theta), np.zeros(draws)
-    actuators = tuple(likelihood.actuator for likelihood in likelihoods)
-    start = Started(actuators, which, model, unrest, none, first.from_rest, engine=first.engine)
+    model = first.table.actuator(start_theta)
+    start = Started(histories, model, unrest, np.zeros(draws))
     if settled:
         offset = first.actuator.parameters.index("offset")
         model[:, offset] -= start.displacement(first.voltage[:1])[:, 0]
@@ -332,10 +300,7 @@ def _informed(
         _p_value(histories, theta, posterior.squares),
     )
     model = likelihood.table.actuator(start_theta)
-    actuators = tuple(likelihood.actuator for likelihood in histories.likelihoods)
-    from_rest, which = likelihood.from_rest, histories.which
-    start = which, model, unrest, sd, from_rest, lead_in, window.stop
-    return Started(actuators, *start, engine=likelihood.engine)
+    return Started(histories, model, unrest, sd, lead_in, window.stop)
 
 
 def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:

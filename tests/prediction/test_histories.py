@@ -40,8 +40,8 @@ def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: floa
     record = record_after(reach)
     start = Start(lead_in=1.0)
     begun = started(POSTERIOR, DRAWS, record, start, np.random.default_rng(2))
-    spans = [actuator.span for actuator in begun.actuators]
-    drawn = np.array([spans[k] for k in begun.which])
+    spans = [likelihood.actuator.span for likelihood in begun.histories.likelihoods]
+    drawn = np.array([spans[k] for k in begun.histories.which])
     # To the next of the ranges that are told apart: 6 V down, a quarter up.
     np.testing.assert_allclose(drawn[:, 0], -reach, atol=10)
     np.testing.assert_allclose(np.median(drawn[:, 1]), reach, atol=10)
@@ -52,7 +52,8 @@ def test_a_planned_voltage_has_any_history() -> None:
     planned = replace(record_after(30.0), displacement=None)
     draws = POSTERIOR.prior.theta(np.empty((500, 0)))
     begun = started(POSTERIOR, draws, planned, Start(), np.random.default_rng(2))
-    counts = np.bincount(begun.which, minlength=len(begun.actuators))
+    histories = begun.histories
+    counts = np.bincount(histories.which, minlength=len(histories.likelihoods))
     assert np.max(np.abs(counts - 500 / len(counts))) < 2
 
 
@@ -64,9 +65,10 @@ def test_every_draw_is_simulated_with_its_own_history() -> None:
     pieces = np.hstack([*begun.pieces(planned.voltage, 77)])
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
     for row in (0, 7, 39):
-        one = begun.actuators[begun.which[row]].advance(
-            begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]]
-        )[0][0]
+        actuator = begun.histories.likelihoods[begun.histories.which[row]].actuator
+        one = actuator.advance(begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]])[0][
+            0
+        ]
         np.testing.assert_allclose(whole[row], one, atol=1e-9)
 
 
