@@ -2,7 +2,7 @@
 
 A joint fit takes its records for those of one actuator. If one of them was measured with another
 gain or another mounting, the joint posterior lies between them and fits none. So each record is
-fitted alone, by a point fit with the joint fit's noise. With m and C mean and covariance of its
+fitted alone, from the joint fit's mode and with its noise. With m and C mean and covariance of its
 parameters given all records, m_r and C_r given record r alone, and ℓ its log likelihood,
 
     D = 2 [ℓ(m_r) − ℓ(m) + ∇ℓ(m_r)ᵀ (m − m_r)]
@@ -22,7 +22,7 @@ of 1 if the noise that the records share is its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.inference import map_estimate as pointfit
+from bwbayes.diagnosis.laplace import LocalFit, climb
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
@@ -107,10 +107,7 @@ class Agreement:
 
 
 def agreements(
-    posterior: Posterior,
-    point: PointFit,
-    generator: np.random.Generator,
-    begin: Mapping[str, float] | None = None,
+    posterior: Posterior, point: PointFit, begin: Mapping[str, float] | None = None
 ) -> dict[str, Agreement]:
     """Compare each record of a joint posterior with all of them; nothing, if there is one alone.
 
@@ -120,8 +117,6 @@ def agreements(
         The joint posterior.
     point
         Its point fit.
-    generator
-        Starts the records' own point fits.
     begin
         Time of each record's first sample, s, by name; by default 0.
     """
@@ -131,10 +126,11 @@ def agreements(
     compared = {}
     for name, single, joint_free in posterior.each(free):
         with_noise = _with_noise(single, joint_free)
-        own = pointfit.fit(with_noise, generator)
-        own_free, _ = with_noise.prior.constrain(own.mode[np.newaxis])
+        names = (posterior.table.name_of(plain, name) for plain in with_noise.names)
+        columns = [posterior.names.index(column) for column in names]
+        own = climb(with_noise, point.mode[columns])
         series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
-        own_residual = innovations(with_noise, own_free[0]).residual
+        own_residual = innovations(with_noise, own.free).residual
         joint_um, own_um, size = (
             float(np.sqrt(np.mean(x**2))) for x in (series.residual, own_residual, series.white)
         )
@@ -143,7 +139,7 @@ def agreements(
         compared[name] = Agreement(
             joint_um,
             own_um,
-            *_distance(posterior, point, with_noise, own),
+            *_distance(posterior, point, columns, own),
             size,
             series.time.size,
             series.time[step],
@@ -164,19 +160,18 @@ def _with_noise(alone: Posterior, free: FloatArray) -> Posterior:
 
 
 def _distance(
-    posterior: Posterior, point: PointFit, single: Posterior, own: PointFit
+    posterior: Posterior, point: PointFit, columns: Sequence[int], own: LocalFit
 ) -> tuple[float, float, tuple[str, float]]:
-    """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off."""
+    """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off.
+
+    ``columns`` are the joint posterior's coordinates of a record's own fit.
+    """
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
-    columns = [
-        posterior.names.index(posterior.table.name_of(name, single.only.name))
-        for name in single.names
-    ]
     rows = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
     precision = scipy.linalg.inv(point.covariance)[np.ix_(physical, physical)]
     taken = own.covariance - scipy.linalg.inv(precision)[np.ix_(rows, rows)]
-    added = scipy.linalg.inv(own.covariance) - scipy.linalg.inv(own.prior_covariance)
+    added = scipy.linalg.inv(own.covariance) - np.eye(len(rows))
     weights = np.maximum(scipy.linalg.eigvals(added @ taken).real, 0.0)
     # What a record tells by itself alone differs by rounding: then nothing can be compared.
     smallest = 0.05
@@ -184,13 +179,14 @@ def _distance(
         return 0.0, 0.0, ("", 0.0)
     unit = float(np.sum(weights**2) / np.sum(weights))
     spread = np.sqrt(np.maximum(np.diag(taken), smallest * np.diag(own.covariance)))
+    away = own.coordinates - point.mode[columns]
     shifts = {
         name: float(shift)
-        for name, shift in zip(single.names, (own.mode - point.mode[columns]) / spread, strict=True)
+        for name, shift in zip(own.posterior.names, away / spread, strict=True)
         if name in posterior.names
     }
     farthest = max(shifts, key=lambda name: abs(shifts[name]))
-    cost = max(_cost(single, own.mode, point.mode[columns]), 0.0)
+    cost = max(_cost(own.posterior, own.coordinates, point.mode[columns]), 0.0)
     return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
 
 

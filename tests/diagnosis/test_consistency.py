@@ -33,8 +33,7 @@ def pair(seed: int, gain: float = 1.0, noise: float = 0.0) -> Posterior:
 
 
 def compared(posterior: Posterior) -> dict[str, Agreement]:
-    generator = np.random.default_rng(1)
-    return agreements(posterior, pointfit.fit(posterior, generator), generator)
+    return agreements(posterior, pointfit.fit(posterior, np.random.default_rng(1)))
 
 
 def test_records_of_one_actuator_agree() -> None:

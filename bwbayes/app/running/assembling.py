@@ -73,12 +73,8 @@ def assemble(
         name: innovations.innovations(alone, theta[0], records[name].start)
         for name, alone, theta in posterior.each(best)
     }
-    compared = agreement.agreements(
-        posterior,
-        chain.point,
-        generator(seed, "agreement"),
-        {name: record.start for name, record in records.items()},
-    )
+    starts = {name: record.start for name, record in records.items()}
+    compared = agreement.agreements(posterior, chain.point, starts)
     background = Background.of(posterior, flat)
     unexplained = judged(problem, bands, background, {})
     result = replace(
