@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from bwbayes.comparison.evidence import Evidence
-from bwbayes.comparison.leave_future_out import Part, judged
+from bwbayes.comparison.leave_future_out import Part
 from bwbayes.diagnosis.standing import Standing
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.scores import Scores, judged
 from bwbayes.shown import brief
 
 
@@ -97,17 +97,16 @@ class Candidate:
         um, ``nrmse`` over the range of the readings; ``coverage`` of the 95 % sensor band with its
         error.
         """
-        counts = np.array([np.sum(judged(bands)) for bands in self.held_out], dtype=np.float64)
+        counts = np.array([np.sum(judged(b, b.measured)) for b in self.held_out], dtype=np.float64)
         if not counts.sum():
             return None
         shares, scores = counts / counts.sum(), [self.scores[b.name] for b in self.held_out]
-        log_scores = [np.mean(np.asarray(b.log_score)[judged(b)]) for b in self.held_out]
         covered, errors = (
             np.array([dict(values["sensor"] or {})[95] for values in several])
             for several in ([s.coverage for s in scores], [s.coverage_error for s in scores])
         )
         return {
-            "log_score": float(shares @ log_scores),
+            "log_score": float(shares @ np.array([s.log_score for s in scores], np.float64)),
             "crps_um": float(shares @ [score.crps_um for score in scores]),
             "nrmse": float(np.sqrt(shares @ np.square([score.nrmse for score in scores]))),
             "coverage": float(shares @ covered),

@@ -17,11 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.scores import judged
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
@@ -145,14 +146,6 @@ def _path(
     return path
 
 
-def judged(bands: Bands) -> BoolArray:
-    """Tell which samples of bands have a reading that is judged."""
-    assert bands.measured is not None
-    inside: BoolArray = np.isfinite(bands.measured)
-    inside[: bands.scored_from] = False
-    return inside
-
-
 def bands_part(bands: Bands) -> Part | None:
     """Return the part that another record is, from its bands; None without a reading to judge.
 
@@ -160,10 +153,11 @@ def bands_part(bands: Bands) -> Part | None:
     density would be that of the luckiest draw: their own densities stand, and count as independent
     ones do.
     """
-    if bands.measured is None or bands.log_score is None or not judged(bands).any():
+    rows = judged(bands, bands.log_score)
+    if bands.measured is None or bands.log_score is None or not rows.any():
         return None
-    residual = (bands.measured - bands.mean)[judged(bands)]
-    blocks = np.array_split(bands.log_score[judged(bands)], BLOCKS)
+    residual = (bands.measured - bands.mean)[rows]
+    blocks = np.array_split(bands.log_score[rows], BLOCKS)
     sums = np.array([block.sum() for block in blocks])
     return Part(sums, residual.size, residual.size / _correlation_time(residual), joint=False)
 

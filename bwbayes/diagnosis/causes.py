@@ -13,13 +13,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.model import tail_nats
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
+from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 
 # A lead-in whose test says less than this does not fit.
@@ -67,22 +68,21 @@ WORDS: Mapping[str, tuple[str, str]] = {
 }
 
 
-def cause(
-    bands: Bands, judged: BoolArray, memory: float, beyond: Sequence[Finding] = ()
-) -> Finding:
+def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Finding:
     """Return the likely cause of bands that fail, or that there is none among those that are known.
 
     Parameters
     ----------
-    bands, judged
-        Bands with readings, and which of these (samples,) count.
+    bands
+        Bands with readings.
     memory
         Correlation time of the discrepancy, s.
     beyond
         In what the drive leaves training.
     """
     ranked = sorted(
-        _explanations(bands, np.flatnonzero(judged), memory), key=lambda finding: -finding.nats
+        _explanations(bands, np.flatnonzero(judged(bands, bands.measured)), memory),
+        key=lambda finding: -finding.nats,
     )
     likely = joined(likely_causes(ranked)) or Finding(
         "unknown",

@@ -17,6 +17,7 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 
 # False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
@@ -49,9 +50,7 @@ class Standardized:
     noise_log_sd: float
 
     @classmethod
-    def of(
-        cls, bands: Bands, judged: BoolArray, memory: float, noise_log_sd: float
-    ) -> Standardized:
+    def of(cls, bands: Bands, memory: float, noise_log_sd: float) -> Standardized:
         """Take the residuals over their sd, and work out how many independent ones they are worth.
 
         With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in
@@ -60,14 +59,15 @@ class Standardized:
         """
         assert bands.measured is not None
 
-        own, slow, sensor = (bands.sd(kind)[judged] for kind in KINDS)
+        rows = judged(bands, bands.measured)
+        own, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
         sensor = np.maximum(sensor, np.finfo(float).tiny)
-        z = (bands.measured - bands.mean)[judged] / sensor
+        z = (bands.measured - bands.mean)[rows] / sensor
         total = float(np.mean(sensor**2))
         p = min(float(np.mean(own**2)) / total, 1.0)
         q = min(float(np.mean(slow**2)) / total, 1.0) - p
         q = max(q, 0.0) if memory > 0 else 0.0
-        once, twice = _mean_correlations(judged, bands.interval, memory)
+        once, twice = _mean_correlations(rows, bands.interval, memory)
         single = 1 / z.size
         common = min(bands.common_sd**2 / total, p)
 
@@ -80,7 +80,7 @@ class Standardized:
         varying = of_squares(min((p - common) / shared, 1.0), min(q * (1 - once) / shared, 1.0))
         return cls(
             bands,
-            judged,
+            rows,
             z,
             1 / mean,
             1 / of_squares(p, q),

@@ -28,6 +28,7 @@ from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, titled
+from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief
 
@@ -163,13 +164,9 @@ def assess(
     beyond
         In what the record's drive leaves the one that was fitted.
     """
-    if bands.measured is None:
+    if not judged(bands, bands.measured).any():
         return None
-    judged = np.isfinite(bands.measured)
-    judged[: bands.scored_from] = False
-    if not judged.any():
-        return None
-    standard = Standardized.of(bands, judged, background.memory, background.noise_log_sd)
+    standard = Standardized.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
     verdict = Verdict(
         bands.name, bands.training, True, notes=_lead_in(bands), separate=bands.separate
@@ -178,7 +175,7 @@ def assess(
         why = joined(likely_causes(explanations)) or (
             REVERSED_SIGN
             if reasons[0].startswith("the readings fall")
-            else cause(bands, judged, background.memory, beyond)
+            else cause(bands, background.memory, beyond)
         )
         return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
     advice = _offset_advice(standard)

@@ -85,6 +85,13 @@ class Scores:
         }
 
 
+def judged(bands: Bands, values: FloatArray | None) -> BoolArray:
+    """Tell which samples count: those after a lead-in where values (samples,) are known."""
+    known = np.isfinite(np.full(bands.time.size, np.nan) if values is None else values)
+    known[: bands.scored_from] = False
+    return known
+
+
 def score(bands: Bands, full: float = 0.0) -> Scores:
     """Judge bands against what was measured, and against the truth where it is known.
 
@@ -105,12 +112,11 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
             f"{bands.name}: no sample is left after the lead-in of "
             f"{bands.scored_from * bands.interval:g} s; shorten the lead-in or give a longer record"
         )
-    judged = np.isfinite(bands.measured)
-    judged[: bands.scored_from] = False
-    if not judged.any():
+    rows = judged(bands, bands.measured)
+    if not rows.any():
         raise InputError(f"{bands.name}: all readings are missing; judge another window")
-    measured = bands.measured[judged]
-    residual = measured - bands.mean[judged]
+    measured = bands.measured[rows]
+    residual = measured - bands.mean[rows]
     extent, rmse = float(np.ptp(measured)), float(np.sqrt(np.mean(residual**2)))
     coverage: dict[str, dict[int, float] | None] = {}
     error: dict[str, dict[int, float] | None] = {}
@@ -121,31 +127,30 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
     for kind, values in targets.items():
         coverage[kind] = error[kind] = None
         if values is not None:
-            known = np.isfinite(values)
-            known[: bands.scored_from] = False
+            known = judged(bands, values)
             hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
             coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
             error[kind] = _coverage_errors(hits, (values - bands.mean)[known])
     width, interval_score, worst = {}, {}, {}
     scored = slice(bands.scored_from, None)
     for level in LEVELS:
-        lower, upper = (edge["sensor", level][judged] for edge in (bands.lower, bands.upper))
+        lower, upper = (edge["sensor", level][rows] for edge in (bands.lower, bands.upper))
         distance = np.maximum(lower - measured, 0) + np.maximum(measured - upper, 0)
         width[level] = float(np.mean(upper - lower))
         interval_score[level] = float(np.mean(upper - lower + 2 / (1 - level / 100) * distance))
         inside = bands.covers("sensor", level, bands.measured)
-        worst[level] = _worst_second(inside[scored], judged[scored], bands.interval)
+        worst[level] = _worst_second(inside[scored], rows[scored], bands.interval)
     return Scores(
         nrmse=rmse / extent if extent > 0 else np.nan,
         nrmse_full=rmse / full if full else None,
         max_error_um=float(np.abs(residual).max()),
-        crps_um=float(bands.crps[judged].mean()),
+        crps_um=float(bands.crps[rows].mean()),
         width_um=width,
         interval_score_um=interval_score,
         coverage=coverage,
         coverage_error=error,
         worst_second=worst,
-        log_score=None if bands.log_score is None else float(bands.log_score[judged].mean()),
+        log_score=None if bands.log_score is None else float(bands.log_score[rows].mean()),
     )
 
 
