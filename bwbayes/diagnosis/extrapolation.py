@@ -8,7 +8,7 @@ voltages, lags behind faster ones, and drifts.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -50,36 +50,37 @@ def beyond_training(
         The samples that are predicted; those before are what the actuator went through.
     """
     windows = [data.voltage[part] for data in posterior.datasets for part in data.training]
-    span = min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
+    low, high = min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
     turn_times = [
         time_between_turns(data.voltage, data.actuator.interval, data.training)
         for data in posterior.datasets
     ]
-    findings = [
-        _range(span, voltage[window]),
-        _speed(posterior, turn_times, voltage[window], interval),
-        _slow(posterior, span, min(turn_times), voltage, interval, window),
-        _duration(posterior, voltage[: window.stop].size * interval),
-    ]
-    return [finding for finding in findings if finding is not None]
-
-
-def _range(span: tuple[float, float], voltage: FloatArray) -> Finding | None:
-    low, high = span
+    planned, findings = voltage[window], []
     slack = 0.02 * (high - low)  # a sensor's noise
-    if np.min(voltage) >= low - slack and np.max(voltage) <= high + slack:
-        return None
-    return Finding(
-        "range",
-        f"voltage {np.min(voltage):.4g} to {np.max(voltage):.4g} V exceeds the training range "
-        f"{low:.4g} to {high:.4g} V; the bands extrapolate",
-        "train on a record that spans this range",
+    if np.min(planned) < low - slack or np.max(planned) > high + slack:
+        text = (
+            f"voltage {np.min(planned):.4g} to {np.max(planned):.4g} V exceeds the training range "
+            f"{low:.4g} to {high:.4g} V; the bands extrapolate"
+        )
+        findings.append(Finding("range", text, "train on a record that spans this range"))
+    findings += _speed(posterior, turn_times, planned, interval)
+    findings += _slow(posterior, (low, high), min(turn_times), voltage, interval, window)
+    duration = voltage[: window.stop].size * interval
+    before = max(
+        dataset.training[-1].stop * dataset.actuator.interval for dataset in posterior.datasets
     )
+    if duration > LONGER * before:
+        text = (
+            f"duration of {duration:.4g} s exceeds the {before:.4g} s of training; the bands "
+            "extrapolate, with slow creep at its prior and no drift"
+        )
+        findings.append(Finding("duration", text, "train on a record that is as long"))
+    return findings
 
 
 def _speed(
     posterior: Posterior, turn_times: Sequence[float], voltage: FloatArray, interval: float
-) -> Finding | None:
+) -> Iterator[Finding]:
     turn_time, speeds = time_between_turns(voltage, interval), []
     for dataset, fitted_turn_time in zip(posterior.datasets, turn_times, strict=True):
         over = PART * min(fitted_turn_time, turn_time)
@@ -88,14 +89,12 @@ def _speed(
     # Of several records the one that comes nearest to the drive.
     now, before = min(speeds, key=lambda pair: pair[0] / max(pair[1], 1e-300))
     # Noise and the sampling change a speed by a tenth or so.
-    if now <= 1.5 * before:
-        return None
-    return Finding(
-        "speed",
-        f"voltage speed of up to {now:.3g} V/s exceeds the {before:.3g} V/s of training; the bands "
-        "extrapolate, because the lag is not known that well",
-        "train on a record that is as fast",
-    )
+    if now > 1.5 * before:
+        text = (
+            f"voltage speed of up to {now:.3g} V/s exceeds the {before:.3g} V/s of training; the "
+            "bands extrapolate, because the lag is not known that well"
+        )
+        yield Finding("speed", text, "train on a record that is as fast")
 
 
 def _slow(
@@ -105,7 +104,7 @@ def _slow(
     voltage: FloatArray,
     interval: float,
     window: slice,
-) -> Finding | None:
+) -> Iterator[Finding]:
     """Hold the voltage's means over some times T against those of training.
 
     Creep with the time T follows the mean over T. The creep that training does not show is as large
@@ -131,31 +130,15 @@ def _slow(
     excess = np.maximum(np.nan_to_num(sides * planned - before), 0.0)
     # In volts times decades of time; a sine over the whole range has half the range to either side.
     unknown = np.sum(excess, axis=1) / a_decade
-    if unknown.max() <= math.log10(LONGER) * (high - low) / 2:
-        return None
-    side = int(np.argmax(unknown))
-    at = int(np.argmax(excess[side] >= excess[side].max() / 2))
-    reached = f"at {('least', 'most')[side]} {(sides * before)[side, at]:.3g} V"
-    return Finding(
-        "slow",
-        f"voltage averages {planned[side, at]:.3g} V over {times[at]:.3g} s, in training {reached}"
-        "; the bands extrapolate, with slow creep at its prior",
-        "train on a record that is as slow, or is held as long",
-    )
-
-
-def _duration(posterior: Posterior, duration: float) -> Finding | None:
-    before = max(
-        dataset.training[-1].stop * dataset.actuator.interval for dataset in posterior.datasets
-    )
-    if duration <= LONGER * before:
-        return None
-    return Finding(
-        "duration",
-        f"duration of {duration:.4g} s exceeds the {before:.4g} s of training; the bands "
-        "extrapolate, with slow creep at its prior and no drift",
-        "train on a record that is as long",
-    )
+    if unknown.max() > math.log10(LONGER) * (high - low) / 2:
+        side = int(np.argmax(unknown))
+        at = int(np.argmax(excess[side] >= excess[side].max() / 2))
+        reached = f"at {('least', 'most')[side]} {(sides * before)[side, at]:.3g} V"
+        text = (
+            f"voltage averages {planned[side, at]:.3g} V over {times[at]:.3g} s, in training "
+            f"{reached}; the bands extrapolate, with slow creep at its prior"
+        )
+        yield Finding("slow", text, "train on a record that is as slow, or is held as long")
 
 
 def _slow_means(
