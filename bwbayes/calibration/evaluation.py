@@ -170,9 +170,8 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
     level = FAMILY_LEVEL / 2 / len(names)
     p = smooth_test(positions)
     ecdf_limit = float(scipy.stats.kstwo.isf(level, count))
-    # Between the distribution function's steps and the straight line.
-    ordered, steps = np.sort(positions, axis=0).T, np.arange(count + 1) / count
-    distances = np.maximum(steps[1:] - ordered, ordered - steps[:-1]).max(axis=1)
+    even = scipy.stats.uniform.cdf
+    distances = [scipy.stats.ks_1samp(column, even).statistic for column in positions.T]
     statistics = {
         name: Uniformity(
             float(p[i]),
