@@ -15,7 +15,8 @@ state is ``memory``, the ``rest`` of each section, um, and two ``filters`` of ea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -289,21 +290,18 @@ class SampledModel:
         w (1 + κ |u| / U) is a second input. ``dt`` is in s.
         """
         growing = self.actuator.creep is not None and self.actuator.creep.growing
-        a, b, c, d = [], [], [], np.zeros((1, 1 + growing))
+        systems = []
         sections = zip(*(values[0] for values in self.sections), strict=True)
         for number, (numerator, denominator, gain) in enumerate(sections):
             order = max(int(np.max(np.nonzero([numerator, denominator])[1])), 1)
-            column = int(growing and number > 0)
-            shift, entry = np.eye(order, k=1), np.zeros((order, 1 + growing))
+            inputs = np.eye(1, 1 + growing, int(growing and number > 0))
+            shift = np.eye(order, k=1)
             shift[:, 0] -= denominator[1 : order + 1]
-            entry[:, column] = (numerator - denominator * numerator[0])[1 : order + 1]
-            d[0, column] += gain * numerator[0]
-            a.append(shift)
-            b.append(entry)
-            c.append(gain * np.eye(1, order))
-        return scipy.signal.StateSpace(
-            scipy.linalg.block_diag(*a), np.vstack(b), np.hstack(c), d, dt=self.actuator.interval
-        )
+            entry = (numerator - denominator * numerator[0])[1 : order + 1, np.newaxis] * inputs
+            direct, interval = gain * numerator[0] * inputs, self.actuator.interval
+            output = gain * np.eye(1, order)
+            systems.append(scipy.signal.StateSpace(shift, entry, output, direct, dt=interval))
+        return reduce(add, systems)  # side by side
 
 
 def require_inverse(model: SampledModel, limits: Span) -> None:
