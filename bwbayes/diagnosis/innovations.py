@@ -10,7 +10,7 @@ and large enough to matter; of records that the model describes fewer than one i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -44,16 +44,11 @@ class Innovations:
     rate: FloatArray
     residual: FloatArray
     interval: float
-    noise: Noise | None = None
-    parameters: FloatArray = field(default_factory=lambda: np.empty(0))
+    noise: Noise
+    parameters: FloatArray
 
-    def noise_density(self, frequency: FloatArray) -> FloatArray | None:
-        """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided.
-
-        None without a noise model.
-        """
-        if self.noise is None:
-            return None
+    def noise_density(self, frequency: FloatArray) -> FloatArray:
+        """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided."""
         return self.noise.density(self.parameters[np.newaxis], frequency)
 
     def residual_density(self) -> tuple[FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.innovations import Innovations, departures, innovations
 from bwbayes.diagnosis.predictive_checks import STATISTICS, Replicated, replicated
+from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Posterior
 from tests.inference import problems
 from tests.inference.problems import INTERVAL, TRUE_NOISE, short_posterior, truth
@@ -84,7 +85,8 @@ def along(white: FloatArray) -> Innovations:
     time = 0.005 * np.arange(white.size, dtype=np.float64)
     voltage = 100 * np.sin(2 * np.pi * time)
     rate = np.gradient(voltage) / 0.005
-    return Innovations(time, white, voltage, rate, 0.5 * white, 0.005)
+    noise = noise_model("white", 0.005), np.array([0.5])
+    return Innovations(time, white, voltage, rate, 0.5 * white, 0.005, *noise)
 
 
 def test_innovations_of_the_right_model_raise_no_remark() -> None:

@@ -173,8 +173,7 @@ def draw_spectrum(innovations: Innovations) -> Figure:
     figure, ((panel,),) = style.new_figure(11, 4.2)
     panel.loglog(frequency, density, color=style.Color.MEASURED, lw=0.9, label="residual")
     model = innovations.noise_density(frequency)
-    if model is not None:
-        panel.loglog(frequency, model, color=style.Color.MEAN, lw=1.5, label="noise model")
+    panel.loglog(frequency, model, color=style.Color.MEAN, lw=1.5, label="noise model")
     panel.set(xlabel="frequency (Hz)", ylabel="amplitude density (µm/√Hz)")
     figure.legend(loc="outside right upper")
     return figure
