@@ -13,13 +13,12 @@ explicit numbers, which a run prints and stores.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Ranges
 from bwbayes.model.reversals import time_between_turns
 
 
@@ -69,11 +68,3 @@ def joined(records: Sequence[Ranges]) -> Ranges:
         interval=min(record.interval for record in records),
         duration=max(record.duration for record in records),
     )
-
-
-def default_priors(
-    declarations: Iterable[Declaration], context: Context
-) -> dict[str, Distribution]:
-    """Return the default priors of those of the parameters that have one, by name."""
-    defaults = {declaration.name: declaration.default(context) for declaration in declarations}
-    return {name: prior for name, prior in defaults.items() if isinstance(prior, Distribution)}

@@ -5,12 +5,13 @@ Each kind of planted mistake is said, by name.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import conflicts
-from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
@@ -22,7 +23,7 @@ NAMES = (
     "d", "alpha", "beta", "gamma", "exponent", "initial", "lag", "offset", "sensor_sd",
     "discrepancy_sd", "discrepancy_time",
 )  # fmt: skip
-DEFAULTS = default_priors([declared(name) for name in NAMES], context(RANGES))
+DEFAULTS: Any = {name: declared(name).default(context(RANGES)) for name in NAMES}
 
 # What a good run's posterior is like: mean and sd.
 GOOD = {

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from itertools import chain
@@ -47,7 +47,6 @@ from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.defaults import default_priors
 from bwbayes.inference.engine import choose
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
@@ -290,12 +289,11 @@ def _posterior(
     prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
-    defaults: dict[str, Distribution] = {}
-    for column in table.layout:
-        named = replace(column.declaration, name=column.name)
-        defaults |= default_priors([named], contexts[column.record])
-    engine = choose(config.sampling.engine)
-    return Posterior(tuple(datasets), prior, engine, table), defaults
+    defaults = {c.name: c.declaration.default(contexts[c.record]) for c in table.layout}
+    known = {
+        name: default for name, default in defaults.items() if isinstance(default, Distribution)
+    }
+    return Posterior(tuple(datasets), prior, choose(config.sampling.engine), table), known
 
 
 def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
