@@ -210,7 +210,7 @@ def _promised(name: str, arguments: list[str]) -> list[str]:
     home, files = LEAVES[name]
     options = dict(pairwise(arguments))
     words = {
-        "stem": Path(arguments[0]).stem,
+        "stem": Path(next(iter(arguments), "")).stem,
         "record": Path(options.get("--record", options.get("--signal", ""))).stem,
     }
     home = options.get("--out", home.format(*arguments, **words))
