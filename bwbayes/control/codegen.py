@@ -19,7 +19,7 @@ from typing import Any
 from bwbayes.errors import InputError
 
 # Arguments of functions that are arrays to be written to.
-WRITTEN = ("after", "rested", "filtered")
+WRITTEN = ("after", "settled", "filtered")
 
 
 def c_functions(

@@ -154,7 +154,7 @@ class Exported:
         sections = len(tables["taps"])
         shapes = {name: values.shape for name, values in tables.items()}
         shapes |= dict.fromkeys(("memory", "after"), (len(remembered),))
-        shapes |= dict.fromkeys(("rest", "rested"), (sections,))
+        shapes |= dict.fromkeys(("initial", "settled"), (sections,))
         shapes |= dict.fromkeys(("filters", "filtered"), (sections, 2))
         functions: list[Callable[..., Any]] = [settle, advance]
         functions += [search] * (self.without_inverse is None)

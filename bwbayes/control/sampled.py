@@ -9,7 +9,7 @@ These functions take the model in arrays: ``move`` and ``parameters`` of the hys
 ``curve``, the coefficients of 1, u, u² and u³ that the gain adds, and κ/U, by which the creep's
 drive w (1 + κ |u| / U) grows; and ``taps`` of each section, b₀, b₁, b₂, a₁, a₂ and the gain, then b
 of the sample that a voltage acts on first, and how its two states carry over to that sample. A
-state is ``memory``, the ``rest`` of each section, um, and two ``filters`` of each.
+state is ``memory``, the ``initial`` drive of each section, um, and two ``filters`` of each.
 """
 
 from __future__ import annotations
@@ -45,28 +45,28 @@ def drive(move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, aft
 
 
 def settle(
-    move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any, rested: Any
+    move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any, settled: Any
 ) -> Any:
     """Return hysteresis and gain at a first voltage, um, where dynamics and creep are at rest."""
     w, _ = drive(move, parameters, curve, memory, voltage, after)
-    for i in range(len(rested)):
-        rested[i] = select(i > 0, w * (1.0 + curve[4] * np.abs(voltage)), w)
+    for i in range(len(settled)):
+        settled[i] = select(i > 0, w * (1.0 + curve[4] * np.abs(voltage)), w)
     return w
 
 
 def advance(
-    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, rest: Any, filters: Any,
+    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, initial: Any, filters: Any,
     voltage: Any, after: Any, filtered: Any,
 ) -> Any:  # fmt: skip
     """Return the displacement at a sample with this voltage, um, and write the state after it."""
     w, _ = drive(move, parameters, curve, memory, voltage, after)
     creeping, displacement = w * (1.0 + curve[4] * np.abs(voltage)), 0.0
-    for i in range(len(rest)):
-        driven = select(i > 0, creeping, w) - rest[i]
+    for i in range(len(initial)):
+        driven = select(i > 0, creeping, w) - initial[i]
         moved = taps[i, 0] * driven + filters[i, 0]
         filtered[i, 0] = taps[i, 1] * driven - taps[i, 3] * moved + filters[i, 1]
         filtered[i, 1] = taps[i, 2] * driven - taps[i, 4] * moved
-        displacement = displacement + taps[i, 5] * (rest[i] + moved)
+        displacement = displacement + taps[i, 5] * (initial[i] + moved)
     return displacement
 
 
@@ -76,7 +76,7 @@ def within(voltage: Any, lowest: Any, highest: Any) -> Any:
 
 
 def search(
-    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, rest: Any, filters: Any,
+    move: Any, parameters: Any, curve: Any, taps: Any, memory: Any, initial: Any, filters: Any,
     voltage: Any, displacement: Any, lowest: Any, highest: Any, close: Any, after: Any,
 ) -> Any:  # fmt: skip
     """Return the voltage that brings the displacement there, or the limit that is nearest, V.
@@ -85,10 +85,10 @@ def search(
     rule between bounds, and bisection should that not do, until a step is as small as ``close``.
     """
     direct, creeping, demand = 0.0, 0.0, displacement
-    for i in range(len(rest)):
+    for i in range(len(initial)):
         weight = taps[i, 5] * taps[i, 6]
         carried = taps[i, 7] * filters[i, 0] + taps[i, 8] * filters[i, 1]
-        demand = demand - taps[i, 5] * (rest[i] + carried) + weight * rest[i]
+        demand = demand - taps[i, 5] * (initial[i] + carried) + weight * initial[i]
         direct = select(i > 0, direct, weight)
         creeping = select(i > 0, creeping + weight, 0.0)
     low, high = lowest, highest
@@ -198,10 +198,10 @@ class SampledModel:
 
     def begin(self, voltage: FloatArray) -> SteppedState:
         """Return the state of actuators that have settled at a voltage (models,), V."""
-        memory, rest = self.step.demagnetized().T, np.empty(self.taps[:, 0].shape)
+        memory, initial = self.step.demagnetized().T, np.empty(self.taps[:, 0].shape)
         after = np.empty_like(memory)
-        settle(*self.hysteresis, memory, voltage, after, rest)
-        return SteppedState(after, voltage, rest, np.zeros((len(rest), 2, self.models)))
+        settle(*self.hysteresis, memory, voltage, after, initial)
+        return SteppedState(after, voltage, initial, np.zeros((len(initial), 2, self.models)))
 
     @cached_property
     def zero(self) -> FloatArray:
@@ -217,12 +217,12 @@ class SampledModel:
 
         If the voltage is held, the displacement is that just before it changes.
         """
-        memory, _, rest, filters = state
+        memory, _, initial, filters = state
         after, filtered = np.empty_like(memory), np.empty_like(filters)
         displacement = advance(
-            *self.hysteresis, self.taps, memory, rest, filters, voltage, after, filtered
+            *self.hysteresis, self.taps, memory, initial, filters, voltage, after, filtered
         )
-        return displacement - self.zero, SteppedState(after, voltage, rest, filtered)
+        return displacement - self.zero, SteppedState(after, voltage, initial, filtered)
 
     def inverse(
         self,
@@ -238,12 +238,12 @@ class SampledModel:
         outside of the limits gets the limit. The search starts at a ``guess``, by default the last
         voltage, and ends at a ``tolerance``, V, by default the last bits.
         """
-        memory, last, rest, filters = state
+        memory, last, initial, filters = state
         begin, aim = last if guess is None else guess, displacement + self.zero
         close, after = tolerance or resolution(limits), np.empty_like(memory)
         model = *self.hysteresis, self.taps
         with np.errstate(divide="ignore", invalid="ignore"):
-            voltage = search(*model, memory, rest, filters, begin, aim, *limits, close, after)
+            voltage = search(*model, memory, initial, filters, begin, aim, *limits, close, after)
         return voltage, self.forward(state, voltage)[1]
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:

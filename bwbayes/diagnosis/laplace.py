@@ -104,17 +104,17 @@ def climb(
     target = _Target(posterior, effect, least)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
     climbed = [target.climb(target.at(start), 2) for start in starts]
-    return target.fitted(target.climb(max(climbed, key=lambda place: place.density), ROUNDS))
+    return target.fitted(target.climb(max(climbed, key=lambda state: state.density), ROUNDS))
 
 
 def climb_each(posterior: Posterior, places: FloatArray) -> list[LocalFit]:
     """Fit from each of coordinates (places, free) of a posterior of one record."""
     target = _Target(posterior, NONE)
-    return [target.fitted(target.climb(target.at(place), ROUNDS)) for place in places]
+    return [target.fitted(target.climb(target.at(row), ROUNDS)) for row in places]
 
 
 @dataclass(frozen=True)
-class _Place:
+class _State:
     """Where a climb is: coordinates (free + sizes,), log density, displacement (readings,)."""
 
     coordinates: FloatArray
@@ -181,30 +181,30 @@ class _Target:
             density[possible] += score.log_density
         return np.where(np.isfinite(density), density, -np.inf)
 
-    def at(self, coordinates: FloatArray) -> _Place:
-        """Return the place at coordinates (free + sizes,)."""
+    def at(self, coordinates: FloatArray) -> _State:
+        """Return the state at the coordinates (free + sizes,)."""
         theta, density = self.prior(coordinates[np.newaxis])
         moved = np.zeros((1, self.posterior.likelihood.readings.rows.size))
         if np.isfinite(density).all():
             moved = self.displacement(theta, coordinates[np.newaxis])
             density = self.density(theta, density, moved[0])
-        return _Place(coordinates, float(density[0]), moved[0])
+        return _State(coordinates, float(density[0]), moved[0])
 
-    def climb(self, place: _Place, rounds: int) -> _Place:
+    def climb(self, state: _State, rounds: int) -> _State:
         """Climb for so many rounds at most, as long as these may reach ``least``."""
-        for _ in range(rounds if np.isfinite(place.density) else 0):
-            before, place = place.density, self._step_physics(self._step_noise(place))
-            if place.density < before + max(GAIN, (self.least - place.density) / ROUNDS):
+        for _ in range(rounds if np.isfinite(state.density) else 0):
+            before, state = state.density, self._step_physics(self._step_noise(state))
+            if state.density < before + max(GAIN, (self.least - state.density) / ROUNDS):
                 break
-        return place
+        return state
 
-    def fitted(self, place: _Place) -> LocalFit:
+    def fitted(self, state: _State) -> LocalFit:
         """Put the evidence at a mode together."""
-        log_evidence, covariance = place.density, np.eye(place.coordinates.size)
+        log_evidence, covariance = state.density, np.eye(state.coordinates.size)
         # What the record does not tell keeps its prior; the noise's bend is a finite difference.
         for rows, curvature, flattest in (
-            (self.physical, self._physical_bend(place)[1], 1.0),
-            (self.noise, self._noise_bend(place)[1], 1e-2),
+            (self.physical, self._physical_bend(state)[1], 1.0),
+            (self.noise, self._noise_bend(state)[1], 1e-2),
         ):
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
@@ -213,64 +213,64 @@ class _Target:
         return LocalFit(
             self.posterior,
             self.effect,
-            place.coordinates,
+            state.coordinates,
             covariance,
-            place.density,
+            state.density,
             log_evidence,
-            place.displacement,
+            state.displacement,
         )
 
-    def _step_physics(self, place: _Place) -> _Place:
+    def _step_physics(self, state: _State) -> _State:
         """Step in the physical coordinates and the sizes, by Fisher scoring."""
-        slope, curvature = self._physical_bend(place)
-        step = np.zeros(place.coordinates.size)
+        slope, curvature = self._physical_bend(state)
+        step = np.zeros(state.coordinates.size)
         step[self.physical] = np.linalg.solve(curvature, slope)
-        tried = (self.at(place.coordinates + fraction * step) for fraction in FRACTIONS)
-        return next((there for there in tried if there.density > place.density), place)
+        tried = (self.at(state.coordinates + fraction * step) for fraction in FRACTIONS)
+        return next((there for there in tried if there.density > state.density), state)
 
-    def _physical_bend(self, place: _Place, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
+    def _physical_bend(self, state: _State, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the physical coordinates.
 
         ``step`` may be small: a simulation has no noise but rounding.
         """
-        steps = step * np.eye(place.coordinates.size)[self.physical]
-        sides = place.coordinates + np.concatenate([steps, -steps])
-        theta, log_prior = self.prior(np.concatenate([place.coordinates[np.newaxis], sides]))
+        steps = step * np.eye(state.coordinates.size)[self.physical]
+        sides = state.coordinates + np.concatenate([steps, -steps])
+        theta, log_prior = self.prior(np.concatenate([state.coordinates[np.newaxis], sides]))
         possible = np.isfinite(log_prior[1:])
-        moved = np.tile(place.displacement, (len(sides), 1))
+        moved = np.tile(state.displacement, (len(sides), 1))
         moved[possible] = self.displacement(theta[1:][possible], sides[possible])
         forth, back = np.split(moved, 2)
         width = step * np.maximum(np.sum(possible.reshape(2, -1), axis=0), 1)
-        slopes, here = (forth - back) / width[:, np.newaxis], place.displacement[np.newaxis]
+        slopes, here = (forth - back) / width[:, np.newaxis], state.displacement[np.newaxis]
         score = self.posterior.likelihood.score(theta[:1], slopes, here)
-        slope = score.pull[0] - place.coordinates[self.physical]
+        slope = score.pull[0] - state.coordinates[self.physical]
         return slope, score.information[0] + np.eye(len(steps))
 
-    def _step_noise(self, place: _Place) -> _Place:
+    def _step_noise(self, state: _State) -> _State:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
         for _ in range(6 if self.noise.size else 0):
-            slope, curvature = self._noise_bend(place)
+            slope, curvature = self._noise_bend(state)
             values, vectors = np.linalg.eigh(curvature)
             step = vectors @ (vectors.T @ slope / np.maximum(np.abs(values), 1.0))
             step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
             steps = FRACTIONS[:, np.newaxis] * step
-            gains = self._noise_gains(place, steps)
+            gains = self._noise_gains(state, steps)
             best = int(np.argmax(gains))
             if gains[best] <= GAIN / 4:
                 break
-            coordinates = place.coordinates.copy()
+            coordinates = state.coordinates.copy()
             coordinates[self.noise] += steps[best]
-            place = _Place(coordinates, place.density + float(gains[best]), place.displacement)
-        return place
+            state = _State(coordinates, state.density + float(gains[best]), state.displacement)
+        return state
 
-    def _noise_gains(self, place: _Place, steps: FloatArray) -> FloatArray:
+    def _noise_gains(self, state: _State, steps: FloatArray) -> FloatArray:
         """By how much steps (steps, noise) in the noise's coordinates raise the log density."""
-        coordinates = np.tile(place.coordinates, (len(steps), 1))
+        coordinates = np.tile(state.coordinates, (len(steps), 1))
         coordinates[:, self.noise] += steps
-        density = self.density(*self.prior(coordinates), place.displacement)
-        return np.maximum(density, -1e12) - place.density
+        density = self.density(*self.prior(coordinates), state.displacement)
+        return np.maximum(density, -1e12) - state.density
 
-    def _noise_bend(self, place: _Place, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
+    def _noise_bend(self, state: _State, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the noise's coordinates.
 
         The posterior's sds are hundredths of the prior's, which are one.
@@ -279,7 +279,7 @@ class _Target:
         single = step * np.eye(size)
         # Along each coordinate, then along each two of them.
         steps = np.concatenate([single, single[i] + single[j]])
-        plus, minus = np.split(self._noise_gains(place, np.concatenate([steps, -steps])), 2)
+        plus, minus = np.split(self._noise_gains(state, np.concatenate([steps, -steps])), 2)
         bend = plus + minus
         curvature = np.diag(bend[:size])
         curvature[i, j] = curvature[j, i] = (bend[size:] - bend[i] - bend[j]) / 2
