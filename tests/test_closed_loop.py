@@ -12,10 +12,11 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.problem.records import generator
-from bwbayes.control.loop import LoopNoise, Stand
+from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import PROCESS_SD, PROCESS_TIME
+from tests.control import cases
 from tests.measured import keep
 
 SEEDS = 5
@@ -52,11 +53,7 @@ def on_the_stand(fit: bw.Fit) -> Tracking:
     return track(
         stand.actuator,
         np.tile(truth, (DRAWS, 1)),
-        LoopNoise(
-            np.full(DRAWS, known["sensor_sd"]),
-            np.full(DRAWS, PROCESS_SD),
-            np.full(DRAWS, PROCESS_TIME),
-        ),
+        cases.noise_of(DRAWS, known["sensor_sd"], PROCESS_SD, PROCESS_TIME),
         Stand(Span(*LIMITS)),
         np.random.default_rng(1),
         frequencies=FREQUENCIES,

@@ -18,6 +18,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains
 from bwbayes.control.sampled import SampledModel
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 
@@ -53,11 +54,26 @@ class Stand:
 
 
 class LoopNoise(NamedTuple):
-    """What each draw has beside its actuator: sds, um, and the discrepancy's time, s; (draws,)."""
+    """What each draw has beside its actuator: a noise model, and its parameters (draws, any)."""
 
-    sensor: FloatArray
-    discrepancy: FloatArray
-    time: FloatArray
+    model: Noise
+    parameters: FloatArray
+
+    def walk(
+        self, interval: float, generator: np.random.Generator
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield discrepancy and sensor noise, (draws,) each, um, sample by sample without end."""
+        model, theta = self.model.at(interval), self.parameters
+        states = slice(0, model.states)
+        kept, fresh = (f(theta)[:, states, states] for f in (model.transition, model.fresh))
+        values, vectors = np.linalg.eigh(fresh)
+        scale = vectors * np.sqrt(np.maximum(values, 0.0))[:, np.newaxis]
+        slow, white = model.marginal_sd(theta)
+        state = slow[:, np.newaxis] * generator.standard_normal((len(theta), model.states))
+        while True:
+            yield state[:, :1].sum(axis=1), white * generator.standard_normal(len(theta))
+            shock = generator.standard_normal(state.shape)
+            state = np.einsum("dij,dj->di", kept, state) + np.einsum("dij,dj->di", scale, shock)
 
 
 class LoopPlan(NamedTuple):
@@ -176,29 +192,27 @@ def follow(
         Source of discrepancy and sensor noise.
     """
     controllers, signals, samples = plan.ahead.shape
-    count = noise.sensor.size
-    shape = controllers, signals, count
+    shape = controllers, signals, len(noise.parameters)
     # The last sample of the reference is there for those that look one ahead.
     samples -= 1
     low, high = stand.limits
     step, reach = stand.amplifier.step, stand.amplifier.slew * gains.interval
     looks = np.array(plan.looks)[:, np.newaxis, np.newaxis]
-    decay = np.exp(-gains.interval / noise.time)
-    shock = noise.discrepancy * np.sqrt(-np.expm1(-2 * gains.interval / noise.time))
 
     state = draws.begin(np.zeros(draws.models))
     held = np.zeros(shape)
     answers = [np.zeros(shape) for _ in range(stand.delay)]
     answer, errors = np.zeros(shape), [np.zeros(shape), np.zeros(shape)]
-    drift = noise.discrepancy * generator.standard_normal(count)
     squares, largest, limited = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    noises = noise.walk(gains.interval, generator)
     for t in range(samples):
+        drift, white = next(noises)
         moved = draws.displacement(state).reshape(shape) + drift
         if t >= plan.begins:
             error = moved - plan.reference[:, t, np.newaxis]
             squares += error**2
             np.maximum(largest, np.abs(error), out=largest)
-        reading = moved + noise.sensor * generator.standard_normal(count)
+        reading = moved + white
         np.round(reading / stand.sensor.step, out=reading)
         reading *= stand.sensor.step
         errors = [plan.targets[:, :, t, np.newaxis] - reading, *errors[:2]]
@@ -214,6 +228,5 @@ def follow(
         if t >= plan.begins:
             limited += (command <= low) | (command >= high)
         state = draws.forward(state, held.ravel())[1]
-        drift = decay * drift + shock * generator.standard_normal(count)
     judged = samples - plan.begins
     return TrackingErrors(np.sqrt(squares / judged), largest, limited / judged)

@@ -18,7 +18,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.running.campaign import Row
 from bwbayes.app.running.folder import CampaignFolder
-from bwbayes.control.loop import LoopNoise, Stand
+from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.population.population import population
 from bwbayes.shown import LONGEST, MOST_LINES, brief
@@ -61,7 +61,7 @@ def objects(fit: bw.Fit, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
 def followed(generator: np.random.Generator) -> Tracking:
     """Return what ``fit.track`` does, of three draws: the margins of a thousand take a minute."""
     actuator = cases.actuator("bouc-wen, second-order", "zero")
-    noise = LoopNoise(np.full(3, 0.5), np.full(3, 1.5), np.full(3, 0.5))
+    noise = cases.noise_of(3, 0.5, 1.5, 0.5)
     theta, stand = cases.theta(actuator, 3), Stand(cases.SPAN)
     return track(actuator, theta, noise, stand, generator, frequencies=(5.0,))
 

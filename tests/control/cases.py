@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.control.loop import LoopNoise
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.gain import PolynomialGain
@@ -90,3 +92,8 @@ def drive(samples: int = 3000, interval: float = 1e-3) -> FloatArray:
     jumps = generator.uniform(-95, 95, samples // 10)
     voltage[-2 * jumps.size :] = np.repeat(jumps, 2)
     return voltage
+
+
+def noise_of(count: int, *values: float) -> LoopNoise:
+    """Return a rough discrepancy's sensor sd, sd and time, the same of a number of draws."""
+    return LoopNoise(DiscrepancyNoise(), np.tile(values, (count, 1)))

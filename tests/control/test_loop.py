@@ -9,12 +9,15 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains, Robustness, design
 from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, follow
 from bwbayes.control.sampled import SampledModel
+from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise, WhiteNoise
+from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier
 from tests.control import cases
+from tests.control.cases import noise_of
 
-QUIET = LoopNoise(np.zeros(2), np.zeros(2), np.ones(2))
+QUIET = noise_of(2, 0.0, 0.0, 1.0)
 
 
 def of(name: str, count: int, copies: int) -> tuple[Actuator, FloatArray, SampledModel]:
@@ -112,13 +115,33 @@ def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
     _, _, rows = of("bouc-wen", 1, 400)
     required = np.zeros((1, 1001))
     plan = LoopPlan(np.zeros((1, 1, 1001)), np.zeros((1, 1, 1001)), (False,), required, 0)
-    noise = LoopNoise(np.full(400, 0.5), np.full(400, 1.5), np.full(400, 0.01))
+    noise = noise_of(400, 0.5, 1.5, 0.01)
     gains, stand = Gains((0.1, 0.0, 0.0), 1e-3), Stand(cases.SPAN)
     got = follow(plan, gains, rows, noise, stand, np.random.default_rng(8))
     spread = 1.5**2 * np.sqrt(2 / 40_000)
     assert np.mean(got.rms**2) == pytest.approx(1.5**2, abs=5 * spread)
-    alone = noise._replace(discrepancy=np.zeros(400))
+    alone = noise_of(400, 0.5, 0.0, 0.01)
     assert 0 == follow(plan, gains, rows, alone, stand, np.random.default_rng(8)).largest.max()
+
+
+@pytest.mark.parametrize(
+    ("model", "theta"),
+    [
+        (WhiteNoise(), (0.5,)),
+        (DiscrepancyNoise(), (0.5, 1.5, 0.05)),
+        (SmoothNoise(), (0.5, 1.5, 0.05, 2.0)),
+    ],
+)
+def test_a_loop_has_the_noise_model_of_the_fit(model: Noise, theta: tuple[float, ...]) -> None:
+    """Covariances of 20,000 draws six samples on, within five standard errors."""
+    every = np.tile(theta, (20_000, 1))
+    walk = LoopNoise(model, every).walk(0.01, np.random.default_rng(3))
+    discrepancy, sensor = np.stack([next(walk) for _ in range(6)], axis=1)
+    sds = model.marginal_sd(every[:1])
+    kept = model.at(0.01).transition(every[:1], np.arange(6.0))[0, :, 0, 0]
+    for values, sd, shared in ((discrepancy, sds[0], kept), (sensor, sds[1], np.eye(6)[0])):
+        got = values @ values[0] / len(every)
+        np.testing.assert_allclose(got, sd**2 * shared, atol=5 * sd[0] ** 2 * (2 / 20_000) ** 0.5)
 
 
 def test_out_of_reach_for_long_it_comes_back_at_once() -> None:

@@ -30,7 +30,7 @@ def draws(count: int) -> tuple[Actuator, FloatArray, LoopNoise]:
     both = generator.standard_normal(count)
     theta[:, actuator.parameters.index("d")] += 0.0048 * both
     theta[:, actuator.parameters.index("alpha")] += 0.0122 * both
-    return actuator, theta, LoopNoise(np.full(count, 0.5), np.full(count, 1.5), np.full(count, 0.5))
+    return actuator, theta, cases.noise_of(count, 0.5, 1.5, 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_by_default_it_goes_to_where_the_dynamics_matter() -> None:
 
 def test_a_range_on_one_side_of_zero_is_approached_first() -> None:
     actuator, theta, noise = draws(4)
-    noise = noise._replace(discrepancy=np.zeros(4), sensor=np.zeros(4))
+    noise = cases.noise_of(4, 0.0, 0.0, 0.5)
     same = np.tile(theta.mean(axis=0), (4, 1))
     stand = Stand(Span(0.0, 100.0))
     made = track(actuator, same, noise, stand, np.random.default_rng(2), frequencies=(5.0,))

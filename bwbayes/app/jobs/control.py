@@ -314,13 +314,10 @@ def track(
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.alone(dataset.name)
     parameters = alone.noise_of_new(theta[:draws], generator(seed, "noise"))
-    discrepancy, sensor = dataset.noise.marginal_sd(parameters)
-    memory = dataset.noise.correlation_time(parameters)
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
-        # A white noise has no discrepancy, so that any time will do.
-        LoopNoise(sensor, discrepancy, np.where(memory > 0, memory, 1.0)),
+        LoopNoise(dataset.noise, parameters),
         Stand(command_limits(problem, voltage), delay),
         generator(seed, "track"),
         robustness=Robustness(gain_margin, phase_margin),
