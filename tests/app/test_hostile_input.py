@@ -39,7 +39,7 @@ from tests.app.mutations import KINDS, QUICK, Case, case, made
 from tests.measured import keep
 
 SEED = 1
-FEW, ALL, FITTED = 300, 10_000, 2
+FEW, ALL = 300, 10_000
 SECONDS = 10  # of processor time, for a case that takes some hundredths
 LONGEST_LINE = 700
 
