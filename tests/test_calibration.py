@@ -49,7 +49,7 @@ from tests.together import (
 )
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "calibration.toml"
-FEW = 10
+FEW = 7
 
 FULL = 500
 
