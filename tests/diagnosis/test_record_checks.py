@@ -116,14 +116,22 @@ def without_memory(seed: int, loop: float = 0.0) -> Record:
     return Record(voltage, 10 * ((1 - 5 * loop) * curve + 5 * loop * np.array(play) + error), 1e-3)
 
 
-def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not() -> None:
-    """Of 100 records four are not named by chance once in 50 times; loops are 1 % of the range."""
-    named = [
-        [len(findings_of("no hysteresis", without_memory(seed, loop))) for seed in range(100)]
+@pytest.mark.parametrize(
+    ("records", "named"), [(40, 38), pytest.param(100, 97, marks=pytest.mark.slow)]
+)
+def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not(
+    records: int, named: int
+) -> None:
+    """Of 100 records four are not named by chance once in 50 times, of 40 three once in 100.
+
+    Loops are 1 % of the range.
+    """
+    found = [
+        [len(findings_of("no hysteresis", without_memory(seed, loop))) for seed in range(records)]
         for loop in (0.0, 0.01)
     ]
-    assert 97 <= sum(named[0])
-    assert 0 == sum(named[1])
+    assert named <= sum(found[0])
+    assert 0 == sum(found[1])
 
 
 def test_of_the_measured_record_only_its_start_is_remarked_on() -> None:

@@ -131,7 +131,7 @@ def of_operator(
 
 @pytest.mark.parametrize("name", HYSTERESIS)
 @given(VOLTAGES, st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 def test_engines_agree_on_any_path(name: str, path: list[float], seed: int) -> None:
     """Plateaus, steps, turns at every sample; whole tens meet extrema and ends of the span."""
     usual, reading = of_operator(name), np.random.default_rng(seed).normal(size=len(path))
