@@ -1,6 +1,6 @@
 """The notebooks run from top to bottom, and are stored as such a run leaves them.
 
-Two run in the default suite, all with ``-m slow``.
+One runs in the default suite, all with ``-m slow``.
 
 After a change, ``jupyter execute --inplace notebooks/NAME.ipynb`` stores the new outputs.
 """
@@ -24,7 +24,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST_FILE = 600_000
 LONGEST_CELL = 300  # s
 
-QUICK = {"quickstart", "reading_the_paper"}
+QUICK = "reading_the_paper"
 
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -42,7 +42,7 @@ def outputs_as_text(outputs: list[Any]) -> str:
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
+        pytest.param(path, id=path.stem, marks=() if path.stem == QUICK else pytest.mark.slow)
         for path in NOTEBOOKS
     ],
 )
