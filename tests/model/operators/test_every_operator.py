@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -104,6 +104,7 @@ corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, m
 @every_operator
 @settings(deadline=None, max_examples=10)
 @given(path=corners, seed=st.integers(0, 9), holds=st.lists(st.integers(1, 3), min_size=6))
+@example(path=[-15.4, 39.9], seed=8, holds=[1] * 6)  # d u and h nearly cancel
 def test_neither_the_pace_nor_the_batch_matters(
     name: str, path: list[float], seed: int, holds: list[int]
 ) -> None:
@@ -113,9 +114,11 @@ def test_neither_the_pace_nor_the_batch_matters(
     repeats = np.array(holds[: len(path)])
     slow = run(operator, column, np.repeat(path, repeats))
     assert_near(name, np.repeat(w, repeats, axis=1), slow)
+    # As far as a difference of terms as large as the voltage has digits.
+    rounding = 1e-13 + 1e-14 * np.abs(path).max()
     for row in (0, 4):
         alone = run(operator, {k: v[row : row + 1] for k, v in column.items()}, np.array(path))
-        np.testing.assert_allclose(alone[0], w[row], rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(alone[0], w[row], rtol=1e-13, atol=rounding)
 
 
 @every_operator
