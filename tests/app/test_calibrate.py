@@ -145,7 +145,7 @@ def test_more_replicates_can_be_asked_for(whole: Path, tmp_path: Path) -> None:
 def test_request_to_stop_is_answered_with_how_to_go_on(
     bwbayes: Type, whole: Path, tmp_path: Path
 ) -> None:
-    """With two workers it then ends in the same bytes: half a line is made again."""
+    """With two threads it then ends in the same bytes: half a line is made again."""
     (tmp_path / "small.toml").write_text(TEXT)
     command = small.command(
         "calibrate", "small.toml", "--replicates", "3", "--out", "a", "--quiet", "--workers", "1"
@@ -166,7 +166,7 @@ def test_request_to_stop_is_answered_with_how_to_go_on(
     assert not (tmp_path / "a/calibration.json").exists()
     with lines.open("ab") as file:
         file.write(b'{"number": 2, "ra')  # cut off
-    done = bwbayes("calibrate", "--resume", "a", "--workers", "2")
+    done = bwbayes("calibrate", "--resume", "a", "--workers", "2", "--executor", "threads")
     assert 0 == done.status, done.err
     texts = ("log_likelihood", "loop_area", "95 %", "sensor", "power", "3 replicates, 0 not")
     for text in (*texts, "low power: more replicates are needed"):

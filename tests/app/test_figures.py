@@ -28,6 +28,7 @@ from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
 from bwbayes.report.figures.style import Color, envelope, zigzag
 from bwbayes.report.page import NO_PLOTS
+from bwbayes.report.result import Result
 from tests.app import example
 
 
@@ -227,8 +228,14 @@ class Broken(Executor):
         return future
 
 
+def short() -> Result:
+    """Return a run of few samples."""
+    training = example.bands("training", 300, 0, training=True)
+    return example.run(every=(training, example.bands(samples=300, lead_in=30)))
+
+
 def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
-    run = example.run()
+    run = short()
     with artist_of(2) as artist:
         if artist.pool is None:
             pytest.skip("this machine has one core")
@@ -254,6 +261,6 @@ def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
 
 
 def test_pictures_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
-    artist, run = Artist(Broken()), example.run()
+    artist, run = Artist(Broken()), short()
     artist.draw(run)
     assert list(pictures(run)) == list(artist.drawn(run, tmp_path)[0])

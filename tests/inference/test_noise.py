@@ -77,7 +77,7 @@ def whitened(
     st.one_of(st.none(), QUALITIES),
     st.lists(st.integers(0, 300), min_size=1, max_size=60, unique=True),
 )
-@settings(deadline=None, max_examples=120)
+@settings(deadline=None, max_examples=60)
 def test_whitening_is_that_of_a_dense_covariance(
     seed: int, time: float, quality: float | None, readings: list[int]
 ) -> None:
