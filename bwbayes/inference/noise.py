@@ -5,6 +5,7 @@ Each is a :class:`~bwbayes.inference.state_space.Noise` that says how its discre
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -45,13 +46,15 @@ DISCREPANCY_TIME = Declaration(
     lambda context: lognormal(0.5 * context.ranges.time, 0.8),
     floor=0.0,
 )
-# What swings knows hardly anything at low frequencies: it takes a slow misfit for the parameters'.
+# Up to 1/√2 the spectrum, ∝ 1/((ω² − ω₀²)² + ω² ω₀²/Q²), has no peak. What resonates has hardly
+# anything at low frequencies, so that a slow misfit is taken for the parameters'. Were 1/2 the
+# most, low ones would be extrapolated from high ones, the more the finer a record is sampled.
 DISCREPANCY_QUALITY = Declaration(
     "discrepancy_quality",
     "",
     "Q",
     "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
-    lambda _: Distribution("uniform", {"lower": 0.0, "upper": 0.5}),
+    lambda _: Distribution("uniform", {"lower": 0.0, "upper": math.sqrt(0.5)}),
     floor=0.0,
 )
 
@@ -143,9 +146,10 @@ class SmoothNoise(Noise):
 
         ẍ + (ω/Q) ẋ + ω² x = white noise,   ω = 1/(τ Q),   τ = ∫₀^∞ ρ(t) dt.
 
-    Q = 1/2 is a Matérn process of order 3/2; for Q → 0 it becomes an Ornstein-Uhlenbeck process of
-    the same σ and τ, and beyond 1/2 it swings. The states are x and ẋ/ω. With the rates a ≤ b that
-    solve λ² − λ ω/Q + ω² = 0, and S(t) = (e^(−a t) − e^(−b t))/(b − a):
+    Q = 1/2 is a Matérn process of order 3/2, 1/√2 the one whose spectrum is as level as can be up
+    to its corner; for Q → 0 it becomes an Ornstein-Uhlenbeck process of the same σ and τ. The
+    states are x and ẋ/ω. With the rates a ≤ b that solve λ² − λ ω/Q + ω² = 0, and
+    S(t) = (e^(−a t) − e^(−b t))/(b − a):
 
         F(t) = [[e^(−a t) + a S,  ω S], [−ω S,  e^(−b t) − a S]].
 
