@@ -97,7 +97,7 @@ class _Plan:
             self.posterior, self.draws, self.record(voltage), self.start, self.rng()
         )
         theta = self.posterior.prior.theta(self.draws)
-        theta = self.posterior.noise_of_new(theta, np.random.default_rng(len(theta)))
+        theta = self.posterior.noise_of_new(theta)
         noise, rng = self.posterior.only.noise.at(self.reference.interval), self.rng()
         rms, largest, squares = np.empty((3, len(theta), 2))
         for rows, displacement in self.displacements(voltage):

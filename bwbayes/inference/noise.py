@@ -167,25 +167,15 @@ class SmoothNoise(Noise):
         """Sds of sensor and discrepancy, the discrepancy's correlation time and quality."""
         return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME, DISCREPANCY_QUALITY)
 
-    def for_new_readings(
-        self,
-        theta: FloatArray,
-        missed: Callable[[], float],
-        readings: int,
-        generator: np.random.Generator,
-    ) -> FloatArray:
+    def for_new_readings(self, theta: FloatArray, missed: Callable[[], float]) -> FloatArray:
         """Take the discrepancy's size from the residuals, not from the kernel.
 
         Readings fix how the process moves at high frequencies, σ²/τ³; what σ adds at low ones is an
-        extrapolation, often of several times what was seen. So a draw's variance is the mean
-        square of the residuals less the sensor's, times ν/χ²(ν): over a time T they are worth
-        ν = T/∫ρ² = T/(τ (1 + Q²)) independent ones, or two at least.
+        extrapolation. What the models' mean misses has the mean square σ² + s², less the part that
+        the fit took into the parameters, whose own uncertainty a band has besides.
         """
-        _, _, time, quality = theta.T
-        worth = np.maximum(readings * self.interval / (time * (1 + quality**2)), 2.0)
-        seen = np.maximum(missed() - theta[:, 0] ** 2, 0.0)
         sized = theta.copy()
-        sized[:, 1] = np.sqrt(seen * worth / generator.chisquare(worth))
+        sized[:, 1] = np.sqrt(np.maximum(missed() - theta[:, 0] ** 2, 0.0))
         return sized
 
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:

@@ -233,7 +233,7 @@ class Posterior:
             moving = None if unrest is None else unrest[batch]
             yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
-    def noise_of_new(self, theta: FloatArray, generator: np.random.Generator) -> FloatArray:
+    def noise_of_new(self, theta: FloatArray) -> FloatArray:
         """Return the noise's parameters (models, its own) for readings that were not fitted.
 
         Of a posterior of one record; ``theta`` (models, parameters) are draws from it.
@@ -246,10 +246,7 @@ class Posterior:
                 total += simulated.sum(axis=0)
             return float(np.mean((readings.values - total / len(theta)) ** 2))
 
-        parameters = self.only.table.noise(theta)
-        return self.likelihood.spaced.for_new_readings(
-            parameters, missed, readings.rows.size, generator
-        )
+        return self.only.noise.for_new_readings(self.only.table.noise(theta), missed)
 
     def altered(self, **fields: Any) -> Posterior:
         """Return a posterior of one record with other fields of its dataset."""

@@ -95,13 +95,11 @@ class Noise(ABC):
         self,
         theta: FloatArray,
         missed: Callable[[], float],  # noqa: ARG002  # the kernel says the size
-        readings: int,  # noqa: ARG002
-        generator: np.random.Generator,  # noqa: ARG002
     ) -> FloatArray:
         """Return θ (models, parameters) with the discrepancy's size where nothing was fitted.
 
-        ``missed`` returns the mean square, um², of what the models' mean misses of so many
-        fitted readings. By default θ as it is.
+        ``missed`` returns the mean square, um², of what the models' mean misses of the fitted
+        readings. By default θ as it is.
         """
         return theta
 

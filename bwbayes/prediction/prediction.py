@@ -179,7 +179,7 @@ def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
     # The same for all predictions: bands differ by what is predicted, not by chance.
     generator = np.random.default_rng(len(theta))
     scores = mixture.stratified_scores(len(theta), generator)
-    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta, generator))
+    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta))
     return _Draws(start, *sds, scores)
 
 

@@ -313,7 +313,7 @@ def track(
     free = thinned(fit.flat_draws, generator(seed, "draws"))
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.alone(dataset.name)
-    parameters = alone.noise_of_new(theta[:draws], generator(seed, "noise"))
+    parameters = alone.noise_of_new(theta[:draws])
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
