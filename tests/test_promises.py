@@ -135,6 +135,16 @@ FIGURES: dict[str, list[str]] = {
         "sum every k-th sample*/within one sd/*/1",
         "extent every k-th sample*/covered/*/95",
     ],
+    "-m slow tests/test_sampling_rates.py": [
+        *(f"100 one answer at any rate/{key} *" for key in ("within one", "sds within")),
+        *(f"one answer at any rate/error ratio/{number}" for number in range(2)),
+        "extent 100 one answer at any rate/coverage/*/95",
+        *(
+            f"100 a {kind} discrepancy of {time} s/coverage/95"
+            for kind in ("smooth", "rough")
+            for time in (0.04, 0.2, 0.5, 1.3)
+        ),
+    ],
     "-m slow tests/test_spoilt_readings.py": [
         "spikes set aside/found",
         "spikes set aside/spikes",

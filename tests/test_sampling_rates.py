@@ -1,13 +1,15 @@
 """One answer at any sampling rate, where the model cannot follow: ten plants of forty plays.
 
-Bouc-Wen hysteresis with a smooth discrepancy is fitted to 4 s of each plant at 5 kHz, with every
-reading, every 5th, 25th and 100th (the drive stays whole), and predicts another record of it. What
-the model misses is smooth and the same at all rates, so that fewer readings must not tell more: a
-rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
+Bouc-Wen hysteresis, with the noise that has most evidence, is fitted to 4 s of each plant at 5 kHz,
+with every reading, every 5th, 25th and 100th (the drive stays whole), and predicts another record
+of it. What the model misses is smooth and the same at all rates, so that fewer readings must not
+tell more: a rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -18,8 +20,9 @@ import pytest
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.noise import SmoothNoise
+from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.model.actuator import Actuator
+from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
@@ -37,14 +40,17 @@ SHAPE = ("d", "alpha", "beta")
 class Answer(NamedTuple):
     """Means and sds (parameters,) of :data:`SHAPE`, the sensor's sd, and of another record.
 
-    ``error`` is the mean's root mean square, um; ``coverage`` the 95 % sensor band's.
+    ``noise`` is what was fitted; ``error`` the mean's root mean square, um; ``coverage`` the sensor
+    bands' by level, and ``width`` the 95 % one's, um.
     """
 
+    noise: str
     mean: FloatArray
     sd: FloatArray
     sensor: float
     error: float
-    coverage: float
+    coverage: dict[int, float]
+    width: float
 
 
 def drive(rng: np.random.Generator) -> FloatArray:
@@ -100,50 +106,60 @@ def answer(fitted: Record, other: Record, every: int, noise: str, folder: Path) 
     sd = np.sqrt(weights @ (draws[:, columns] - mean) ** 2)
     sensor = float(weights @ draws[:, problem.posterior.names.index("sensor_sd")])
     error = float(np.sqrt(np.mean((bands.measured - bands.mean) ** 2)))
-    return Answer(mean, sd, sensor, error, covered(bands))
+    coverage = {level: covered(bands, level) for level in LEVELS}
+    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+    return Answer(problem.config.model.noise, mean, sd, sensor, error, coverage, width)
 
 
-def judged(plants: int, noise: str, folder: Path) -> dict[str, Any]:
+def judged(seeds: Iterable[int], noise: str, folder: Path) -> dict[str, Any]:
     """Return how far answers at all rates are one."""
-    apart, ratios, sensors, errors = [], [], [], []
-    coverage: dict[str, list[float]] = {f"{RATE / every:g}": [] for every in EVERY}
-    for seed in range(plants):
+    apart, ratios, answers = [], [], []
+    for seed in seeds:
         fitted, other = records(seed)
-        answers = [answer(fitted, other, every, noise, folder) for every in EVERY]
-        for one, two in combinations(answers, 2):
+        every = [answer(fitted, other, every, noise, folder) for every in EVERY]
+        for one, two in combinations(every, 2):
             apart += list(np.abs(one.mean - two.mean) / np.maximum(one.sd, two.sd))
             ratios += list(np.exp(np.abs(np.log(one.sd / two.sd))))
-        sensors.append([one.sensor / SENSOR for one in answers])
-        # At 5 kHz over that at 200 Hz.
-        errors.append(answers[0].error / answers[2].error)
-        for values, one in zip(coverage.values(), answers, strict=True):
-            values.append(one.coverage)
+        answers.append(every)
+    # At 5 kHz over that at 200 Hz.
+    errors = [every[0].error / every[2].error for every in answers]
+    names = [f"{RATE / every:g}" for every in EVERY]
+    rates = dict(zip(names, zip(*answers, strict=True), strict=True))
+    sensors = {r: [one.sensor / SENSOR for one in every] for r, every in rates.items()}
     return {
-        "plants": plants,
+        "plants": len(answers),
         "within one sd": float(np.mean(np.array(apart) < 1)),
         "sds within 1.5": float(np.mean(np.array(ratios) < 1.5)),
         "largest ratio of sds": float(np.max(ratios)),
-        "sensor": [[float(np.min(s)), float(np.max(s))] for s in np.transpose(sensors)],
+        "sensor": {rate: [min(values), max(values)] for rate, values in sensors.items()},
         "error ratio": [float(np.median(errors)), float(np.max(errors))],
-        "coverage": {rate: [float(np.mean(v)), float(np.min(v))] for rate, v in coverage.items()},
+        "noise": dict(Counter(one.noise for every in answers for one in every)),
+        "width": {rate: float(np.mean([one.width for one in e])) for rate, e in rates.items()},
+        "coverage": {rate: coverage(every) for rate, every in rates.items()},
     }
+
+
+def coverage(answers: Sequence[Answer]) -> dict[str, float]:
+    """Return the mean coverage by level, and the lowest of the 95 % bands."""
+    means = {str(v): float(np.mean([one.coverage[v] for one in answers])) for v in LEVELS}
+    return means | {"lowest": min(one.coverage[95] for one in answers)}
 
 
 @pytest.mark.slow
 def test_one_answer_at_any_rate(tmp_path: Path) -> None:
-    """Asked are 90 % within one sd, errors at 5 kHz at most 1.1 times those at 200 Hz, 90 to 99 %.
+    """Asked: 90 % within one sd and a factor of 1.5, errors within 1.1 times, coverage 90 to 99 %.
 
-    Of what is asked this holds the first in full; the largest ratio of errors is 1.2, and bands are
-    wider than they need be at high rates. The sensor's sd is right from 200 Hz on: fewer readings
-    hardly show it.
+    One plant's error is 1.12 times as large. The sensor's sd is right from 200 Hz on: fewer
+    readings hardly show it.
     """
-    result = judged(PLANTS, "smooth", tmp_path)
+    result = judged(range(PLANTS), "auto", tmp_path)
     keep("one answer at any rate", result)
     assert result["within one sd"] >= 0.9
-    assert result["sds within 1.5"] >= 0.85
-    assert result["error ratio"][1] < 1.3
-    assert all(0.9 < low <= high < 1.1 for low, high in result["sensor"][:3])
-    assert all(mean > 0.94 for mean, _ in result["coverage"].values())
+    assert result["sds within 1.5"] >= 0.9
+    assert result["error ratio"][0] < 1.1
+    assert result["error ratio"][1] < 1.15
+    assert all(0.9 < low <= high < 1.1 for low, high in [*result["sensor"].values()][:3])
+    assert all(0.9 <= covers["95"] <= 0.99 for covers in result["coverage"].values())
 
 
 def test_one_plant_has_one_answer_and_the_twin_has_not(tmp_path: Path) -> None:
@@ -157,22 +173,34 @@ def test_one_plant_has_one_answer_and_the_twin_has_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("time", [0.05, 0.3])
-def test_bands_are_right_where_the_discrepancy_is_the_models(time: float, tmp_path: Path) -> None:
-    """Twelve records each: the mean coverage is known to 1.5 and 3 points, by their spread."""
+@pytest.mark.parametrize("time", [0.04, 0.2, 0.5, 1.3])
+@pytest.mark.parametrize("kind", ["smooth", "rough"])
+def test_bands_where_the_discrepancy_is_the_models(kind: str, time: float, tmp_path: Path) -> None:
+    """Twelve records of 4 s each; the mean coverage is known to 1 to 8 points, by their spread.
+
+    Bands are right where a record is many times as long as its discrepancy's correlation time; one
+    of eight times or three does not show how large that gets. A rough discrepancy is called rough,
+    so that its bands are those of before.
+    """
     actuator = Actuator("lag", "first", 1 / RATE)
     truth = {"d": 0.7, "alpha": 0.35, "beta": 0.027, "gamma": 0.012, "exponent": 1.0, "lag": 0.005}
     model = np.array([[truth.get(name, 0.0) for name in actuator.parameters]])
-    coverage = []
+    noise = SmoothNoise(1 / RATE) if kind == "smooth" else DiscrepancyNoise(1 / RATE)
+    theta = np.array([[SENSOR, 1.0, time, 0.4][: len(noise.declarations)]])
+    answers = []
     for seed in range(12):
         rng = np.random.default_rng([5, seed])
         made: list[Record] = []
         for _ in range(2):
             voltage = 0.9 ** len(made) * drive(rng)
-            noise = SmoothNoise(1 / RATE)
-            added = noise.draw(np.array([[SENSOR, 1.0, time, 0.4]]), voltage.size, rng)
+            added = noise.draw(theta, voltage.size, rng)
             reading = actuator.displacement(model, voltage)[0] + np.sum(added, axis=0)
             made.append(Record(voltage, reading, 1 / RATE))
-        coverage.append(answer(made[0], made[1], 25, "smooth", tmp_path).coverage)
-    keep(f"a smooth discrepancy of {time} s", {"coverage": float(np.mean(coverage))})
-    assert 0.88 < np.mean(coverage) <= 0.98
+        answers.append(answer(made[0], made[1], 25, "auto", tmp_path))
+    chosen, covers = Counter(one.noise for one in answers), coverage(answers)
+    width = float(np.mean([one.width for one in answers]))
+    figures = {"coverage": covers, "noise": dict(chosen), "width": width}
+    keep(f"a {kind} discrepancy of {time} s", figures)
+    assert chosen == {"smooth" if kind == "smooth" else "discrepancy": 12}
+    if time < 0.5:
+        assert 0.9 < covers["95"] < 0.98

@@ -16,7 +16,8 @@ from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.running.explaining import explained
+from bwbayes.app.problem.records import generator
+from bwbayes.app.running.explaining import chosen_noise, explained
 from bwbayes.app.running.predictions import judged
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Background, Verdict
@@ -50,8 +51,15 @@ class Judged:
 
 
 def problem_of(text: str, folder: Path) -> Problem:
-    """Resolve a config's text, its files in ``folder``."""
-    return resolve(parse(text, "config"), folder)
+    """Resolve a config's text, its files in ``folder``; its noise is chosen as a run does it."""
+    config = parse(text, "config")
+    problem = resolve(config, folder)
+    if config.model.noise != "auto":
+        return problem
+    point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
+    noise, _ = chosen_noise(problem, point)
+    model = config.model.model_copy(update={"noise": noise})
+    return resolve(config.model_copy(update={"model": model}), folder)
 
 
 def posterior_draws(
