@@ -107,12 +107,6 @@ def climb(
     return target.fitted(target.climb(max(climbed, key=lambda state: state.density), ROUNDS))
 
 
-def climb_each(posterior: Posterior, places: FloatArray) -> list[LocalFit]:
-    """Fit from each of coordinates (places, free) of a posterior of one record."""
-    target = _Target(posterior, NONE)
-    return [target.fitted(target.climb(target.at(row), ROUNDS)) for row in places]
-
-
 @dataclass(frozen=True)
 class _State:
     """Where a climb is: coordinates (free + sizes,), log density, displacement (readings,)."""

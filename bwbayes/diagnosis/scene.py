@@ -12,7 +12,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb, climb_each
+from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
@@ -128,12 +128,12 @@ class Scene:
         places = optima
         try:
             rest = posterior.altered(training=later)
-            fits = climb_each(rest, map_estimate.valleys(rest, generator))
+            fits = [climb(rest, valley) for valley in map_estimate.valleys(rest, generator)]
             best = max(fits, key=lambda fit: fit.log_density)
             places = np.concatenate([optima, best.coordinates[np.newaxis]])
         except InputError:
             pass  # the rest has too few readings for these priors
-        best = max(climb_each(posterior, places), key=lambda fit: fit.log_evidence)
+        best = max((climb(posterior, p) for p in places), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
         return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
