@@ -32,28 +32,22 @@ def refused(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "path", "nearest"),
-    [
-        ("sead = 1\n" + RECORD, "sead", "seed"),
-        ('[recrod]\nfile = "a.csv"\n', "recrod", "record"),
-        ("[record]\nsignal = {amplitud = 1.0}", "record.signal.amplitud", "amplitude"),
-        (RECORD + "[parameters.d]\nfixd = 1.0", "parameters.d.fixd", "fixed"),
-        (
-            RECORD + "[validation.a]\nsignal = {amplitude = 1.0, frequncy = 1.0, duration = 1.0}",
-            "validation.a.signal.frequncy",
-            "frequency",
-        ),
-    ],
-)
-def test_unknown_key_is_named_with_its_path_and_the_nearest(
-    text: str, path: str, nearest: str
-) -> None:
-    assert f"{path}: unknown key; did you mean {nearest}?" == refused(text)
-
-
-@pytest.mark.parametrize(
     ("text", "hint"),
     [
+        ("sead = 1\n" + RECORD, "sead: unknown key; did you mean seed?"),
+        ('[recrod]\nfile = "a.csv"\n', "recrod: unknown key; did you mean record?"),
+        (
+            "[record]\nsignal = {amplitud = 1.0}",
+            "signal.amplitud: unknown key; did you mean amplitude?",
+        ),
+        (
+            RECORD + "[parameters.d]\nfixd = 1.0",
+            "d.fixd: unknown key; did you mean fixed?",
+        ),
+        (
+            RECORD + "[validation.a]\nsignal = {amplitude = 1.0, frequncy = 1.0, duration = 1.0}",
+            "validation.a.signal.frequncy: unknown key; did you mean frequency?",
+        ),
         (RECORD + "[sampling]\ndraws = 100", "sampling.draws: unknown key; did you mean ess?"),
         (RECORD + "xyzzy = 1", "record.xyzzy: unknown key; known are file, signal, voltage_is, "),
         (RECORD + "seed = 3", "record.seed: unknown key; it belongs above the first table"),
@@ -77,6 +71,11 @@ def test_unknown_key_is_named_with_its_path_and_the_nearest(
         (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
         ("seed = 9223372036854775808\n" + RECORD, "seed"),
         (f"seed = 0x{5000 * 'f'}\n{RECORD}", "seed: "),
+        (RECORD + "train = [[0.0, nan]]", "finite"),
+        (
+            RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan, sd = 1.0}",
+            "finite",
+        ),
     ],
 )
 def test_hints_are_near_in_meaning_or_all_keys(text: str, hint: str) -> None:
@@ -131,17 +130,6 @@ def test_wrong_value_is_named_with_its_path(text: str, path: str) -> None:
     assert said.startswith(f"{path}")
     assert re.match(r"[:.]", said.removeprefix(path))
     assert said.endswith("; correct it")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        RECORD + "train = [[0.0, nan]]",
-        RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan, sd = 1.0}",
-    ],
-)
-def test_number_that_is_not_finite_is_refused(text: str) -> None:
-    assert "finite" in refused(text)
 
 
 @pytest.mark.parametrize(
