@@ -244,3 +244,18 @@ def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
     config = small.config(("from_rest = true", f"lead_in = {lead_in}"))
     with pytest.raises(InputError, match=r"validation\.sine\.lead_in: "):
         resolve(config, tmp_path)
+
+
+def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Path) -> None:
+    def records(seed: int) -> tuple[str | None, ...]:
+        problem = resolve(small.config(("seed = 3", f"seed = {seed}")), tmp_path)
+        assert "zero" == problem.posterior.only.actuator.hold
+        truth = problem.config.truth
+        names = ("d", "alpha", "beta", "sensor_sd")
+        assert (0.7, 0.3575, 0.0272, 0.5) == tuple(truth[name] for name in names)
+        assert "mass" not in truth
+        sine = problem.validations["sine"].record
+        return problem.record.sha256, sine.sha256 if sine else None
+
+    assert records(1) == records(1)
+    assert not {*records(1)} & {*records(2), None}
