@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.config.config import parse
+from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
 from bwbayes.app.running.campaign import Campaign, Row
@@ -147,6 +147,19 @@ def test_a_finished_campaign_fits_nothing_again(
     assert [["broken"], ["broken", "s002"]] == asked
     assert folder.is_done(file)
     assert_same_end(whole, folder.path)
+
+
+def test_a_run_whose_noise_was_chosen_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(CONFIG.replace('noise = "white"', 'noise = "auto"'))
+    specimens(tmp_path / "records", 1)
+    folder = begun(tmp_path, tmp_path / "batch")
+    assert ended(folder).exit_status == 0
+    run = folder.run("s000")
+    assert load(run / "config.toml").model.noise != "auto"
+    before = (run / "chain").stat().st_mtime_ns
+    (run / "ended.json").unlink()
+    assert ended(folder).exit_status == 0
+    assert before == (run / "chain").stat().st_mtime_ns
 
 
 def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_path: Path) -> None:

@@ -155,8 +155,12 @@ def test_a_wrong_command_is_one_line(
     bwbayes("compare", *arguments).assert_refused(text)
 
 
-def test_a_config_is_run_with_each_model_and_gone_on_with(bwbayes: Type, tmp_path: Path) -> None:
-    (tmp_path / "c.toml").write_text(CONFIG, encoding="utf-8")
+@pytest.mark.parametrize("noise", ["white", "auto"])
+def test_a_config_is_run_with_each_model_and_gone_on_with(
+    bwbayes: Type, tmp_path: Path, noise: str
+) -> None:
+    config = CONFIG.replace("white", noise)
+    (tmp_path / "c.toml").write_text(config, encoding="utf-8")
     bw.write_record(measured(), tmp_path / "record.csv")
     options = "--models", "linear; bouc-wen", "--no-future", "--workers", "1", "--out", "out"
     said = bwbayes("compare", "c.toml", *options)
@@ -172,7 +176,7 @@ def test_a_config_is_run_with_each_model_and_gone_on_with(bwbayes: Type, tmp_pat
     assert 0 == bwbayes("compare", "c.toml", *options).status
     after = ChainFile.read(tmp_path / "out/bouc-wen/chain").coordinates("sampling")
     np.testing.assert_array_equal(before, after)
-    (tmp_path / "c.toml").write_text(CONFIG.replace("seed = 3", "seed = 4"), encoding="utf-8")
+    (tmp_path / "c.toml").write_text(config.replace("seed = 3", "seed = 4"), encoding="utf-8")
     (tmp_path / "out/comparison.json").unlink()
     said = bwbayes("compare", "c.toml", *options)
     assert 2 == said.status

@@ -221,7 +221,9 @@ def _run_folder(path: Path, problem: Problem) -> RunFolder:
         try:
             existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            same_posterior = fingerprint(load(existing.config)) == fingerprint(problem.config)
+            config = load(existing.config)
+            expected = problem.with_noise(config.model.noise)
+            same_posterior = fingerprint(config) == fingerprint(expected)
             if same_posterior and existing.problem().record.sha256 == problem.record.sha256:
                 return existing
         except (InputError, OSError):

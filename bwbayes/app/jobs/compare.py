@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, dump
+from bwbayes.app.config.config import Config, dump, load
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
@@ -291,7 +291,8 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
     """Make a model's folder, or take the one that is there, if it is the same run's."""
     if path.exists() and not overwrite:
         folder = RunFolder.open(path)
-        if folder.config.read_text(encoding="utf-8") != dump(problem.config):
+        expected = problem.with_noise(load(folder.config).model.noise)
+        if folder.config.read_text(encoding="utf-8") != dump(expected):
             raise InputError(
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )

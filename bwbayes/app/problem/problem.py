@@ -198,6 +198,19 @@ class Problem:
         shared = {n: p for n, p in stated.items() if n in units and p.unit in (None, units[n])}
         return config.model_copy(update={"model": model, "parameters": shared, "truth": {}})
 
+    def with_noise(self, chosen: str) -> Config:
+        """Return the config as a run writes it whose noise, ``auto``, came to this one.
+
+        As it is, if it names a noise, or none is chosen yet.
+        """
+        model = self.config.model
+        if model.noise != "auto" or chosen == "auto":
+            return self.config
+        if chosen == model.noise_until_chosen:
+            named = model.model_copy(update={"noise": chosen})
+            return self.config.model_copy(update={"model": named})
+        return self.changed(self.config, {"noise": chosen}, {})
+
     def windows(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record by the names of their bands, fitted ones first.
 

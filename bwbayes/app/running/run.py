@@ -184,13 +184,9 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
     if config.model.noise == "auto":
         noise, why = chosen_noise(problem, point)
         console.print(why, highlight=False, soft_wrap=True)
-        if noise == config.model.noise_until_chosen:
-            model = config.model.model_copy(update={"noise": noise})
-            _rewrite(folder, config.model_copy(update={"model": model}))
-            problem = folder.problem()
-        else:
-            _rewrite(folder, problem.changed(config, {"noise": noise}, {}))
-            problem = folder.problem()
+        _rewrite(folder, problem.with_noise(noise))
+        problem = folder.problem()
+        if noise != config.model.noise_until_chosen:
             point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
     posterior, config = problem.posterior, problem.config
     attributes: dict[str, str | int] = {
