@@ -9,7 +9,7 @@ the answer itself.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
+
+# A mode that is less probable than the best one by so many nats holds nothing of the posterior, and
+# an ensemble that starts there stays for hundreds of steps.
+NEGLIGIBLE = 30.0
 
 
 @dataclass(frozen=True)
@@ -54,17 +58,22 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     InputError
         No prior draw has a finite posterior density.
     """
-    places, spread = _places(posterior, generator)
+    places, noise, spread = _places(posterior, generator)
     modes: list[_Mode] = []
-    for position in places:
+
+    def climb(position: FloatArray) -> None:
         mode = _mode(posterior, position, spread, modes)
         if mode is not None:
             modes.append(mode)
-    modes.sort(key=lambda mode: -mode.log_density)
+            modes.sort(key=lambda mode: -mode.log_density)
+
+    for position in places:
+        climb(position)
+    for position, log_density in _at_rest(posterior, modes[0].position, noise):
+        if log_density > modes[0].log_density - 2 * NEGLIGIBLE:  # it may yet climb
+            climb(position)
     best = modes[0]
-    # One by 30 nats less probable holds nothing of the posterior, and an ensemble that starts there
-    # stays for hundreds of steps.
-    worth = [m.position for m in modes if m.log_density > best.log_density - 30.0]
+    worth = [m.position for m in modes if m.log_density > best.log_density - NEGLIGIBLE]
     optima = distinct(worth, best.covariance)
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 
@@ -98,8 +107,8 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
 
 def _places(
     posterior: Posterior, generator: np.random.Generator
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return places (free,) to climb from, and the covariance of prior draws."""
+) -> tuple[list[FloatArray], FloatArray, FloatArray]:
+    """Return places (free,) to climb from; of prior draws, the noise and the covariance."""
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(generator, 4 * DRAWS))
     center, spread = np.median(draws, axis=0), np.atleast_2d(np.cov(draws, rowvar=False))
@@ -117,7 +126,27 @@ def _places(
     possible = np.isfinite(posterior.log_density(np.stack(places)))
     likeliest = draws[int(np.argmax(density))]
     climbed = [position for position, is_so in zip(places, possible, strict=True) if is_so]
-    return climbed or [likeliest], spread
+    return climbed or [likeliest], noise, spread
+
+
+def _at_rest(
+    posterior: Posterior, position: FloatArray, noise: FloatArray
+) -> Iterator[tuple[FloatArray, float]]:
+    """Yield a place (free,) with one noise parameter at its prior's center, and its log density.
+
+    Few readings may leave open whether a discrepancy is there at all. Where it is next to nothing,
+    as its prior's center is, all is the sensor's noise: another mode, which no step from the first
+    one finds. The other noise parameters are the most probable of prior draws (draws, noise).
+    """
+    size = noise.shape[1]
+    physical = np.tile(position[: position.size - size], (len(noise), 1))
+    for column in range(size):
+        resting = noise.copy()
+        resting[:, column] = 0.0
+        places = np.hstack([physical, resting])
+        density = posterior.log_density(places)
+        best = int(np.argmax(density))
+        yield places[best], float(density[best])
 
 
 def _with_noise(
