@@ -87,11 +87,11 @@ class AmongPlaces(moves.Move):  # type: ignore[misc]  # emcee has no types
         return which, accepted, chosen
 
 
-def pilot_moves(proposal: StudentMixture | None = None, places: int = 1) -> Weighted:
+def pilot_moves(proposal: StudentMixture | None = None) -> Weighted:
     """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
     if proposal is None:
         return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
-    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (AmongPlaces(proposal, places), 0.5)]
+    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (AmongPlaces(proposal), 0.5)]
 
 
 def sampling_moves(proposal: StudentMixture | None, places: int = 1) -> Weighted:

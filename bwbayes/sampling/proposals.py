@@ -9,6 +9,7 @@ of posterior to proposal bounded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
@@ -55,13 +56,20 @@ class StudentMixture:
     freedom: float = 6.0
 
     @classmethod
-    def fitted(cls, draws: FloatArray, log_density: FloatArray | None = None) -> StudentMixture:
+    def fitted(
+        cls,
+        draws: FloatArray,
+        log_density: FloatArray | None = None,
+        guess: StudentMixture | None = None,
+    ) -> StudentMixture:
         """Fit to draws (count, free), by expectation maximization of a Gaussian mixture.
 
         Of three components, or up to six where draws are many: few would be followed too closely.
         With their log densities (count,) under what they are drawn from, the mixture gets one more
         component, of the draws where log p − log q is largest: a walker that is there would hardly
-        be led away.
+        be led away. Modes that a first ``guess`` has beside the most probable one get a component
+        each, and as much as a twentieth of the draws would give it, however few there are: a mode
+        that is not proposed is not found again. What bends the coordinates is the first mode.
 
         Raises
         ------
@@ -69,18 +77,24 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
-        bend = QuadraticMap.fitted(draws)
+        count, straightened, modes = len(draws), draws, draws[:0]
+        if guess is not None and guess._lesser:
+            straightened = draws[guess._mode_of(draws) == 0]
+            draws = np.concatenate([draws, guess._stand_ins(count // 20)])
+            modes = guess.centers[guess._lesser]
+        bend = QuadraticMap.fitted(straightened)
         if bend is not None:
-            draws = bend.to_straight(draws)
+            draws, modes = bend.to_straight(draws), bend.to_straight(modes)
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
-        mixture = _first_cut(sample, parts=min(max(len(draws) // 4_000, 3), 6))
+        mixture = _first_cut(sample, min(max(count // 4_000, 3), 6), modes)
         for _ in range(25):
             mixture = mixture._fitted_on(sample)
         sample = subsample(draws, 10_000)
         for _ in range(5):
             mixture = mixture._fitted_on(sample)
         if log_density is not None:
+            draws = draws[:count]
             mixture = mixture._with_worst(draws, log_density - mixture.log_density(draws))
         return replace(mixture, bend=bend)
 
@@ -170,6 +184,34 @@ class StudentMixture:
         drawn: FloatArray = self.centers[chosen] + steps
         return drawn if self.bend is None else self.bend.to_curved(drawn)
 
+    @cached_property
+    def _modes(self) -> list[int]:
+        """Which mode each component stands for, (components,): those of one center, one mode."""
+        centers = [tuple(center) for center in self.centers]
+        return [list(dict.fromkeys(centers)).index(center) for center in centers]
+
+    @property
+    def _lesser(self) -> list[int]:
+        """The first component of each mode but the first."""
+        return [self._modes.index(mode) for mode in range(1, max(self._modes) + 1)]
+
+    def _mode_of(self, draws: FloatArray) -> IntArray:
+        """Return to which mode draws (count, free) belong, (count,)."""
+        likeliest = np.argmax(self.log_parts(self.squares(draws)), axis=0)
+        return np.asarray(self._modes)[likeliest]
+
+    def _stand_ins(self, count: int) -> FloatArray:
+        """Return points (some, free) that stand for ``count`` draws of each mode but the first.
+
+        With the columns lₖ of L, the points μ ± lₖ √p have the component's mean and covariance.
+        """
+        points = [self.centers[:0]]
+        for component in self._lesser:
+            steps = np.sqrt(self.centers.shape[1]) * self.factors[component].T
+            around = self.centers[component] + np.concatenate([steps, -steps])
+            points.append(np.tile(around, (math.ceil(count / len(around)), 1)))
+        return np.concatenate(points)
+
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
         """Take a round of expectation maximization."""
         logs = np.log(self.weights) - self._log_volumes
@@ -198,12 +240,15 @@ def _require_spread(draws: FloatArray) -> None:
         raise np.linalg.LinAlgError("the draws do not span the space")
 
 
-def _first_cut(draws: FloatArray, parts: int) -> StudentMixture:
-    """Let draws (count, free) belong to the nearest of a few of them, in units of their sds."""
-    white = draws / np.std(draws, axis=0)
-    few = white[np.linspace(0, len(white) - 1, parts).astype(int)]
-    nearest = np.argmin(np.sum((few[:, np.newaxis] - white) ** 2, axis=2), axis=0)
-    return _of_shares(draws, np.equal.outer(np.arange(parts), nearest))
+def _first_cut(draws: FloatArray, parts: int, modes: FloatArray) -> StudentMixture:
+    """Let draws (count, free) belong to the nearest of a few of them, or of modes (modes, free).
+
+    In units of their sds.
+    """
+    few = np.concatenate([draws[np.linspace(0, len(draws) - 1, parts).astype(int)], modes])
+    away = (few[:, np.newaxis] - draws) / np.std(draws, axis=0)
+    nearest = np.argmin(np.sum(away**2, axis=2), axis=0)
+    return _of_shares(draws, np.equal.outer(np.arange(len(few)), nearest))
 
 
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:

@@ -3,7 +3,8 @@
 The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
 by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
 draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on a
-little, each time with a new fit and twice as long. Pilot and tuning are thrown away. Then draws
+little, each time with a new fit and twice as long. Every fit keeps a share for each mode that the
+point fit knows, be it in the draws or not. Pilot and tuning are thrown away. Then draws
 count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row
 find nothing wrong, the first on half the draws that are to be reached, the second on all of them
 and a fifth more than the first at least; or the budget of steps is used up.
@@ -50,7 +51,7 @@ from bwbayes.sampling.diagnostics import (
     times,
 )
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import pilot_moves, sampling_moves
+from bwbayes.sampling.moves import Weighted, pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -138,12 +139,10 @@ class _Sampling:
     def _extend(self, phase: Phase) -> None:
         """Advance every ensemble by a block, wherever the executor likes."""
         plan, chain = self.plan, self.chain
-        proposal, ends = chain.proposal_in_use(phase), chain.ends
-        make = pilot_moves if phase == "pilot" else sampling_moves
-        futures = []
+        futures, ends = [], chain.ends
         for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
             # Moves of its own for each: some of emcee's write to themselves.
-            moves = [make(proposal, plan.places) for _ in group]
+            moves = [self._moves(phase) for _ in group]
             futures.append(self.executor.submit(advance, self.posterior, moves, group, plan.block))
         blocks: list[Block] = []
         for future in futures:
@@ -151,6 +150,13 @@ class _Sampling:
                 blocks.append(block)
                 self.watcher(phase, None)
         chain.append(phase, blocks)
+
+    def _moves(self, phase: Phase) -> Weighted:
+        """Return an ensemble's moves; only where draws count has a step several places."""
+        proposal = self.chain.proposal_in_use(phase)
+        if phase == "pilot":
+            return pilot_moves(proposal)
+        return sampling_moves(proposal, self.plan.places if phase == "sampling" else 1)
 
     def _pilot_is_done(self) -> bool:
         """Tell whether the ensembles have met.
@@ -173,15 +179,14 @@ class _Sampling:
     def _tune(self) -> None:
         """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
 
-        The first is one block; others follow until walkers take half of the places, or most where a
-        step has several to choose from, at most four blocks in all: where these do not suffice, the
-        sampling will tell. A run that goes on within a round fits again to what that round had
-        begun with.
+        The first is one block; others follow until walkers take half of the places, at most four
+        blocks in all: where these do not suffice, the sampling will tell. A run that goes on within
+        a round fits again to what that round had begun with.
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
         begin, end, rate = 0, 1, 0.0
-        while rate < (0.8 if plan.places > 1 else 0.5) and end <= 4:
+        while rate < 0.5 and end <= 4:
             if chain.blocks("tuning") < end:
                 chain.freeze("tuning", proposal)
             while chain.blocks("tuning") < end:
@@ -311,8 +316,9 @@ def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentM
     """Fit a proposal to the draws of these steps of a phase, if they span the space."""
     draws = chain.coordinates(phase, thin)[steps]
     log_density = chain.log_density(phase, thin)[steps]
+    flat, guess = draws.reshape(-1, draws.shape[-1]), chain.proposals["pilot"]
     try:
-        return StudentMixture.fitted(draws.reshape(-1, draws.shape[-1]), log_density.ravel())
+        return StudentMixture.fitted(flat, log_density.ravel(), guess)
     except np.linalg.LinAlgError:
         return None
 
@@ -320,6 +326,7 @@ def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentM
 def _refit(chain: Chain) -> StudentMixture | None:
     """Fit a proposal to all blocks of the sampling, whether they count or not."""
     fitted_to = Chain(chain.starts)
+    fitted_to.freeze("pilot", chain.proposals["pilot"])
     for blocks in chain.history("sampling"):
         fitted_to.append("sampling", blocks)
     return _fitted(fitted_to, "sampling", slice(None), thinning(fitted_to.draws("sampling")))

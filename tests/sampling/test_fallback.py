@@ -37,7 +37,7 @@ from tests.sampling.samplings import (
 tune = sampler._Sampling._tune
 
 
-def narrow(draws: FloatArray, _: FloatArray | None = None, *, width: float = 0.3) -> StudentMixture:
+def narrow(draws: FloatArray, *_: object, width: float = 0.3) -> StudentMixture:
     """Fit normal distributions of a part of the width: a tail shape of 1 − 0.3² = 0.91."""
     center, factor = np.mean(draws, axis=0), width * np.linalg.cholesky(np.cov(draws, rowvar=False))
     return StudentMixture(np.ones(1), center[np.newaxis], factor[np.newaxis], freedom=1e6)

@@ -85,7 +85,7 @@ def test_a_chain_whose_target_is_made_smaller_is_judged_at_its_end(
     assert chain.steps("sampling") == outcome.check.steps
 
 
-def flat(draws: FloatArray, _: FloatArray) -> StudentMixture:
+def flat(draws: FloatArray, *_: object) -> StudentMixture:
     """Fit nothing."""
     raise np.linalg.LinAlgError(f"{len(draws)} draws in a plane")
 
