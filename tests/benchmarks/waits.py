@@ -68,55 +68,48 @@ result = None
 
 RING = 'command("run", "runs/ring_bender.toml", "--out", out + "/{}")'
 
-# What is waited for: what comes before it and is not measured, what is measured, and the part of
-# the baseline's time that it may take (None: there is no such target).
-WAITS: dict[str, tuple[str, str, float | None]] = {
-    "first run, everything compiled": ("", RING.format("cold"), 0.5),
-    "run": ("", RING.format("warm"), 0.6),
-    "bwbayes.fit, the name": ("", "import bwbayes; bwbayes.fit", None),
-    "open_run": ("", "import bwbayes; bwbayes.open_run(out + '/warm')", 0.1),
-    "open_run and its bands": ("", "import bwbayes; bwbayes.open_run(out + '/warm').bands", 0.1),
+# What is waited for: what comes before it and is not measured, and what is measured.
+WAITS: dict[str, tuple[str, str]] = {
+    "first run, everything compiled": ("", RING.format("cold")),
+    "run": ("", RING.format("warm")),
+    "bwbayes.fit, the name": ("", "import bwbayes; bwbayes.fit"),
+    "open_run": ("", "import bwbayes; bwbayes.open_run(out + '/warm')"),
+    "open_run and its bands": ("", "import bwbayes; bwbayes.open_run(out + '/warm').bands"),
     "predict 10,000 samples": (
         "import bwbayes; fit = bwbayes.open_run(out + '/warm'); record = plan(); fit.converged",
         "fit.predict(record)",
-        0.1,
     ),
-    "fit of 20 readings": ("", "stand(20)", None),
-    "fit of 300 readings": ("", "stand(300)", None),
-    "six fits of 20 readings, lag and discrepancy": ("", "few(20, 6)", None),
-    "six fits of 300 readings, lag and discrepancy": ("", "few(300, 6)", None),
-    "fit with creep": ("", "stand(20_000, creep=True, folder=out + '/creep')", 0.2),
+    "fit of 20 readings": ("", "stand(20)"),
+    "fit of 300 readings": ("", "stand(300)"),
+    "six fits of 20 readings, lag and discrepancy": ("", "few(20, 6)"),
+    "six fits of 300 readings, lag and discrepancy": ("", "few(300, 6)"),
+    "fit with creep": ("", "stand(20_000, creep=True, folder=out + '/creep')"),
     "predict with creep": (
         "import bwbayes; fit = bwbayes.open_run(out + '/creep'); record = plan(); fit.converged",
         "fit.predict(record)",
-        0.1,
     ),
     "joint campaign": (
         "",
         'command("run", "runs/ring_bender_campaign.toml", "--out", out + "/joint")',
-        0.5,
     ),
     "compare seven models": (
         "",
         'command("compare", "runs/ring_bender.toml", "--out", out + "/models")',
-        0.4,
     ),
     "20 replicates of a calibration": (
         "",
         'command("calibrate", "runs/calibration.toml", "--replicates=20", "--out", out + "/c")',
-        None,
     ),
     "memory of a fit of a million samples, GiB": (
         "",
         "stand(1_000_000)\nresult = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20",
-        None,
     ),
 }
 
 
 def waited(name: str, checkout: Path, folder: Path) -> float | None:
     """Return the CPU seconds (or what the step measures) of a step; None if it fails there."""
-    before, measured, _ = WAITS[name]
+    before, measured = WAITS[name]
     python = checkout / ".venv" / "bin" / "python"
     code = (
         f"{PREAMBLE}\n{before}\nbegin = spent()\n{measured}\n"
@@ -149,16 +142,14 @@ def waits(*, against: Path | None, only: tuple[str, ...]) -> None:
         homes = [Path(folder) / str(number) for number in range(len(checkouts))]
         for home in homes:
             home.mkdir()
-        for name, (*_, target) in WAITS.items():
+        for name in WAITS:
             if not only or any(word in name for word in only):
                 results = [
                     waited(name, root, home) for root, home in zip(checkouts, homes, strict=True)
                 ]
                 here, there = results[0], results[1] if len(results) > 1 else None
                 ratio = here / there if here is not None and there else None
-                rows.append(
-                    dict[str, Cell](wait=name, here=here, there=there, ratio=ratio, target=target)
-                )
+                rows.append(dict[str, Cell](wait=name, here=here, there=there, ratio=ratio))
                 console.print(f"{name}: {results}", highlight=False)
     note = "CPU seconds of all processes, once; `-`: it fails there"
     Table("What a person waits for", note, rows).show(console)
