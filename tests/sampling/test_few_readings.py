@@ -15,6 +15,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import map_estimate
+from bwbayes.inference.engine import choose
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -39,7 +40,8 @@ def few_readings(seed: int) -> Posterior:
     missed = 0.2 * np.sin(2.2 * times + seed) + generator.normal(0, 0.1, READINGS)
     displacement = actuator.displacement(theta, voltage)[0] + missed
     fixed = {"initial": 0.0, "exponent": 1.0}
-    return posterior_of(voltage, displacement, actuator, "discrepancy", fixed)
+    posterior = posterior_of(voltage, displacement, actuator, "discrepancy", fixed)
+    return replace(posterior, engine=choose())
 
 
 def without_discrepancy(posterior: Posterior, coordinates: FloatArray) -> BoolArray:
@@ -54,7 +56,7 @@ def share_by_weights(posterior: Posterior, point: PointFit) -> tuple[float, floa
     around = StudentMixture.around(point.optima, *map_estimate.peaks(posterior, point))
     # Twice as wide as the modes: what is between them is reached too.
     proposal = replace(around, factors=2**0.5 * around.factors, freedom=3.0)
-    places = proposal.draw(np.random.RandomState(1), 100_000)
+    places = proposal.draw(np.random.RandomState(1), 400_000)
     weights = scipy.special.softmax(posterior.log_density(places) - proposal.log_density(places))
     inside = without_discrepancy(posterior, places)
     share = float(weights @ inside)
