@@ -26,7 +26,7 @@ def c_functions(
     functions: Sequence[Callable[..., Any]],
     shapes: Mapping[str, tuple[int, ...]],
     prefix: str,
-    given: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
+    bindings: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
 ) -> str:
     """Return functions and those that they call as static functions of C, callees first.
 
@@ -39,7 +39,7 @@ def c_functions(
         Shapes of the arrays by the names of arguments; those in ``WRITTEN`` are written to.
     prefix
         Beginning of the functions' names.
-    given
+    bindings
         What arguments stand for that are functions: C has these by their names.
 
     Raises
@@ -50,7 +50,7 @@ def c_functions(
     printed: dict[FunctionType, str] = {}
     for function in functions:
         assert inspect.isfunction(function)
-        _Printer(function, shapes, prefix, given, printed)
+        _Printer(function, shapes, prefix, bindings, printed)
     return "\n".join(printed.values())
 
 
@@ -78,11 +78,11 @@ class _Printer(ast.NodeTransformer):
         function: FunctionType,
         shapes: Mapping[str, tuple[int, ...]],
         prefix: str,
-        given: Mapping[str, Callable[..., Any]],
+        bindings: Mapping[str, Callable[..., Any]],
         printed: dict[FunctionType, str],
     ) -> None:
         self.function, self.shapes, self.prefix = function, shapes, prefix
-        self.given, self.printed = given, printed
+        self.bindings, self.printed = bindings, printed
         self.tables: dict[str, Sequence[float]] = {}
         self.variables = set(function.__code__.co_varnames)
         tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
@@ -103,7 +103,7 @@ class _Printer(ast.NodeTransformer):
         results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
         names = [argument.arg for argument in tree.args.args]
         kinds = dict.fromkeys(self.shapes, "const double *") | dict.fromkeys(WRITTEN, "double *")
-        arguments = [f"{kinds.get(n, 'double ')}{n}" for n in names if n not in self.given]
+        arguments = [f"{kinds.get(n, 'double ')}{n}" for n in names if n not in self.bindings]
         arguments += [f"double *result_{number}" for number in range(1, results)]
         return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"
 
@@ -240,7 +240,7 @@ class _Printer(ast.NodeTransformer):
 
     def call(self, node: ast.Call, pointers: Sequence[str]) -> str:
         """Return a call of a function of math.h, or of one that is printed before this one."""
-        texts = [self.text(x) for x in node.args if ast.unparse(x) not in self.given]
+        texts = [self.text(x) for x in node.args if ast.unparse(x) not in self.bindings]
         arguments = ", ".join([*texts, *pointers])
         match node.func:
             case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
@@ -248,10 +248,10 @@ class _Printer(ast.NodeTransformer):
                 others = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
                 return f"{others.get(name, name)}({arguments})"
             case ast.Name(id=name):
-                function = self.given.get(name, self.function.__globals__.get(name))
+                function = self.bindings.get(name, self.function.__globals__.get(name))
                 if inspect.isfunction(function):
                     if function not in self.printed:
-                        _Printer(function, self.shapes, self.prefix, self.given, self.printed)
+                        _Printer(function, self.shapes, self.prefix, self.bindings, self.printed)
                     return f"{self.prefix}{name}({arguments})"
         raise self.refused(node)
 

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
 
-# A mode that is less probable than the best one by so many nats holds nothing of the posterior, and
-# an ensemble that starts there stays for hundreds of steps.
-NEGLIGIBLE = 30.0
-
 
 @dataclass(frozen=True)
 class PointFit:
@@ -69,11 +65,14 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
 
     for position in places:
         climb(position)
+    # A mode that is less probable than the best one by so many nats holds nothing of the posterior,
+    # and an ensemble that starts there stays for hundreds of steps.
+    negligible = 30.0
     for position, log_density in _at_rest(posterior, modes[0].position, noise):
-        if log_density > modes[0].log_density - 2 * NEGLIGIBLE:  # it may yet climb
+        if log_density > modes[0].log_density - 2 * negligible:  # it may yet climb
             climb(position)
     best = modes[0]
-    worth = [m.position for m in modes if m.log_density > best.log_density - NEGLIGIBLE]
+    worth = [m.position for m in modes if m.log_density > best.log_density - negligible]
     optima = distinct(worth, best.covariance)
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 

@@ -244,8 +244,8 @@ def _summarized(
     samples, start, unknown = simulated.shape[1], mixed.start, np.ones(1)
     expected = simulated
     if start.carried is not None:
-        remembered, known = start.carried.after(first, samples)
-        expected, unknown = simulated + remembered, 1 - known
+        remembered, explained = start.carried.after(first, samples)
+        expected, unknown = simulated + remembered, 1 - explained
     mean = np.mean(expected, axis=0)
     summarized: dict[str, Floating] = {"mean": mean}
     # About their mean, so that a single precision is one of the band's width.

@@ -87,9 +87,9 @@ class Scores:
 
 def judged(bands: Bands, values: FloatArray | None) -> BoolArray:
     """Tell which samples count: those after a lead-in where values (samples,) are known."""
-    known = np.isfinite(np.full(bands.time.size, np.nan) if values is None else values)
-    known[: bands.scored_from] = False
-    return known
+    counts = np.isfinite(np.full(bands.time.size, np.nan) if values is None else values)
+    counts[: bands.scored_from] = False
+    return counts
 
 
 def score(bands: Bands, full: float = 0.0) -> Scores:
@@ -127,10 +127,10 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
     for kind, values in targets.items():
         coverage[kind] = error[kind] = None
         if values is not None:
-            known = judged(bands, values)
-            hits = {level: bands.covers(kind, level, values)[known] for level in LEVELS}
+            counts = judged(bands, values)
+            hits = {level: bands.covers(kind, level, values)[counts] for level in LEVELS}
             coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
-            error[kind] = _coverage_errors(hits, (values - bands.mean)[known])
+            error[kind] = _coverage_errors(hits, (values - bands.mean)[counts])
     width, interval_score, worst = {}, {}, {}
     scored = slice(bands.scored_from, None)
     for level in LEVELS:

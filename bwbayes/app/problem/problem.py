@@ -303,10 +303,10 @@ def _posterior(
     if not prior.dimensions:
         raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
     defaults = {c.name: c.declaration.default(contexts[c.record]) for c in table.layout}
-    known = {
+    default_priors = {
         name: default for name, default in defaults.items() if isinstance(default, Distribution)
     }
-    return Posterior(tuple(datasets), prior, choose(config.sampling.engine), table), known
+    return Posterior(tuple(datasets), prior, choose(config.sampling.engine), table), default_priors
 
 
 def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
