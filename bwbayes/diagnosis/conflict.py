@@ -173,7 +173,9 @@ def _near(gap: FloatArray) -> bool:
 def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
     fix = f"move parameters.{parameter.name}.{side}"
     if bound not in (parameter.lower, parameter.upper):
-        fix = f"widen its prior {parameter.prior}, which ends there"
+        declared = parameter.declared
+        advice = declared.pressed.get(side) if declared and declared.bounds is None else None
+        fix = advice or f"widen its prior {parameter.prior}, which ends there"
     text = f"lies on its {side} bound {bound:.4g} {parameter.unit}"
     return Finding(parameter.name, text.rstrip(), fix)
 

@@ -56,6 +56,7 @@ DISCREPANCY_QUALITY = Declaration(
     "quality of the model discrepancy, 0.5 for Matérn 3/2, less if it is rougher",
     lambda _: Distribution("uniform", {"lower": 0.0, "upper": math.sqrt(0.5)}),
     floor=0.0,
+    pressed={"upper": "try other parts of the model; what it misses oscillates"},
 )
 
 # The integral over a time, by Gauss and Legendre, where the fast rate times it is below one.

@@ -90,7 +90,8 @@ class Declaration:
     stated_bounds
         The bounds in words, for messages: ``|gamma| <= beta``.
     pressed
-        What to say where the posterior presses against the lower or upper of these bounds.
+        What to say where the posterior presses against the lower or upper of these bounds, or of
+        the default prior's where there are none.
     scope
         Whether it belongs to the actuator, or to one record alone (its start, its offset).
     loop

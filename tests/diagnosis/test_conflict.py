@@ -133,3 +133,10 @@ def test_given_bounds_that_the_posterior_leans_on_are_said() -> None:
     uniform = with_prior("d", Distribution("uniform", {"lower": 0.8, "upper": 2.0}))
     (remark,) = said(uniform, d=piled_up(0.8, 0.01))
     assert remark.startswith("d: lies on its lower bound 0.8 um/V. Fix: widen its prior uniform(")
+
+
+def test_the_edge_of_a_default_prior_is_not_to_be_widened_where_it_is_the_models() -> None:
+    prior = joint_prior((*NAMES, "discrepancy_quality"), RANGES, {})
+    (remark,) = said(prior, discrepancy_quality=0.5**0.5 - piled_up(0, 0.02))
+    advice = "Fix: try other parts of the model; what it misses oscillates."
+    assert remark == f"discrepancy_quality: lies on its upper bound 0.7071. {advice}"
