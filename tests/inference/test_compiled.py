@@ -111,6 +111,14 @@ def test_engines_agree_at_any_poles(damping: float) -> None:
     assert_engines_agree(posterior, changed(posterior, damping=damping))
 
 
+def test_without_hysteresis_an_initial_state_has_no_effect_on_either_engine() -> None:
+    posterior = of_operator("linear")
+    with_state = changed(posterior, initial=3.0)
+    assert_engines_agree(posterior, with_state)
+    expected = posterior.log_likelihood(changed(posterior, initial=0.0))
+    assert np.array_equal(posterior.log_likelihood(with_state), expected)
+
+
 VOLTAGES = st.lists(
     st.one_of(st.integers(-17, 17).map(lambda k: 10.0 * k), st.just(1e-9), st.floats(-200, 200)),
     min_size=2,

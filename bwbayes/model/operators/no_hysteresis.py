@@ -13,7 +13,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.scalar_memory import OneState, d, initial
+from bwbayes.model.operators.scalar_memory import OneState, StateMemory, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
@@ -35,6 +35,10 @@ class NoHysteresis(OneState):
         slope = replace(d(), default=lambda c: lognormal(c.ranges.gain, 0.6), bounds=None)
         return slope, replace(initial(), default=lambda _: 0.0)
 
+    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> StateMemory:  # noqa: ARG002  # nothing before counts
+        """Return no state."""
+        return StateMemory(voltage, np.zeros_like(column["d"]))
+
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -45,11 +49,3 @@ class NoHysteresis(OneState):
         """Return d u."""
         nothing = np.zeros_like(column["d"])
         return RelaxingStep.of([column["d"]], [nothing], nothing, nothing)
-
-    def reachable(
-        self, column: Values, voltage: float, span: Span
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return zero: no drive leaves anything."""
-        del voltage, span
-        nothing = np.zeros_like(column["d"])
-        return nothing, nothing
