@@ -109,10 +109,9 @@ class Parameter:
 
         By the names that the parts declare; see :meth:`JointPrior.seen`.
         """
-        if self.declared is None or self.declared.bounds is None:
+        if self.declared is None:
             return np.asarray(-np.inf), np.asarray(np.inf)
-        low, high = self.declared.bounds(values)
-        return np.asarray(low), np.asarray(high)
+        return self.declared.limits(values)
 
     @cached_property
     def support(self) -> tuple[float, float]:
@@ -176,6 +175,8 @@ class JointPrior:
         self._free_rows = [self.names.index(name) for name in self.free_names]
         self._fixed_rows = [self.names.index(name) for name in self._fixed]
         self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
+        # A formula maps most of the free parameters, and nothing cuts them.
+        self._cut = [(row, p) for row, p in enumerate(self.free) if p.formula is None]
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -219,7 +220,8 @@ class JointPrior:
         for parameter in self.free:
             assert parameter.prior is not None
             result += parameter.prior.frozen.logpdf(values[parameter.name])
-            inside &= self._inside(parameter, values)
+            x, (low, high) = values[parameter.name], self._limits(parameter, values)
+            inside &= (low <= x) & (x <= high) & parameter.above_floor(x)
         inside &= self._possible(values)
         return np.where(inside, result, -np.inf)
 
@@ -299,11 +301,6 @@ class JointPrior:
         return rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
 
     @cached_property
-    def _cut(self) -> tuple[tuple[int, Parameter], ...]:
-        """The other ones, and which they are of the free ones."""
-        return tuple((row, p) for row, p in enumerate(self.free) if p.formula is None)
-
-    @cached_property
     def _floors(self) -> tuple[FloatArray, FloatArray]:
         """What free parameters must be above, or reach at least: two columns."""
         floors = np.array([parameter.floor for parameter in self.free])
@@ -360,9 +357,3 @@ class JointPrior:
             for record in self.records or ("",):
                 possible = possible & self.constraint(self.seen(values, record))
         return possible
-
-    def _inside(self, parameter: Parameter, values: Values) -> BoolArray:
-        low, high = self._limits(parameter, values)
-        x = values[parameter.name]
-        inside: BoolArray = (low <= x) & (x <= high) & parameter.above_floor(x)
-        return inside

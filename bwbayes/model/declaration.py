@@ -86,7 +86,7 @@ class Declaration:
         a floor of zero.
     bounds
         Lower and upper bound (models,) given other parameters: those that come before it, and those
-        that are fixed (so a name may be missing). Infinite where there is none.
+        that are fixed. There are none (:meth:`limits`) where one that it asks for is not known yet.
     stated_bounds
         The bounds in words, for messages: ``|gamma| <= beta``.
     pressed
@@ -126,6 +126,17 @@ class Declaration:
     def positive(self) -> bool:
         """Whether it lies above zero."""
         return self.floor == 0 and not self.reaches_floor
+
+    def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Return its bounds (models,) given values of other parameters; infinite without any."""
+        if self.bounds is not None:
+            try:
+                low, high = self.bounds(values)
+            except KeyError:  # one is free and comes later
+                pass
+            else:
+                return np.asarray(low), np.asarray(high)
+        return np.asarray(-np.inf), np.asarray(np.inf)
 
     def unit_in(self, stated: Mapping[str, float | Distribution]) -> str:
         """Return its unit, given what is stated of other parameters by name."""

@@ -11,6 +11,8 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
 from bwbayes.model.operator import Operator
@@ -129,3 +131,12 @@ def _check_parameters(where: str, name: str, operator: Operator) -> None:
             f'{where}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
             'scope = "record": the state before a record'
         )
+    for declared in operator.parameters:
+        try:
+            if declared.bounds is not None:
+                declared.bounds({known: np.ones(1) for known in names})
+        except KeyError as unknown:
+            raise InputError(
+                f"{where}: the bounds of {declared.name} in {name!r} ask for {unknown}, which it "
+                "does not declare; declare it"
+            ) from None

@@ -7,18 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.operators.scalar_memory import (
-    HIGHEST_CEILING,
-    OneState,
-    alpha,
-    beta,
-    d,
-    initial,
-)
+from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, ceiling, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
@@ -45,21 +35,9 @@ class BacklashLike(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, α, β and the initial h."""
-        return d(), alpha(), beta(), initial(_ceiling)
+        start = initial(lambda e: (-(top := ceiling(e["alpha"], e["beta"])), top))
+        return d(), alpha(), beta(), start
 
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
         return RelaxingStep.of([column["d"]], [column["alpha"]], column["beta"], column["beta"])
-
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range
-
-
-def _ceiling(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    """Return ∓α/β, um."""
-    if "alpha" not in earlier or "beta" not in earlier:
-        return -np.inf, np.inf
-    with np.errstate(divide="ignore", over="ignore"):
-        top = np.minimum(earlier["alpha"] / earlier["beta"], HIGHEST_CEILING)
-    return -top, top

@@ -84,9 +84,17 @@ class BoucWen(OneState):
         return (
             d(),
             alpha(),
-            replace(beta(bounds=self._beta_bounds), default=_beta, unit_given=_rate_unit),
             replace(
-                gamma(_gamma, self._gamma_bounds, stated), pressed=pressed, unit_given=_rate_unit
+                beta(bounds=lambda e: (abs(e["gamma"]) if self.passive else -e["gamma"], np.inf)),
+                default=_beta,
+                unit_given=_rate_unit,
+            ),
+            replace(
+                gamma(
+                    _gamma, lambda e: (-e["beta"], e["beta"] if self.passive else np.inf), stated
+                ),
+                pressed=pressed,
+                unit_given=_rate_unit,
             ),
             Declaration(
                 "exponent",
@@ -99,7 +107,7 @@ class BoucWen(OneState):
                 loop=True,
                 aliases=("n",),
             ),
-            initial(_initial_bounds),
+            initial(lambda earlier: (-(top := _top(earlier)), top)),
         )
 
     def check(self, column: Values) -> None:
@@ -130,23 +138,6 @@ class BoucWen(OneState):
     def opening(self, column: Values, half_range: float) -> FloatArray | None:
         """Return β U for n = 1."""
         return column["beta"] * half_range if np.all(column["exponent"] == 1.0) else None
-
-    def _beta_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-        if "gamma" not in earlier:
-            return -np.inf, np.inf
-        return np.abs(earlier["gamma"]) if self.passive else -earlier["gamma"], np.inf
-
-    def _gamma_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-        if "beta" not in earlier:
-            return -np.inf, np.inf
-        return -earlier["beta"], earlier["beta"] if self.passive else np.inf
-
-
-def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    if not all(name in earlier for name in SHAPE):
-        return -np.inf, np.inf
-    top = _top(earlier)
-    return -top, top
 
 
 def ceiling(

@@ -19,10 +19,10 @@ from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal, refuse
 from bwbayes.model.operators.scalar_memory import (
-    HIGHEST_CEILING,
     OneState,
     alpha,
     beta,
+    ceiling,
     d,
     gamma,
     initial,
@@ -93,19 +93,13 @@ class BoucWenAsymmetric(OneState):
         """d, α, β, γ, the terms and the initial h."""
         tilt = gamma(
             lambda context: normal(0.0, 4.0 / context.ranges.voltage),
-            lambda earlier: (
-                np.negative(earlier.get("beta", np.inf)),
-                earlier.get("beta", np.inf),
-            ),
+            lambda earlier: (-earlier["beta"], earlier["beta"]),
             "|gamma| <= beta",
         )
         start = initial(_initial_bounds)
         # |γ| ≤ β cuts the joint prior, which takes small β away, as for Bouc-Wen.
-        shape = beta(0.15, lambda earlier: (np.abs(earlier.get("gamma", np.zeros(1))), np.inf))
-        return d(), alpha(), shape, tilt, *self._asymmetry(), start
-
-    def _asymmetry(self) -> list[Declaration]:
-        return [
+        shape = beta(0.15, lambda earlier: (np.abs(earlier["gamma"]), np.inf))
+        asymmetry = (
             Declaration(
                 name,
                 "-",
@@ -118,7 +112,8 @@ class BoucWenAsymmetric(OneState):
             )
             for name, signs in TERMS.items()
             if name in self.terms
-        ]
+        )
+        return d(), alpha(), shape, tilt, *asymmetry, start
 
     def check(self, column: Values) -> None:
         """Raise an InputError where a parameter is not finite or |γ'| > β' for a pair of signs."""
@@ -138,10 +133,6 @@ class BoucWenAsymmetric(OneState):
         pairs = [rates(column, s, x) for s, x in product(reversed(SIGNS), repeat=2)]
         slow, fast = np.stack(pairs, axis=1)
         return RelaxingStep.of([column["d"]], [column["alpha"]], slow - fast, slow + fast)
-
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range
 
 
 def rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
@@ -169,13 +160,10 @@ def _passive(column: Values) -> BoolArray:
 
 def _initial_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
     """Return the ceilings of h, um: where it grows no further, with the slower of two rates."""
-    if not {"alpha", "beta", "gamma"} <= set(earlier):
-        return -np.inf, np.inf
     tops = []
     for s in SIGNS:
-        slowest = np.min([np.add(*rates(earlier, s, x)) for x in SIGNS], axis=0)
-        with np.errstate(divide="ignore", over="ignore"):
-            tops.append(np.minimum(earlier["alpha"] / slowest, HIGHEST_CEILING))
+        slowest = np.minimum(*(np.add(*rates(earlier, s, x)) for x in SIGNS))
+        tops.append(ceiling(earlier["alpha"], slowest))
     return -tops[1], tops[0]
 
 

@@ -79,15 +79,25 @@ class Duhem(OneState):
             "um/V^3",
             r"\alpha_2",
             "growth of the hysteresis with the voltage's square",
-            _growth,
+            lambda context: Distribution(
+                "halfnormal",
+                {"scale": rounded(0.3 * context.ranges.gain / _farthest(context) ** 2)},
+            ),
             floor=0.0,
             reaches_floor=True,
-            bounds=_alpha2_bounds,
+            bounds=lambda earlier: (0.0, 4 * earlier["alpha"] * earlier["beta"] ** 2),
             stated_bounds="alpha2 <= 4 alpha beta^2",
             loop=True,
         )
         # The bounds of α₂ and α₁ cut the joint prior, which takes small β away.
-        first, last = (d(), gains, alpha(), beta(0.3, _beta_bounds), strengths), initial()
+        shape = beta(
+            0.3,
+            lambda earlier: (
+                np.sqrt(np.maximum(earlier["alpha2"], 0.0) / (4 * earlier["alpha"])),
+                np.inf,
+            ),
+        )
+        first, last = (d(), gains, alpha(), shape, strengths), initial()
         if self.odd:
             return *first, last
         even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient", 0.1)
@@ -132,10 +142,6 @@ class Duhem(OneState):
         mean = column["d"] + even * (low + high)
         return np.asarray(mean + column["d3"] * (low**2 + low * high + high**2))
 
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range
-
 
 class DuhemStep(RelaxingStep):
     """w = f(u) − h with Duhem hysteresis h, exact: dg/dv = α(u) − β g, g = s h."""
@@ -178,26 +184,7 @@ def _farthest(context: Context) -> float:
     return context.ranges.voltage + abs(context.ranges.bias)
 
 
-def _growth(context: Context) -> Distribution:
-    scale = 0.3 * context.ranges.gain / _farthest(context) ** 2
-    return Distribution("halfnormal", {"scale": rounded(scale)})
-
-
-def _beta_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    if "alpha" not in earlier or "alpha2" not in earlier:
-        return 0.0, np.inf
-    return np.sqrt(np.maximum(earlier["alpha2"], 0.0) / (4 * earlier["alpha"])), np.inf
-
-
-def _alpha2_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    if "alpha" not in earlier or "beta" not in earlier:
-        return 0.0, np.inf
-    return 0.0, 4 * earlier["alpha"] * earlier["beta"] ** 2
-
-
 def _alpha1_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    if not {"alpha", "beta", "alpha2"} <= set(earlier):
-        return -np.inf, np.inf
     alpha2 = earlier["alpha2"]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         top = np.sqrt(alpha2 * (4 * earlier["alpha"] - alpha2 / earlier["beta"] ** 2))

@@ -62,14 +62,14 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
             "rise of the voltage along which a relay switches",
             lambda ranges: 0.2 * ranges.voltage,
             reaches_floor=True,
-            bounds=lambda earlier: (0.0, WIDEST * earlier.get("saturation", np.array(np.inf))),
+            bounds=lambda earlier: (0.0, WIDEST * earlier["saturation"]),
             stated_bounds=f"width <= {WIDEST:g} saturation",
         )
         rayleigh, saturation = DENSITY
         # Of a width that is fixed.
         saturation = replace(
             saturation,
-            bounds=lambda earlier: (earlier.get("width", np.array(0.0)) / WIDEST, np.inf),
+            bounds=lambda earlier: (earlier["width"] / WIDEST, np.inf),
         )
         return (SLOPE, rayleigh, saturation, width, INITIAL)
 

@@ -95,7 +95,7 @@ class Pinned(OneState):
                 r"k",
                 "voltage by which pinned walls lag behind",
                 lambda ranges: 0.25 * ranges.voltage,
-                bounds=self._pinning_bounds,
+                bounds=lambda earlier: (WEAKEST * self._field(earlier), np.inf),
                 stated_bounds=f"at least {WEAKEST:g} of the field's scale",
             ),
             _fraction("reversible", "c", "part of the walls' motion that is reversible", 2.0, 2.0),
@@ -132,7 +132,13 @@ class Pinned(OneState):
         from_rest: bool,
     ) -> StateMemory:
         """Return P_irr at the first voltage: as far behind as ``initial``, or what it becomes."""
-        fixed = self._fixed(column, 0.0 if from_rest else voltage, column["initial"])
+        walls, behind = self.walls(column), column["initial"]
+        # P = P_an − (1 − c) (P_an − P_irr): P_an is what all walls would do in another field.
+        reversible = walls._replace(reversible=np.ones_like(behind))
+        elsewhere = 0.0 if from_rest else voltage
+        elsewhere = elsewhere - walls.coupling * (1 - walls.reversible) * behind
+        whole = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
+        fixed = np.asarray(whole - behind)
         if from_rest and voltage != 0:
             fixed = self.trace(column, np.array([0.0, voltage]), fixed)[1]
         return StateMemory(voltage, fixed)
@@ -145,17 +151,6 @@ class Pinned(OneState):
             level, _ = curve(self.spins, (voltage + walls.coupling * p) / walls.field)
             behind.append(np.clip(walls.saturation * level - fixed, -walls.lag, walls.lag))
         return np.stack(behind)
-
-    def _fixed(self, column: Values, voltage: float, behind: FloatArray) -> FloatArray:
-        """Return P_irr (models,) of walls that lag ``behind`` P_an by so much (models,), um.
-
-        P = P_an − (1 − c) (P_an − P_irr), so that P_an is what all walls would do in another field.
-        """
-        walls = self.walls(column)
-        reversible = walls._replace(reversible=np.ones_like(behind))
-        elsewhere = voltage - walls.coupling * (1 - walls.reversible) * behind
-        whole = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
-        return np.asarray(whole - behind)
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
@@ -200,10 +195,9 @@ class Pinned(OneState):
     def walls(self, column: Values) -> Walls:
         """Return the numbers of the equation."""
         bare = column["d"] * (1 - column["coupling"])
-        field = self._slope_at_zero * column["saturation"] / bare
         return Walls(
             column["saturation"],
-            field,
+            self._field(column),
             column["coupling"] / bare,
             column["pinning"],
             column["reversible"],
@@ -211,16 +205,10 @@ class Pinned(OneState):
             column["d"],
         )
 
-    @property
-    def _slope_at_zero(self) -> float:
-        """L′(0)."""
-        return 1.0 if self.spins else 1 / 3
-
-    def _pinning_bounds(self, earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-        if not {"d", "saturation", "coupling"} <= set(earlier):
-            return 0.0, np.inf
-        bare = earlier["d"] * (1 - earlier["coupling"])
-        return WEAKEST * self._slope_at_zero * earlier["saturation"] / bare, np.inf
+    def _field(self, column: Values) -> FloatArray:
+        """Return E₀ = P_s L′(0) / (d (1 − η)), V."""
+        slope = 1.0 if self.spins else 1 / 3
+        return slope * column["saturation"] / (column["d"] * (1 - column["coupling"]))
 
 
 def _fraction(name: str, label: str, description: str, a: float, b: float) -> Declaration:
@@ -240,8 +228,6 @@ def _fraction(name: str, label: str, description: str, a: float, b: float) -> De
 
 
 def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    if not {"d", "coupling", "pinning"} <= set(earlier):
-        return -np.inf, np.inf
     bound = earlier["pinning"] * earlier["d"] * (1 - earlier["coupling"])
     return -bound, bound
 

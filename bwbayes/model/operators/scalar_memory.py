@@ -50,6 +50,10 @@ class OneState(Operator):
         """Return d."""
         return column["d"]
 
+    def opening(self, column: Values, half_range: float) -> FloatArray | None:
+        """Return β U, if there is a β."""
+        return column["beta"] * half_range if "beta" in column else None
+
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -107,6 +111,12 @@ class OneState(Operator):
         return [self.trace(column, np.array(sweep), start)[1] for sweep in sweeps]
 
 
+def ceiling(alpha: FloatArray, rate: FloatArray) -> FloatArray:
+    """Return the largest |h| (models,), um, that a strength α, um/V, and a rate, 1/V, reach."""
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.minimum(alpha / rate, HIGHEST_CEILING)
+
+
 # What is the same thing as in the Bouc-Wen model, with the same priors.
 
 
@@ -120,7 +130,7 @@ def d() -> Declaration:
         # A drive that is small for the loop shows d - α, which may be half of d.
         lambda ranges: 1.6 * ranges.gain,
         0.6,
-        bounds=lambda earlier: (earlier.get("alpha", -np.inf), np.inf),
+        bounds=lambda earlier: (earlier["alpha"], np.inf),
         aliases=("gain", "d33"),
     )
 
@@ -133,7 +143,7 @@ def alpha() -> Declaration:
         r"\alpha",
         "hysteretic displacement per volt at h = 0",
         lambda ranges: 0.7 * ranges.gain,
-        bounds=lambda earlier: (-np.inf, earlier.get("d", np.inf)),
+        bounds=lambda earlier: (-np.inf, earlier["d"]),
         stated_bounds="0 < alpha < d",
         pressed={
             "upper": "the model's slope is zero there; check the displacement's sign and unit, or "

@@ -60,9 +60,8 @@ def drawn(operator: Operator, size: int, seed: int, ranges: Ranges = RANGES) -> 
             continue
         least, most = prior.support
         low, high = np.full(size, max(least, declared.floor)), np.full(size, most)
-        if declared.bounds is not None:
-            below, above = declared.bounds(column)
-            low, high = np.maximum(low, below), np.minimum(high, above)
+        below, above = declared.limits(column)
+        low, high = np.maximum(low, below), np.minimum(high, above)
         values, _ = prior.from_normal(generator.standard_normal(size), low, high)
         column[declared.name] = values
     holds = np.flatnonzero(np.broadcast_to(operator.holds(column), size))[: (size - 20) // 3]
