@@ -187,7 +187,11 @@ class Actuator:
             memory = self.begin(column, path, from_rest=from_rest)
         else:
             memory = state.hysteresis
-        drives, hysteresis = self._drives(column, path, memory)
+        drive, hysteresis = self.drive(column, path, memory)
+        drives = [drive]
+        if self.creep is not None:
+            crept = self.creep.drive(column, drive, path)
+            drives += [crept.copy() for _ in self.creep.times]
         if state is None:
             equilibrium, filtered = tuple(w[:, 0].copy() for w in drives), sections.begin(unrest)
         else:
@@ -200,17 +204,15 @@ class Actuator:
         result += (level + column["offset"])[:, np.newaxis]
         return result, State(hysteresis, equilibrium, filtered)
 
-    def _drives(
-        self, column: Values, path: FloatArray, memory: Any
-    ) -> tuple[list[FloatArray], Any]:
-        """Return the drives along a path, and the operator's memory after it."""
+    def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
+        """Return what hysteresis and gain make of a path (samples,), V, (models, samples), um.
+
+        And the operator's memory after it.
+        """
         drive, after = self.hysteresis.advance(column, path, memory)
         if self.gain is not None:
             drive += self.gain.displacement(column, path)
-        if self.creep is None:
-            return [drive], after
-        crept = self.creep.drive(column, drive, path)
-        return [drive, *(crept.copy() for _ in self.creep.times)], after
+        return drive, after
 
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return the columns (models,) of θ (models, parameters) by name."""

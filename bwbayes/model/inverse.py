@@ -233,9 +233,7 @@ class _Single:
 
     def _along(self, voltage: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
         """Return the drive (samples,) along a voltage, and the operator's memory after it."""
-        drive, after = self.actuator.hysteresis.advance(self.column, voltage, memory)
-        if self.actuator.gain is not None:
-            drive = drive + self.actuator.gain.displacement(self.column, voltage)
+        drive, after = self.actuator.drive(self.column, voltage, memory)
         return drive[0], after
 
     def _begin(self, voltage: float) -> Any:
@@ -296,17 +294,15 @@ def solve_branch(
     low = np.where(rise <= 0, 0.0, np.where(rise >= heights[-1], reach, points[above - 1]))
     high = np.where((rise <= 0) | (rise >= heights[-1]), low, points[above])
     below, beyond = heights[above - 1] - rise, heights[above] - rise
-    return _roots(
-        lambda travel: _in_order(curve, travel) - rise, low, high, below, beyond, resolution
-    )
 
+    def excess(travel: FloatArray) -> FloatArray:
+        # Travels in any order are walked along as a path.
+        order = np.argsort(travel, kind="stable")
+        values = np.empty_like(travel)
+        values[order] = curve(travel[order])
+        return values - rise
 
-def _in_order(curve: Curve, travel: FloatArray) -> FloatArray:
-    """Return the curve after travels (samples,) in any order, walked along as a path."""
-    order = np.argsort(travel, kind="stable")
-    values = np.empty_like(travel)
-    values[order] = curve(travel[order])
-    return values
+    return _roots(excess, low, high, below, beyond, resolution)
 
 
 def _roots(

@@ -196,19 +196,17 @@ def steady_loop(
     """
     voltage, column = _voltages(low, high, points), _demagnetized(column)
     memory = actuator.begin(column, np.zeros(1), from_rest=True)
-    operator = actuator.hysteresis
     # After two cycles, then after twice as many each time, a thousand at most.
     cycles, closed = 2, False
     while not closed and cycles <= 1024:
         # Between two turns nothing needs to be sampled: what is exact is so for any step.
-        moved, memory = operator.advance(column, np.tile([high, low], cycles), memory)
+        moved, memory = actuator.hysteresis.advance(column, np.tile([high, low], cycles), memory)
         changed = np.abs(moved[:, -2:] - moved[:, -4:-2])
         closed = bool(np.all(changed <= 1e-9 * np.abs(moved[:, -2:-1] - moved[:, -1:])))
         cycles *= 2
-    rising, memory = operator.advance(column, voltage, memory)
-    falling, _ = operator.advance(column, voltage[::-1], memory)
-    added = _gain(actuator, column, voltage)
-    return Traced(voltage, rising + added, falling[:, ::-1] + added, closed)
+    rising, memory = actuator.drive(column, voltage, memory)
+    falling, _ = actuator.drive(column, voltage[::-1], memory)
+    return Traced(voltage, rising, falling[:, ::-1], closed)
 
 
 def initial_curve(
@@ -226,9 +224,8 @@ def initial_curve(
     for number, side in enumerate((voltage[voltage < 0][::-1], voltage[voltage >= 0])):
         if side.size:
             virgin = actuator.begin(column, np.zeros(1), from_rest=True)
-            curves[number], _ = actuator.hysteresis.advance(column, side, virgin)
-    joined = np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
-    return voltage, joined + _gain(actuator, column, voltage)
+            curves[number], _ = actuator.drive(column, side, virgin)
+    return voltage, np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
 
 
 def measures(traced: Traced) -> dict[str, FloatArray | None]:
@@ -285,13 +282,6 @@ def _voltages(low: float, high: float, points: int) -> FloatArray:
 
 def _demagnetized(column: Values) -> dict[str, FloatArray]:
     return {**column, "initial": np.zeros_like(column["initial"])}
-
-
-def _gain(actuator: Actuator, column: Values, voltage: FloatArray) -> FloatArray:
-    """Return what the gain adds (models, points), um."""
-    if actuator.gain is None:
-        return np.zeros((1, voltage.size))
-    return actuator.gain.displacement(column, voltage)
 
 
 def _at_zero(voltage: FloatArray, branch: FloatArray) -> FloatArray:
