@@ -109,6 +109,19 @@ class Distribution:
                 raise InputError(f"{self.name}: {key} is {value!r}; give a number")
             if not np.isfinite(value):
                 raise InputError(f"{self.name}: {key} is {value}; give a finite number")
+        if self.name in FAMILIAR:
+            optional = ("lower", "upper") if self.name == "beta" else ()
+            names = (*FAMILIAR[self.name], *optional)
+            missing = [key for key in FAMILIAR[self.name] if key not in self.arguments]
+            unknown = [key for key in self.arguments if key not in names]
+            if missing or unknown:
+                wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
+                raise InputError(f"{self.name}: {wrong}; it takes {', '.join(names)}")
+            lower, upper = self.arguments.get("lower", 0.0), self.arguments.get("upper", 1.0)
+            if not lower < upper:
+                raise InputError(
+                    f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
+                )
         with np.errstate(invalid="ignore"):
             low, high = self.form.value(np.array([-1.0, 1.0])).tolist()
         if not -math.inf < low < high < math.inf:
@@ -155,7 +168,6 @@ class Distribution:
     @cached_property
     def form(self) -> Scored | Tails:
         """The map to a standard normal, in closed form if there is one."""
-        self._require_arguments()
         get = self.arguments.__getitem__
         match self.name:
             case "normal":
@@ -205,23 +217,6 @@ class Distribution:
             case "beta":
                 return scipy.stats.beta(arguments["a"], arguments["b"], lower, upper - lower)
         return self._by_scipy_name(arguments)
-
-    def _require_arguments(self) -> None:
-        """Refuse arguments that a familiar distribution does not have."""
-        arguments = self.arguments
-        if self.name not in FAMILIAR:
-            return
-        required, optional = FAMILIAR[self.name], ("lower", "upper") if self.name == "beta" else ()
-        missing = [key for key in required if key not in arguments]
-        unknown = [key for key in arguments if key not in (*required, *optional)]
-        if missing or unknown:
-            wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
-            raise InputError(f"{self.name}: {wrong}; it takes {', '.join((*required, *optional))}")
-        lower, upper = arguments.get("lower", 0.0), arguments.get("upper", 1.0)
-        if not lower < upper:
-            raise InputError(
-                f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
-            )
 
     def _by_scipy_name(self, arguments: dict[str, float]) -> Any:
         family = getattr(scipy.stats, self.name, None)

@@ -7,7 +7,7 @@ so that its coefficients are displacements at the edge of the range, as large on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,20 +16,24 @@ from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.declaration import Context, Declaration, Values, normal
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import UNIT, Span
 
 
 class Term(NamedTuple):
-    """A power of the voltage: which, its label, and the prior's sd as a part of Y."""
+    """A power of the voltage: which, its label, and its default prior."""
 
     power: int
     label: str
-    part: float
+    default: Callable[[Context], Distribution]
 
 
 # On measured stacks the square makes a tenth of the half range or less, the cube less than that.
-TERMS = {"quadratic": Term(2, r"q_2", 0.15), "cubic": Term(3, r"q_3", 0.1)}
+TERMS = {
+    "quadratic": Term(2, r"q_2", lambda context: normal(0.0, 0.15 * context.ranges.displacement)),
+    "cubic": Term(3, r"q_3", lambda context: normal(0.0, 0.1 * context.ranges.displacement)),
+}
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,18 @@ class PolynomialGain:
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """The coefficients, um."""
-        return tuple(self._declared(name) for name in TERMS if name in self.terms)
-
-    def _declared(self, name: str) -> Declaration:
-        power, label, share = TERMS[name]
-        return Declaration(
-            name,
-            "um",
-            label,
-            f"{name} part of the displacement at the edge of the voltage's range",
-            lambda context: normal(0.0, share * context.ranges.displacement),
-            loop=True,
-            aliases=(f"q{power}",),
+        return tuple(
+            Declaration(
+                name,
+                "um",
+                term.label,
+                f"{name} part of the displacement at the edge of the voltage's range",
+                term.default,
+                loop=True,
+                aliases=(f"q{term.power}",),
+            )
+            for name, term in TERMS.items()
+            if name in self.terms
         )
 
     def scaled(self, voltage: FloatArray) -> FloatArray:

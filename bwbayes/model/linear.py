@@ -263,29 +263,25 @@ def second_order(
 def _divided_differences(
     slow: ComplexArray, fast: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return exp[z₁, z₂], exp[0, z₁, z₂] and exp[0, 0, z₁, z₂] for |z₁| ≤ |z₂|, Re z ≤ 0."""
+    """Return exp[z₁, z₂], exp[0, z₁, z₂] and exp[0, 0, z₁, z₂] for |z₁| ≤ |z₂|, Re z ≤ 0.
+
+    Near zero the last two are summed, Σ h_m/(m+2)! and Σ h_m/(m+3)!, with the complete homogeneous
+    polynomials h_m = (z₁ + z₂) h_{m−1} − z₁ z₂ h_{m−2}.
+    """
     difference = np.exp(slow) * _phi_1(fast - slow)
     near = np.abs(fast) < 1
     gap = np.where(near, 1, fast)
     step = (difference - _phi_1(slow)) / gap
     ramp = (step - _z_phi_2(slow) / np.where(slow == 0, 1, slow)) / gap
-    series_step, series_ramp = _series(np.where(near, slow, 0), np.where(near, fast, 0))
-    return difference, np.where(near, series_step, step), np.where(near, series_ramp, ramp)
-
-
-def _series(slow: NDArray[Any], fast: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Sum exp[0, z₁, z₂] = Σ h_m/(m+2)! and exp[0, 0, z₁, z₂] = Σ h_m/(m+3)!.
-
-    h_m are the complete homogeneous polynomials, h_m = (z₁ + z₂) h_{m−1} − z₁ z₂ h_{m−2}.
-    """
-    before, polynomial = np.zeros_like(slow), np.ones_like(slow)
-    step, ramp, factorial = np.zeros_like(slow), np.zeros_like(slow), 2.0
+    z_1, z_2 = np.where(near, slow, 0), np.where(near, fast, 0)
+    before, polynomial = np.zeros_like(z_1), np.ones_like(z_1)
+    near_step, near_ramp, factorial = np.zeros_like(z_1), np.zeros_like(z_1), 2.0
     for term in range(SERIES_TERMS):
-        step += polynomial / factorial
+        near_step += polynomial / factorial
         factorial *= term + 3
-        ramp += polynomial / factorial
-        before, polynomial = polynomial, (slow + fast) * polynomial - slow * fast * before
-    return step, ramp
+        near_ramp += polynomial / factorial
+        before, polynomial = polynomial, (z_1 + z_2) * polynomial - z_1 * z_2 * before
+    return difference, np.where(near, near_step, step), np.where(near, near_ramp, ramp)
 
 
 def _phi_1(z: NDArray[Any]) -> NDArray[Any]:

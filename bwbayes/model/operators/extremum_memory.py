@@ -200,7 +200,9 @@ def _follow(
     """Write w along a monotone stretch (samples,) to ``out``, and drop the extrema it wipes out."""
     done = 0
     while True:
-        closing = direction * _closing(extrema)
+        # A branch is forgotten at the extremum before the last. Before the first of all was none:
+        # at its mirror image the path joins the first curve again.
+        closing = direction * (extrema[-2].voltage if extrema[2:] else -extrema[-1].voltage)
         end = int(np.searchsorted(direction * voltage, closing)) if extrema[1:] else voltage.size
         if end > done:
             _along(branch, extrema, direction, voltage[done:end], out[:, done:end])
@@ -209,15 +211,6 @@ def _follow(
         done = max(end, done)
         # A loop is closed and forgotten, or the first curve is joined again.
         del extrema[-2 if extrema[2:] else -1 :]
-
-
-def _closing(extrema: list[Extremum]) -> float:
-    """Return the voltage at which the branch from the last extremum is forgotten, V.
-
-    It is the extremum before. Before the first of all was none: its mirror image is where the path
-    joins the first curve again.
-    """
-    return extrema[-2].voltage if extrema[2:] else -extrema[-1].voltage
 
 
 def _along(
