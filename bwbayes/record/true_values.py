@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Context, Declaration, Ranges
+from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
@@ -72,15 +72,12 @@ def true_values(actuator: Actuator, table: Mapping[str, float]) -> dict[str, flo
     values = {n: value for n, value in {**table, **GAIN, **LAG}.items() if n not in of_operator} | {
         **stated
     }
-    return {
-        d.name: values[d.name] if d.name in values else _median(d) for d in actuator.declarations
-    }
-
-
-def _median(declared: Declaration) -> float:
-    default = declared.default(Context(RING_BENDER))
-    if default is None:
-        raise InputError(f"test stand: {declared.name}: has no default; give a true value")
-    if isinstance(default, Distribution):
-        return float(default.frozen.median())
-    return default
+    for name, declared in zip(actuator.parameters, actuator.declarations, strict=True):
+        if name not in values:
+            default = declared.default(Context(RING_BENDER))
+            if default is None:
+                raise InputError(f"test stand: {name}: has no default; give a true value")
+            if isinstance(default, Distribution):
+                default = float(default.frozen.median())
+            values[name] = default
+    return {name: values[name] for name in actuator.parameters}

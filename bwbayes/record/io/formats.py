@@ -118,10 +118,6 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
     InputError
         The file cannot be read, or a column that is needed is not known.
     """
-    return select(_read_source(path), naming, needed)
-
-
-def _read_source(path: Path) -> Source:
     if path.is_dir():
         raise InputError(f"{path}: is a directory; give the file in it")
     if not path.exists():
@@ -136,11 +132,12 @@ def _read_source(path: Path) -> Source:
     if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise InputError(f"{path}: a workbook or an archive; export it as CSV")
     try:
-        return _reader(path, begin)(path)
+        source = _reader(path, begin)(path)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
+    return select(source, naming, needed)
 
 
 def _reader(path: Path, begin: bytes) -> Callable[[Path], Source]:

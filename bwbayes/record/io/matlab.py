@@ -13,7 +13,6 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -105,7 +104,10 @@ def _series(
         dtype = np.dtype("?" if word & _IS_LOGICAL else "c16" if is_complex else _NUMERIC[kind])
         if len(content) != 1 + is_complex:
             raise ValueError("parts of an array are missing")
-        load = partial(_array, content[0], order, shape, dtype)
+
+        def load() -> Any:
+            return _values(content[0], order).astype(dtype).reshape(shape, order="F")
+
         if notes is not None and path in NOTES and math.prod(shape) > 0:
             notes[path] = note(load())
         else:
@@ -125,10 +127,6 @@ def _series(
             index_text = f"({index + 1})" if math.prod(shape) > 1 else ""
             if body:  # else an empty array
                 yield from _series(f"{path}{index_text}{fields[field]}", body, order)
-
-
-def _array(element: tuple[int, bytes], order: str, shape: list[int], dtype: Any) -> Any:
-    return _values(element, order).astype(dtype).reshape(shape, order="F")
 
 
 def _values(element: tuple[int, bytes], order: str) -> Any:

@@ -107,17 +107,13 @@ def vectors(
             inner = partial(lambda name: load()[name], name)
             yield from vectors(f"{group}{leaf}.", name, shape, dtype[name], inner, unit)
     elif len(sides) == 2 and min(sides) <= 64 and dtype.kind in "iuf":
+        across = int(sides[0] >= sides[1])
         for i in range(min(sides)):
-            column = partial(_column, load, i, sides[0] < sides[1])
+            column = partial(lambda i: np.squeeze(load()).take(i, across), i)
             yield Series(f"{group}{leaf}[{i + 1}]", max(sides), column, unit, group)
     elif len(sides) <= 1 or dtype.kind not in "iuf":
         size = int(np.prod(sides, dtype=np.int64))
         yield Series(f"{group}{leaf}", size, lambda: np.ravel(load()), unit, group)
-
-
-def _column(load: Callable[[], Any], number: int, by_row: bool) -> NDArray[Any]:
-    matrix = np.squeeze(load())
-    return np.asarray(matrix[number] if by_row else matrix[:, number])
 
 
 def note(value: Any) -> str:
