@@ -139,7 +139,14 @@ class Likelihood:
             log p = −½ (|z₀ − Z μ|² + μᵀ P⁻¹ μ + log det V + log det(1 + P Zᵀ Z) + n log 2π),
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
         """
-        return self._integrated(theta, *self._products(theta))
+        if self.engine == "numpy":
+            products = self._with_numpy(theta, np.empty((0, self.readings.rows.size)))
+        else:
+            # Here, because numba may not be installed, and takes half a second to load.
+            from bwbayes.inference import compiled  # noqa: PLC0415
+
+            products = compiled.products(self, theta)
+        return self._integrated(theta, *products)
 
     def score(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
@@ -242,24 +249,13 @@ class Likelihood:
 
         return onwards
 
-    def _products(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return Σ zᵢ zⱼ (models, series, series) of whitened residual and responses.
-
-        Beside them the log determinant (models,) of the noise's covariance.
-        """
-        if self.engine == "numpy":
-            return self._with_numpy(theta, np.empty((0, self.readings.rows.size)))
-        # Here, because numba may not be installed, and takes half a second to load.
-        from bwbayes.inference import compiled  # noqa: PLC0415
-
-        return compiled.products(self, theta)
-
     def _with_numpy(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Do the same with NumPy, with shapes (shapes, readings) as further series.
+        """Return Σ zᵢ zⱼ (models, series, series) of whitened residual, responses and shapes.
 
-        ``displacement`` is as in :meth:`score`.
+        Beside them the log determinant (models,) of the noise's covariance. Shapes are (shapes,
+        readings); ``displacement`` is as in :meth:`score`.
         """
         readings, n_series = self.readings, 1 + self.unknowns + shapes.shape[-2]
         # Shapes are many: NumPy is to have a model's series in the cache. Compiled code takes many

@@ -62,11 +62,10 @@ def outliers(
         posterior = without({name: readings_of[name].rows[mask] for name, mask in aside.items()})
         point = pointfit.fit(posterior, generator.spawn(1)[0])
         before = dict(aside)
-        for name, position in _places(posterior, point.mode).items():
-            away, mask = (
-                np.abs(surprise(posterior.alone(name), position, readings_of[name])),
-                aside[name],
-            )
+        free = posterior.prior.constrain(point.mode[np.newaxis])[0]
+        for name, alone, values in posterior.each(free):
+            position, mask = alone.prior.unconstrain(values)[0], aside[name]
+            away = np.abs(surprise(alone, position, readings_of[name]))
             # Spikes in a fit make its noise larger than that of most readings: theirs counts, but
             # what a later fit clears needs the whole distance from then on.
             typical = min(1.0, float(np.median(away[~mask]) / scipy.special.ndtri(0.75)))
@@ -79,12 +78,6 @@ def outliers(
     for mask in aside.values():
         _require_few(mask, 0.05)
     return {name: readings_of[name].rows[mask] for name, mask in aside.items()}
-
-
-def _places(posterior: Posterior, position: FloatArray) -> dict[str, FloatArray]:
-    """Return the coordinates (its free,) of each record alone at joint ones (free,)."""
-    free = posterior.prior.constrain(position[np.newaxis])[0]
-    return {name: alone.prior.unconstrain(draws)[0] for name, alone, draws in posterior.each(free)}
 
 
 def _require_few(aside: BoolArray, limit: float) -> None:

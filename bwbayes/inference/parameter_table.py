@@ -8,7 +8,6 @@ side, and named after it: ``offset[step_10]``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -82,16 +81,15 @@ class ParameterTable:
     @cached_property
     def layout(self) -> tuple[Column, ...]:
         """The columns of θ, in their order."""
-        return tuple(self._laid_out())
-
-    def _laid_out(self) -> Iterator[Column]:
+        columns = []
         for declared in self.declarations:
             by_record = declared.scope == "record" and declared.name not in self.shared
             if len(self.records) > 1 and (by_record or declared.name in self.per_record):
                 for record in self.records:
-                    yield Column(f"{declared.name}[{record}]", declared, record)
+                    columns.append(Column(f"{declared.name}[{record}]", declared, record))
             else:
-                yield Column(declared.name, declared, "")
+                columns.append(Column(declared.name, declared, ""))
+        return tuple(columns)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -181,7 +181,12 @@ def gain(
     """
     for t in range(gaps.size):
         if gaps[t] > 0:
-            _skip(state, second, steps[gaps[t] - 1])
+            # Over the missing readings by the filter's step over them.
+            over = steps[gaps[t] - 1]
+            _take_logs(state)
+            for i in range(over.size):
+                state[GAP + i] = over[i]
+            _predict(state, second, GAP)
         if gaps[t] >= 0:
             _advance(state, second)
             row = t * LANES
@@ -278,15 +283,6 @@ def _predict(state: FloatArray, second: bool | None, step: int) -> None:
             state[COVARIANCE + i] = a * top + b * bottom + fresh
             state[COVARIANCE_12 + i] = d * bottom - b * top + state[step + 4 * LANES + i]
             state[COVARIANCE_22 + i] = d * end - b * low + state[step + 5 * LANES + i]
-
-
-@inner()
-def _skip(state: FloatArray, second: bool | None, step: FloatArray) -> None:
-    """Take the covariance over missing readings by the filter's step (rows,) over them."""
-    _take_logs(state)
-    for i in range(step.size):
-        state[GAP + i] = step[i]
-    _predict(state, second, GAP)
 
 
 @inner()
