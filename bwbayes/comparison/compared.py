@@ -192,33 +192,29 @@ class Comparison(Product):
 
     def _differences_table(self) -> Table:
         parts = tuple(self[self.best].parts) if self.best else ()
+        rows = []
+        for name, apart in list(self.differences.items())[1:]:  # the first is the best
+            model, best = self[name], self[str(self.best)]
+            texts = [f"{'+' * (apart.value > 0)}{with_error(apart.value, apart.error)}"]
+            for part in parts:
+                scored = part in model.parts
+                gain = model.log_score([part]) - best.log_score([part]) if scored else None
+                text = "{gain:+.3g}" if part in self.voting else "({gain:+.3g})"
+                texts.append(_text(text, {"gain": gain}))
+            advantage = model.log_evidence - best.log_evidence
+            texts.append(f"{advantage:+.3g}" if np.isfinite(advantage) else "–")
+            rows.append((name, *texts))
         return Table(
             "differences",
             f"Differences to {self.best}",
             ("Model", self.measure.capitalize(), *parts, "Log evidence"),
-            [
-                (name, *self._difference_texts(self[name], self[str(self.best)], parts))
-                for name in self.differences
-                if name != self.best
-            ],
+            rows,
             note="Model less the best, nats: what decides with its standard error, by blocks "
             "longer than the correlation time; then part by part, in brackets those worth fewer "
             "than five independent readings, which have no vote. Less than four nats, or than the "
             "95% limit of the error, does not tell models apart.",
             on="both",
         )
-
-    def _difference_texts(
-        self, model: Candidate, best: Candidate, parts: tuple[str, ...]
-    ) -> list[str]:
-        apart = self.differences[model.name]
-        texts = [f"{'+' * (apart.value > 0)}{with_error(apart.value, apart.error)}"]
-        for name in parts:
-            gain = model.log_score([name]) - best.log_score([name]) if name in model.parts else None
-            text = "{gain:+.3g}" if name in self.voting else "({gain:+.3g})"
-            texts.append(_text(text, {"gain": gain}))
-        advantage = model.log_evidence - best.log_evidence
-        return [*texts, f"{advantage:+.3g}" if np.isfinite(advantage) else "–"]
 
 
 def _text(text: str, numbers: Mapping[str, Any]) -> str:
