@@ -177,6 +177,12 @@ class JointPrior:
         self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
         # A formula maps most of the free parameters, and nothing cuts them.
         self._cut = [(row, p) for row, p in enumerate(self.free) if p.formula is None]
+        # What free parameters must be above, or reach at least: two columns.
+        floors = np.array([p.floor for p in self.free])[:, np.newaxis]
+        reaches = [p.declared is None or p.declared.reaches_floor for p in self.free]
+        reached = np.array(reaches, dtype=np.bool_)[:, np.newaxis]
+        self._above = np.where(reached, -np.inf, floors)
+        self._at_least = np.where(reached, floors, -np.inf)
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -281,8 +287,8 @@ class JointPrior:
             free[row], between = parameter.prior.from_normal(safe[row], *bounds)
             room *= between
         # Rounding may put a positive parameter on its open bound, where there is no model.
-        above, at_least = self._floors
-        possible &= ((free > above) & (free >= at_least)).all(axis=0) & self._possible(values)
+        possible &= ((free > self._above) & (free >= self._at_least)).all(axis=0)
+        possible &= self._possible(values)
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
         return free.T, np.where(possible, log_prior, -np.inf)
@@ -299,15 +305,6 @@ class JointPrior:
         ).reshape(-1, 4)
         rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
         return rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
-
-    @cached_property
-    def _floors(self) -> tuple[FloatArray, FloatArray]:
-        """What free parameters must be above, or reach at least: two columns."""
-        floors = np.array([parameter.floor for parameter in self.free])
-        reached = [p.declared is None or p.declared.reaches_floor for p in self.free]
-        nothing = np.full(len(self.free), -np.inf)
-        above, at_least = np.where(reached, nothing, floors), np.where(reached, floors, nothing)
-        return above[:, np.newaxis], at_least[:, np.newaxis]
 
     def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
         size = rows if free is None else free.shape[0]
