@@ -216,9 +216,6 @@ class Distribution:
                 return scipy.stats.chi(1, scale=arguments["scale"])
             case "beta":
                 return scipy.stats.beta(arguments["a"], arguments["b"], lower, upper - lower)
-        return self._by_scipy_name(arguments)
-
-    def _by_scipy_name(self, arguments: dict[str, float]) -> Any:
         family = getattr(scipy.stats, self.name, None)
         if not isinstance(family, scipy.stats.rv_continuous):
             scipys = vars(scipy.stats).items()

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
@@ -348,23 +347,17 @@ def undone(recursion: Recursion, displacement: FloatArray) -> FloatArray:
     elif (np.abs(zeros) <= 1).all():
         drive = scipy.signal.lfilter(denominator, numerator, moved)
     else:
-        drive = _looking_ahead(numerator[0], np.asarray(zeros), denominator, moved)
+        # Zeros inside of the unit circle are undone forwards, those outside of it backwards.
+        path = scipy.signal.lfilter(denominator, numerator[:1], moved).astype(np.complex128)
+        for zero in zeros[np.abs(zeros) <= 1]:
+            path = scipy.signal.lfilter([1.0], [1.0, -zero], path)
+        for zero in zeros[np.abs(zeros) > 1]:
+            # w[t-1] = (w[t] - v[t]) / zero, from a drive that does not change after the end.
+            end = path[-1] / (1 - zero)
+            before, _ = scipy.signal.lfilter(
+                [-1 / zero], [1.0, -1 / zero], path[:0:-1], zi=[end / zero]
+            )
+            path = np.concatenate([before[::-1], [end]])
+        drive = path.real.copy()
         drive[0] = 0.0
     return np.asarray(displacement[0] + drive)
-
-
-def _looking_ahead(
-    first: float, zeros: NDArray[Any], denominator: FloatArray, forced: FloatArray
-) -> FloatArray:
-    """Undo zeros inside of the unit circle forwards, and those outside of it backwards."""
-    drive = scipy.signal.lfilter(denominator, [first], forced).astype(np.complex128)
-    for zero in zeros[np.abs(zeros) <= 1]:
-        drive = scipy.signal.lfilter([1.0], [1.0, -zero], drive)
-    for zero in zeros[np.abs(zeros) > 1]:
-        # w[t-1] = (w[t] - v[t]) / zero, from a drive that does not change after the end.
-        end = drive[-1] / (1 - zero)
-        before, _ = scipy.signal.lfilter(
-            [-1 / zero], [1.0, -1 / zero], drive[:0:-1], zi=[end / zero]
-        )
-        drive = np.concatenate([before[::-1], [end]])
-    return np.asarray(drive.real.copy())

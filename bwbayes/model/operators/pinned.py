@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import ArrayLike, FloatArray
+from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, check, positive, refuse
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
@@ -102,7 +102,7 @@ class Pinned(OneState):
             replace(
                 initial(),
                 description="how far the walls lag behind at the first sample",
-                bounds=_within_lag,
+                bounds=lambda e: (-(lag := e["pinning"] * e["d"] * (1 - e["coupling"])), lag),
                 stated_bounds="|initial| <= pinning d (1 - coupling)",
             ),
         )
@@ -225,11 +225,6 @@ def _fraction(name: str, label: str, description: str, a: float, b: float) -> De
         stated_bounds=f"0 <= {name} <= {STRONGEST:g}",
         loop=True,
     )
-
-
-def _within_lag(earlier: Values) -> tuple[ArrayLike, ArrayLike]:
-    bound = earlier["pinning"] * earlier["d"] * (1 - earlier["coupling"])
-    return -bound, bound
 
 
 @dataclass(frozen=True)
