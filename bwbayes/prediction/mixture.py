@@ -67,6 +67,16 @@ def quantile(ranked: Floating, probability: float) -> Floating:
     return line
 
 
+def probability(ranked: Floating, values: Floating) -> FloatArray:
+    """Return the probability (samples,) that a reading is below a value (samples,), um.
+
+    The share of the ranked values that are, as the i-th of N is the quantile of (i + 1/2) / N; nan
+    where a value is missing.
+    """
+    share: FloatArray = np.mean(ranked < values[:, np.newaxis], axis=1, dtype=np.float64)
+    return np.where(np.isnan(values), np.nan, share)
+
+
 def crps(ranked: Floating, values: Floating) -> Floating:
     """Return the continuous ranked probability score of values y (samples,), um.
 

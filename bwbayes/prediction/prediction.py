@@ -18,7 +18,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
 from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
@@ -267,7 +266,7 @@ def _summarized(
         if kind == "sensor" and record.displacement is not None:
             reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
             z = (reading - means) / sds
-            summarized["pit"] = np.mean(scipy.special.ndtr(z), axis=0, dtype=np.float64)
+            summarized["pit"] = mixture.probability(ranked, reading)
             summarized["crps"] = mixture.crps(ranked, reading)
             summarized["log_score"] = mixture.log_density(z, sds)
     return summarized

@@ -53,7 +53,7 @@ def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem, chain = _chain(folder, Console(quiet=True))
+        problem, chain = _chain(folder, folder.problem(), Console(quiet=True))
         return problem, chain.point
 
 
@@ -63,7 +63,7 @@ def draw(folder: RunFolder) -> Fit:
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        return _drawn(folder, Console(quiet=True), workers=1)
+        return _drawn(folder, folder.problem(), Console(quiet=True), workers=1)
 
 
 def resume(
@@ -104,7 +104,7 @@ def resume(
         if show is not None:
             show(problem)
         artist.rehearse(problem.posterior)
-        fit = _drawn(folder, console, workers, engine, backend)
+        fit = _drawn(folder, problem, console, workers, engine, backend)
         console.print("computing predictions ...", highlight=False)
         with StepProgress(console) as watch:
             result = assemble(fit.problem, fit.chain, fit.outcome, artist, watch)
@@ -133,13 +133,14 @@ def redraw(folder: RunFolder) -> Fit:
 
 def _drawn(
     folder: RunFolder,
+    problem: Problem,
     console: Console,
     workers: int | None,
     engine: Engine | None = None,
     backend: str | Executor | None = None,
 ) -> Fit:
     """Sample a run to its end, from wherever it stands."""
-    problem, chain = _chain(folder, console, engine)
+    problem, chain = _chain(folder, problem, console, engine)
     plan = problem.plan
     with (
         executor(workers, problem.posterior.engine, backend) as pool,
@@ -158,10 +159,9 @@ def _drawn(
 
 
 def _chain(
-    folder: RunFolder, console: Console, requested: Engine | None = None
+    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None = None
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
-    problem = folder.problem()
     if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
         return _begun(folder, problem, console)
     chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))

@@ -37,10 +37,11 @@ def drawn(draw: Callable[..., Figure], *shown: Any) -> Figure:
 
 def prepare() -> None:
     """Load what is slow to load, before there is anything to draw."""
-    import corner  # noqa: F401, PLC0415
     from matplotlib.backends import backend_agg  # noqa: F401, PLC0415
 
     from bwbayes.report.figures import chain, interactive  # noqa: F401, PLC0415
+
+    chain.pair_contours()
 
 
 def plots_of(result: Result) -> PagePlots:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import scipy
 from matplotlib.figure import Figure
@@ -16,13 +20,25 @@ from bwbayes.report.result import Result
 RANK_BINS = 20
 
 
+def pair_contours() -> Callable[..., None]:
+    """Load corner's ``hist2d`` alone: the package loads all of arviz, which no picture needs."""
+    package = find_spec("corner")
+    assert package is not None
+    assert package.origin is not None
+    core = spec_from_file_location("corner.core", Path(package.origin).with_name("core.py"))
+    assert core is not None
+    assert core.loader is not None
+    module = module_from_spec(core)
+    core.loader.exec_module(module)
+    hist2d: Callable[..., None] = module.hist2d
+    return hist2d
+
+
 def draw_corner(result: Result) -> Figure:
     """Draw every pair of free parameters, with contours that hold 50 and 90 % of the draws.
 
     The true values, where they are known, are lines.
     """
-    import corner  # noqa: PLC0415  # it loads all of arviz, which no other picture needs
-
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
@@ -32,18 +48,19 @@ def draw_corner(result: Result) -> Figure:
     labels = [style.axis_label(parameter) for parameter in result.free]
     # Inches: a panel has 1.25, the margin for the labels 1.3.
     side = 1.25 * free + 1.5
-    figure = Figure(figsize=(side, side))
+    figure, hist2d = Figure(figsize=(side, side)), pair_contours()
     low, high = 1.3 / side, 1 - 0.2 / side
     grid = figure.add_gridspec(
         free, free, left=low, bottom=low, right=high, top=high, wspace=0.05, hspace=0.05
     )
     for row, column in ((i, j) for i in range(free) for j in range(i + 1)):
-        panel = figure.add_subplot(grid[row, column])
-        panel.grid(visible=False)
+        # Set before there are any ticks: to change those of so many panels takes longer.
+        with mpl.rc_context({"axes.grid": False, "xtick.labelsize": 11, "ytick.labelsize": 11}):
+            panel = figure.add_subplot(grid[row, column])
         is_lowest, is_first = row == free - 1, column == 0 < row
-        panel.tick_params("x", labelbottom=is_lowest, labelsize=11, labelrotation=90)
-        panel.tick_params("y", labelleft=is_first, labelsize=11)
+        panel.tick_params(labelbottom=is_lowest, labelleft=is_first)
         if is_lowest:
+            panel.tick_params("x", labelrotation=90)
             panel.set_xlabel(labels[column], fontsize=13)
             panel.xaxis.set_label_coords(0.5, -0.75)
         if is_first:
@@ -56,7 +73,7 @@ def draw_corner(result: Result) -> Figure:
             panel.set(xlim=ranges[row], yticks=[])
             panel.xaxis.set_major_locator(ticks[row])
             continue
-        corner.hist2d(
+        hist2d(
             flat[:, column],
             flat[:, row],
             ax=panel,
