@@ -13,7 +13,7 @@ with the rest if it has draws at all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,8 +78,6 @@ class Calibration:
         kind and level ("NAME sensor 95"); may be empty.
     power
         Probability that the smooth test finds a posterior sd that is wrong by so much.
-    shortcomings
-        Why the calibration has failed; empty if it has passed.
     name, parameters, facts, provenance
         What was calibrated, and what its numbers depend on: seed, digest of the data, versions.
     """
@@ -94,11 +92,35 @@ class Calibration:
     limits: Mapping[int, tuple[float, float]]
     bands: Mapping[str, Coverage]
     power: Mapping[str, float]
-    shortcomings: tuple[str, ...]
     name: str = "calibration"
     parameters: Sequence[Parameter] = ()
     facts: Sequence[tuple[str, str]] = ()
     provenance: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def shortcomings(self) -> tuple[str, ...]:
+        """Why the calibration has failed; empty if it has passed."""
+        reasons = []
+        if len(self.unconverged) > 0.01 * self.replicates:
+            reasons.append(
+                f"{len(self.unconverged)} of {self.replicates} replicates did not converge, "
+                "more than 1%"
+            )
+        for name, statistic in self.statistics.items():
+            if statistic.adjusted < FAMILY_LEVEL / 2:
+                reasons.append(f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})")
+            if statistic.outside:
+                reasons.append(f"{name}: the distribution of ranks leaves its band")
+        for name, coverage in self.bands.items() if len(self.positions) >= JUDGED_FROM else ():
+            *record, kind, level = name.split(" ")
+            # Written so that nan fails.
+            if not abs(coverage.mean - int(level) / 100) <= LIMIT * coverage.error:
+                samples = f"the record {' '.join(record)}" if record else "held-out samples"
+                reasons.append(
+                    f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} "
+                    f"of {samples}"
+                )
+        return tuple(reasons)
 
     @property
     def passed(self) -> bool:
@@ -187,7 +209,6 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
         error = np.std(covered, ddof=1) / np.sqrt(count) if count > 1 else np.nan
         bands[name] = Coverage(float(np.mean(covered)), float(error))
     intervals = {level: scipy.stats.binom.interval(0.99, count, level / 100) for level in LEVELS}
-    enough = count >= JUDGED_FROM
     return Calibration(
         replicates=len(entries),
         unconverged=tuple(entry["number"] for entry in entries if not entry["converged"]),
@@ -202,7 +223,6 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
             "20 % too small": smooth_power(count, level, 0.8),
             "10 % too small": smooth_power(count, level, 0.9),
         },
-        shortcomings=tuple(_shortcomings(entries, statistics, bands if enough else {})),
     )
 
 
@@ -258,26 +278,3 @@ def holm(p: FloatArray) -> FloatArray:
 def _legendre(u: FloatArray) -> FloatArray:
     """First two Legendre polynomials, orthonormal on (0, 1), stacked in front."""
     return np.stack([np.sqrt(3) * (2 * u - 1), np.sqrt(5) * (6 * u * (u - 1) + 1)])
-
-
-def _shortcomings(
-    entries: Sequence[Entry], statistics: Mapping[str, Uniformity], bands: Mapping[str, Coverage]
-) -> Iterator[str]:
-    """Yield why a calibration has failed."""
-    unconverged = sum(not entry["converged"] for entry in entries)
-    if unconverged > 0.01 * len(entries):
-        yield f"{unconverged} of {len(entries)} replicates did not converge, more than 1%"
-    for name, statistic in statistics.items():
-        if statistic.adjusted < FAMILY_LEVEL / 2:
-            yield f"{name}: ranks are not even (smooth test, p = {statistic.p:.1g})"
-        if statistic.outside:
-            yield f"{name}: the distribution of ranks leaves its band"
-    for name, coverage in bands.items():
-        *record, kind, level = name.split(" ")
-        # Written so that nan fails.
-        if not abs(coverage.mean - int(level) / 100) <= LIMIT * coverage.error:
-            samples = f"the record {' '.join(record)}" if record else "held-out samples"
-            yield (
-                f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} "
-                f"of {samples}"
-            )
