@@ -73,7 +73,7 @@ class Duhem(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, d₃, α, β, α₂ and the initial h; with even terms d₂ and α₁ as well."""
-        gains = _coefficient("d3", 3, "d_3", "cubic piezoelectric coefficient", 0.1)
+        gains = _coefficient("d3", 3, "d_3", "cubic piezoelectric coefficient")
         strengths = Declaration(
             "alpha2",
             "um/V^3",
@@ -100,7 +100,7 @@ class Duhem(OneState):
         first, last = (d(), gains, alpha(), shape, strengths), initial()
         if self.odd:
             return *first, last
-        even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient", 0.1)
+        even = _coefficient("d2", 2, "d_2", "quadratic piezoelectric coefficient")
         tilt = Declaration(
             "alpha1",
             "um/V^2",
@@ -165,16 +165,14 @@ class DuhemStep(RelaxingStep):
         return (slope - farthest).min(axis=1), (slope + farthest).max(axis=1)
 
 
-def _coefficient(name: str, power: int, label: str, description: str, scale: float) -> Declaration:
-    """Declare a gain's coefficient that adds about ``scale`` of d u at the farthest voltage."""
+def _coefficient(name: str, power: int, label: str, description: str) -> Declaration:
+    """Declare a gain's coefficient that adds about a tenth of d u at the farthest voltage."""
     return Declaration(
         name,
         f"um/V^{power}",
         label,
         description,
-        lambda context: normal(
-            0.0, scale * context.ranges.gain / _farthest(context) ** (power - 1)
-        ),
+        lambda context: normal(0.0, 0.1 * context.ranges.gain / _farthest(context) ** (power - 1)),
         loop=True,
     )
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
-from bwbayes.model.operator import Span
-from bwbayes.model.operators.scalar_memory import OneState, StateMemory, d, initial
+from bwbayes.model.operators.scalar_memory import OneState, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
@@ -35,9 +34,9 @@ class NoHysteresis(OneState):
         slope = replace(d(), default=lambda c: lognormal(c.ranges.gain, 0.6), bounds=None)
         return slope, replace(initial(), default=lambda _: 0.0)
 
-    def begin(self, column: Values, voltage: float, span: Span, *, from_rest: bool) -> StateMemory:  # noqa: ARG002  # nothing before counts
-        """Return no state."""
-        return StateMemory(voltage, np.zeros_like(column["d"]))
+    def first_state(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002  # any
+        """Return zero."""
+        return np.zeros_like(column["d"])
 
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray

@@ -22,7 +22,7 @@ from bwbayes.model.declaration import Declaration, Values, check, positive, refu
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.rosenbrock import STAGES
-from bwbayes.model.operators.scalar_memory import OneState, StateMemory, initial
+from bwbayes.model.operators.scalar_memory import OneState, initial
 from bwbayes.model.operators.walls import (
     KNOTS,
     LINES,
@@ -123,25 +123,16 @@ class Pinned(OneState):
         """Return U/k."""
         return half_range / column["pinning"]
 
-    def begin(
-        self,
-        column: Values,
-        voltage: float,
-        span: Span,  # noqa: ARG002  # the state says all of the past
-        *,
-        from_rest: bool,
-    ) -> StateMemory:
-        """Return P_irr at the first voltage: as far behind as ``initial``, or what it becomes."""
+    def first_state(self, column: Values, voltage: float) -> FloatArray:
+        """Return P_irr (models,) of walls that lag behind P_an by ``initial``, um.
+
+        P = P_an − (1 − c) (P_an − P_irr), so that P_an is what all walls would do in another field.
+        """
         walls, behind = self.walls(column), column["initial"]
-        # P = P_an − (1 − c) (P_an − P_irr): P_an is what all walls would do in another field.
         reversible = walls._replace(reversible=np.ones_like(behind))
-        elsewhere = 0.0 if from_rest else voltage
-        elsewhere = elsewhere - walls.coupling * (1 - walls.reversible) * behind
+        elsewhere = voltage - walls.coupling * (1 - walls.reversible) * behind
         whole = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
-        fixed = np.asarray(whole - behind)
-        if from_rest and voltage != 0:
-            fixed = self.trace(column, np.array([0.0, voltage]), fixed)[1]
-        return StateMemory(voltage, fixed)
+        return np.asarray(whole - behind)
 
     def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
         """Return how far behind (2, models) sweeps through the span leave the walls, um."""

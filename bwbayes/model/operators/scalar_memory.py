@@ -75,10 +75,14 @@ class OneState(Operator):
         from_rest: bool,
     ) -> StateMemory:
         """Return the state at the first voltage: ``initial``, or what it becomes from 0 V on."""
-        state = column["initial"]
+        state = self.first_state(column, 0.0 if from_rest else voltage)
         if from_rest and voltage != 0:
             state = self.trace(column, np.array([0.0, voltage]), state)[1]
         return StateMemory(voltage, state)
+
+    def first_state(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002  # any
+        """Return the state (models,) that ``initial`` means at a voltage, V: by default itself."""
+        return column["initial"]
 
     def advance(
         self, column: Values, voltage: FloatArray, memory: StateMemory
