@@ -129,7 +129,7 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
     values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
     for parameter in prior.free:
         name, (low, high) = parameter.name, parameter.support
-        if parameter.declared and parameter.declared.reaches_floor and low == parameter.floor:
+        if parameter.declared.reaches_floor and low == parameter.floor:
             if _near(values[name] - low):
                 yield Finding(
                     name, f"lies on its bound {low:g}", f"give {name} = {{ fixed = {low:.1f} }}"
@@ -145,9 +145,7 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
 
 def _pressed_by_others(parameter: Parameter, x: FloatArray, values: Values) -> Iterator[Finding]:
     """Yield bounds of draws x (draws,) that other parameters set."""
-    if parameter.declared is None:
-        return
-    for side, bound in zip(("lower", "upper"), parameter.limits(values), strict=True):
+    for side, bound in zip(("lower", "upper"), parameter.declared.limits(values), strict=True):
         advice = parameter.declared.pressed.get(side)
         if advice is None or not np.isfinite(bound).all():
             continue
@@ -174,7 +172,7 @@ def _given_bound(parameter: Parameter, side: str, bound: float) -> Finding:
     fix = f"move parameters.{parameter.name}.{side}"
     if bound not in (parameter.lower, parameter.upper):
         declared = parameter.declared
-        advice = declared.pressed.get(side) if declared and declared.bounds is None else None
+        advice = declared.pressed.get(side) if declared.bounds is None else None
         fix = advice or f"widen its prior {parameter.prior}, which ends there"
     text = f"lies on its {side} bound {bound:.4g} {parameter.unit}"
     return Finding(parameter.name, text.rstrip(), fix)

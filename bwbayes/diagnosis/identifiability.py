@@ -112,7 +112,7 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
     """Return a parameter's prior sd around its value in ``values``."""
     assert parameter.prior is not None
     columns = {name: np.array([value]) for name, value in values.items()}
-    lower, upper = parameter.limits(prior.seen(columns, parameter.record))
+    lower, upper = parameter.declared.limits(prior.seen(columns, parameter.record))
     if np.isfinite(lower).all() and np.isfinite(upper).all():
         # What the bounds leave to a parameter of which nothing else is known.
         return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))

@@ -38,7 +38,7 @@ FARTHEST = 37.0
 class Parameter:
     """One parameter: names for people, and a prior or a fixed value.
 
-    ``lower`` and ``upper`` cut the prior; the bounds that its part ``declared`` hold besides.
+    ``lower`` and ``upper`` cut the prior; the bounds that its part has ``declared`` hold besides.
     ``unit`` and ``label`` (LaTeX, without the dollar signs) go to tables and pictures. ``record``
     is the one of several records that the parameter belongs to, empty if to all.
 
@@ -54,11 +54,11 @@ class Parameter:
     unit: str
     label: str
     description: str
+    declared: Declaration = field(compare=False, repr=False)
     prior: Distribution | None = None
     fixed: float | None = None
     lower: float = -np.inf
     upper: float = np.inf
-    declared: Declaration | None = field(default=None, compare=False, repr=False)
     record: str = ""
 
     @classmethod
@@ -66,8 +66,8 @@ class Parameter:
         """Return a declared parameter with a prior or a fixed value."""
         names = declared.name, declared.unit, declared.label, declared.description
         if isinstance(value, Distribution):
-            return cls(*names, prior=value, declared=declared)
-        return cls(*names, fixed=value, declared=declared)
+            return cls(*names, declared, prior=value)
+        return cls(*names, declared, fixed=value)
 
     def __post_init__(self) -> None:
         if (self.prior is None) == (self.fixed is None):
@@ -87,31 +87,21 @@ class Parameter:
     @property
     def plain(self) -> str:
         """Its name without that of its record."""
-        return self.name if self.declared is None else self.declared.name
+        return self.declared.name
 
     @property
     def floor(self) -> float:
         """What the parameter cannot be lower than."""
-        return -np.inf if self.declared is None else self.declared.floor
+        return self.declared.floor
 
     @property
     def positive(self) -> bool:
         """Whether it lies above zero."""
-        return self.declared is not None and self.declared.positive
+        return self.declared.positive
 
     def above_floor(self, x: FloatArray) -> BoolArray:
         """Tell which values are not too low. Some parameters reach their floor."""
-        reaches = self.declared is None or self.declared.reaches_floor
-        return np.asarray(x >= self.floor if reaches else x > self.floor)
-
-    def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Bounds (models,) given the values of other parameters; infinite without a constraint.
-
-        By the names that the parts declare; see :meth:`JointPrior.seen`.
-        """
-        if self.declared is None:
-            return np.asarray(-np.inf), np.asarray(np.inf)
-        return self.declared.limits(values)
+        return np.asarray(x >= self.floor if self.declared.reaches_floor else x > self.floor)
 
     @cached_property
     def support(self) -> tuple[float, float]:
@@ -124,9 +114,9 @@ class Parameter:
     def formula(self) -> Scored | None:
         """The formula that maps normal scores to values, if there is one and nothing cuts it."""
         assert self.prior is not None
-        bounded = self.declared is not None and self.declared.bounds is not None
         form, uncut = self.prior.form, self.support == self.prior.support
-        return form if isinstance(form, Scored) and uncut and not bounded else None
+        free = self.declared.bounds is None
+        return form if isinstance(form, Scored) and uncut and free else None
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
@@ -179,7 +169,7 @@ class JointPrior:
         self._cut = [(row, p) for row, p in enumerate(self.free) if p.formula is None]
         # What free parameters must be above, or reach at least: two columns.
         floors = np.array([p.floor for p in self.free])[:, np.newaxis]
-        reaches = [p.declared is None or p.declared.reaches_floor for p in self.free]
+        reaches = [p.declared.reaches_floor for p in self.free]
         reached = np.array(reaches, dtype=np.bool_)[:, np.newaxis]
         self._above = np.where(reached, -np.inf, floors)
         self._at_least = np.where(reached, floors, -np.inf)
@@ -189,7 +179,7 @@ class JointPrior:
         """Refuse values that are fixed where others leave them no room."""
         fixed = {name: np.array([value]) for name, value in self._fixed.items()}
         for parameter in self.parameters:
-            if parameter.fixed is None or parameter.declared is None:
+            if parameter.fixed is None:
                 continue
             others = {name: value for name, value in fixed.items() if name != parameter.name}
             low, high = self._between(parameter, others)
@@ -203,7 +193,7 @@ class JointPrior:
 
     def _stated(self) -> str:
         """Return the physical constraints in words."""
-        stated = (p.declared.stated_bounds for p in self.parameters if p.declared)
+        stated = (p.declared.stated_bounds for p in self.parameters)
         return " and ".join(filter(None, stated))
 
     @property
@@ -316,7 +306,7 @@ class JointPrior:
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
         low, high = parameter.support
-        if parameter.declared is None or parameter.declared.bounds is None:
+        if parameter.declared.bounds is None:
             return np.asarray(low), np.asarray(high)
         earlier = {name: values[name] for name in self._known[parameter.name]}
         lower, upper = self._between(parameter, earlier)
@@ -341,7 +331,7 @@ class JointPrior:
         """Return the bounds (models,) that other values set; of several records, the tightest."""
         # Those of a parameter that all records have depend on the values of each.
         views = (parameter.record,) if parameter.record or not self.records else self.records
-        limits = [parameter.limits(self.seen(values, record)) for record in views]
+        limits = [parameter.declared.limits(self.seen(values, record)) for record in views]
         low, high = limits[0]
         for lower, upper in limits[1:]:
             low, high = np.maximum(low, lower), np.minimum(high, upper)

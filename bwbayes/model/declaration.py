@@ -128,7 +128,10 @@ class Declaration:
         return self.floor == 0 and not self.reaches_floor
 
     def limits(self, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Return its bounds (models,) given values of other parameters; infinite without any."""
+        """Return its bounds (models,) given values of other parameters; infinite without any.
+
+        By the names that the parts declare, whatever the record.
+        """
         if self.bounds is not None:
             try:
                 low, high = self.bounds(values)

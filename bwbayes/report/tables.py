@@ -336,7 +336,7 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
     bounds = [
         parameter.declared.stated_bounds
         for parameter in prior.parameters
-        if parameter.declared is not None and parameter.declared.stated_bounds
+        if parameter.declared.stated_bounds
     ]
     cut = Markup("bounds of the parameters have cut it")
     if bounds:

@@ -21,7 +21,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bwbayes.app.running.figure_worker import Artist, artist_of
-from bwbayes.inference.parameters import Parameter
 from bwbayes.report.figures import interactive, picture_of, plots_of, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.pictures import pictures
@@ -77,7 +76,7 @@ def test_outer_axes_are_named_with_their_units(figures: Mapping[str, Figure]) ->
 
 def test_names_are_read_as_mathematics_only_if_they_are() -> None:
     odd = dataclasses.replace(example.PARAMETERS[0], label=r"\nonsense{", unit="$")
-    exponent = Parameter("exponent", "-", "n", "s", example.PARAMETERS[0].prior)
+    exponent = dataclasses.replace(odd, name="exponent", unit="-", label="n")
     for parameter, label in ((odd, r"d (\$)"), (exponent, "$n$")):
         run = example.run(False, example.draws()[..., :1], (parameter,))
         figure = draw_trace(run)

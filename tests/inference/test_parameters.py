@@ -192,7 +192,7 @@ def test_bounds_truncate_the_prior() -> None:
 )
 def test_a_parameter_that_cannot_be_is_refused(name: str, what: Any, says: str) -> None:
     with pytest.raises(InputError, match=says) as refused:
-        Parameter(name, "um", name, "", **what, declared=declared(name))
+        Parameter(name, "um", name, "", declared(name), **what)
     assert str(refused.value).startswith(f"{name}: ")
 
 

@@ -177,11 +177,11 @@ def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Par
         stated.unit or unit,
         stated.label or declared.label + (rf"^{{\mathrm{{{above}}}}}" if record else ""),
         stated.description or declared.description + (f" of {record}" if record else ""),
+        declared,
         prior,
         fixed,
         -np.inf if stated.lower is None else stated.lower,
         np.inf if stated.upper is None else stated.upper,
-        declared,
         record,
     )
 

@@ -174,7 +174,7 @@ def test_states_that_are_reachable_are_inside_the_prior(name: str) -> None:
     of = posterior(name)
     column = of.table.columns(drawn_from(of, 40))
     (initial,) = (p for p in of.prior.parameters if p.name == "initial")
-    low, high = initial.limits(column)
+    low, high = initial.declared.limits(column)
     least, most = of.only.actuator.hysteresis.reachable(
         column, float(of.only.voltage[0]), Span(-100.0, 100.0)
     )
