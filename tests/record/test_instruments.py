@@ -6,6 +6,7 @@ import warnings
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -94,6 +95,29 @@ def test_a_rate_beside_the_numbers_is_the_one_to_copy(
     with pytest.raises(ColumnsError) as caught:
         read_record(tmp_path / "a.mat")
     assert (200.0 if value else 1000.0) == caught.value.fs
+
+
+@pytest.mark.parametrize("place", ["/", "/run", "/run/u_V"])
+@pytest.mark.parametrize(("name", "value"), [("fs", 200), ("Sampling_Rate", 200.0), ("dt", 0.005)])
+def test_a_rate_among_the_attributes_is_the_one_to_copy(
+    tmp_path: Path, place: str, name: str, value: float
+) -> None:
+    """Of the file, of a group and of a dataset; none is taken from what is no rate."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/u_V"], file["run/x_um"] = VOLTAGE, DISPLACEMENT
+        file[place].attrs[name] = value
+        file["run"].attrs["rate"] = "fast"
+        file["run/x_um"].attrs["interval"] = 0.0
+    with pytest.raises(ColumnsError, match="; say fs=200") as caught:
+        read_record(tmp_path / "a.h5")
+    assert 200.0 == caught.value.fs
+
+
+def test_a_rate_in_a_line_above_the_header_is_the_one_to_copy(tmp_path: Path) -> None:
+    rows = [f"{v:.3f},{d:.6f}" for v, d in zip(VOLTAGE, DISPLACEMENT, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["# dt: 0.005", "u_V,x_um", *rows, ""]))
+    with pytest.raises(ColumnsError, match="; say fs=200"):
+        read_record(tmp_path / "a.csv")
 
 
 def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> None:

@@ -12,7 +12,9 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
-from bwbayes.record.io.series import Series, Source
+from bwbayes.record.io.series import RATES, Series, Source
 
 QUANTITIES = ("time", "voltage", "displacement")
 
@@ -39,12 +41,6 @@ _WORDS = {
         *("x", "y", "z", "pos", "position", "disp", "displacement", "stroke", "deflection"),
         *("sensor", "output", "weg", "auslenkung"),
     ),
-}
-# What a single number beside the series is called that is their rate, Hz, or the interval, s: the
-# power of it that is the rate.
-_RATES = {
-    **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
-    **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time"), -1),
 }
 
 
@@ -344,9 +340,12 @@ def _columns_error(
         questions.append("what is the sampling rate, Hz (no column can be the time)")
     problem = f"{where}: {', and '.join(questions)}? {listing}"
     single = [s for s in source.series if s.size == 1 and s.name in ranges]
-    numbers = {s.label.lower(): ranges[s.name][0] for s in single}
+    numbers = {s.label.lower(): float(ranges[s.name][0]) for s in single}
+    for name, text in chain.from_iterable(notes.items() for notes in source.notes.values()):
+        with suppress(ValueError):
+            numbers.setdefault(name.lower(), float(text))
     stated = [
-        float(numbers[name]) ** power for name, power in _RATES.items() if numbers.get(name, 0) > 0
+        numbers[name] ** power for name, power in RATES.items() if 0 < numbers.get(name, 0) < np.inf
     ]
     return ColumnsError(problem, columns, units, fs=[*stated, 1000.0][0] if timeless else None)
 

@@ -1,9 +1,10 @@
 """Records in HDF5 files: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
 Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
-says a dataset's unit, columns of a table or matrix are series of their own, ``table.u`` and
-``log[2]``. Beside the datasets may stand ``voltage_is``, ``origin``, ``interval_s`` and
-``time_offset_s``, as attributes or, in MATLAB's files of version 7.3, as variables.
+says a dataset's unit, one like ``fs`` or ``dt`` how fast it was sampled; columns of a table or
+matrix are series of their own, ``table.u`` and ``log[2]``. Beside the datasets may stand
+``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``, as attributes or, in MATLAB's
+files of version 7.3, as variables.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.record.io.series import NOTES, Series, Source, note, vectors
+from bwbayes.record.io.series import NOTES, RATES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
 
@@ -70,7 +71,9 @@ def _series(
     """
     passed.add(h5py.h5o.get_info(group.id).addr)
     prefix = group.name.strip("/") + "/" * (group.name != "/")
-    notes[prefix] = {key: _note(group.attrs, key) for key in NOTES if key in group.attrs}
+    notes[prefix] = {
+        key: _note(group.attrs, key) for key in group.attrs if key in NOTES or key.lower() in RATES
+    }
     links = [name for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
     items = {name: group[name] for name in links if not name.startswith("#")}
     for name, item in items.items():
@@ -85,6 +88,8 @@ def _series(
         elif name in NOTES and name.endswith("_s") and item.size and item.dtype.kind in "iuf":
             notes[prefix][name] = note(item[()])
         elif not is_text:
+            stated = [key for key in item.attrs if key.lower() in RATES]
+            notes[f"{prefix}{name}"] = {key: _note(item.attrs, key) for key in stated}
             unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
             load = partial(_loaded, path, item.name)
             yield from vectors(prefix, name, item.shape, item.dtype, load, unit)

@@ -21,6 +21,12 @@ from bwbayes.errors import InputError
 MAXIMUM_SAMPLES = 10**8
 # What a file may say beside its numbers.
 NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
+# What a number beside the series is called, in lower case, that is their rate, Hz, or the interval,
+# s: the power of it that is the rate.
+RATES = {
+    **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
+    **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time"), -1),
+}
 
 
 @dataclass(frozen=True)
