@@ -41,6 +41,10 @@ class NotConvergedError(InputError):
     """An interval was asked of a sampling that has not converged; the text says how to go on."""
 
 
+class NoNumbersError(InputError):
+    """A text that is no record: it has no columns of numbers."""
+
+
 class ColumnsError(InputError):
     """Columns or units of a file that are not known; ``columns`` and ``units`` are a guess.
 

@@ -18,6 +18,7 @@ from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.record import Record, read_record, write_record
 from tests.app import small
 from tests.app.conftest import Type
+from tests.examples import ROOT
 
 COMMANDS = (
     "init run resume check simulate predict report calibrate campaign compensate compare design "
@@ -96,6 +97,17 @@ def test_malformed_input_is_one_line_and_leaves_nothing(
     for command in ("run", "check"):
         bwbayes(command, "my.toml").assert_refused(*texts)
     assert {"record.csv", "my.toml"} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["README.md", "LICENSE"])
+def test_a_text_that_is_neither_config_nor_record_is_called_so(
+    bwbayes: Type, tmp_path: Path, name: str
+) -> None:
+    """Whatever examples of configs and tables are in it."""
+    example = f"\n```toml\n{RECORD}```\n[record]: a link\n"
+    (tmp_path / name).write_text((ROOT / name).read_text(encoding="utf-8") + example)
+    for command in ("run", "check"):
+        bwbayes(command, name).assert_refused(f"{name}: is no config, and no record; a config has")
 
 
 def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(

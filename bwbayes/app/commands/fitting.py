@@ -19,7 +19,7 @@ from bwbayes.app.commands.options import (
     seed_option,
 )
 from bwbayes.app.running.figure_worker import artist_of
-from bwbayes.errors import ColumnsError, InputError
+from bwbayes.errors import ColumnsError, InputError, NoNumbersError
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
@@ -166,7 +166,13 @@ def _config_or_proposal(
                 "units and fs under [record]"
             )
         return config if record is None else config.with_record(record), False
-    proposal = _proposed(path, path.parent, naming, command)
+    try:
+        proposal = _proposed(path, path.parent, naming, command)
+    except NoNumbersError:
+        raise InputError(
+            f"{path}: is no config, and no record; a config has a table [record], a record columns "
+            "of numbers"
+        ) from None
     config = proposal.config
     if command != "check" and proposal.pointless is not None:
         raise InputError(

@@ -172,10 +172,12 @@ def is_config(path: Path) -> bool:
     except (OSError, UnicodeError):
         return path.suffix == ".toml"
     # A record, which may be called .toml by mistake and have a line [s];[V];[um], is mostly rows
-    # that begin with a number.
+    # that begin with a number; in prose few lines are titles of tables, keys or comments.
     rows = re.findall(r"^[ \t,;|\"']*[-+.]?\d", text, re.MULTILINE)
+    written = re.findall(r"""^\s*(?:[#[\]}]|[\w."'-]+\s*=)""", text, re.MULTILINE)
     has_table = re.search(r"^\s*(\[+[a-z]|record\b)", text, re.MULTILINE) is not None
-    return 2 * len(rows) <= len(text.splitlines()) and (path.suffix == ".toml" or has_table)
+    has_keys = has_table and 2 * len(written) >= len(re.findall(r"^.*\S", text, re.MULTILINE))
+    return 2 * len(rows) <= len(text.splitlines()) and (path.suffix == ".toml" or has_keys)
 
 
 def parse(text: str, where: str) -> Config:

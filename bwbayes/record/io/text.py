@@ -26,7 +26,7 @@ import pandas as pd
 from charset_normalizer import from_bytes
 from numpy.typing import NDArray
 
-from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
 from bwbayes.record.io.columns import QUANTITIES, power_of
 from bwbayes.record.io.labview import is_lvm, plain_lvm
 from bwbayes.record.io.series import Series, Source, in_seconds
@@ -186,7 +186,7 @@ def _layout(path: Path, lines: Sequence[str]) -> _Layout:
         if len(in_a_row) == 3:
             break
     if not in_a_row:
-        raise InputError(f"{path}: no columns of numbers in it; write {_EXAMPLE} above such")
+        raise NoNumbersError(f"{path}: no columns of numbers in it; write {_EXAMPLE} above such")
     return _Layout(separator, fields, in_a_row[0])
 
 
