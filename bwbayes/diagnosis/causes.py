@@ -32,7 +32,7 @@ DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
 REVERSED_SIGN = Finding(
     "sign", "reversed sign of the displacement", "change the sign of the displacement in the file"
 )
-REFIT = "fit this record itself: bwbayes run CONFIG --record FILE"
+REFIT = "fit this record itself, with the same config"
 
 # What a cause is called, and what to do about it.
 WORDS: Mapping[str, tuple[str, str]] = {

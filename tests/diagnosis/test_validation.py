@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.causes import WORDS
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.prediction.bands import LeadIn
@@ -190,3 +191,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
         assert verdict is not None
         assert verdict.holds is holds
         assert holds or "on the training readings" in verdict.reasons[0]
+
+
+def test_no_fix_is_a_command_line_which_python_has_not() -> None:
+    assert not [fix for _, fix in WORDS.values() if "bwbayes " in fix]
