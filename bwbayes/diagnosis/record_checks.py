@@ -262,6 +262,10 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         time > LONG_DECAY * record.duration
     ):
         return
+    elif abs(loop.start) < abs(size) / 2:
+        # Another state at the start takes it back: it mends loops that no play follows, as those of
+        # an amplifier at its limits.
+        return
     begin = float(record.time[loop.rows[0]])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
     over = begin + time * float(np.log(abs(size) / max(0.5 * spread, 0.001 * extent)))

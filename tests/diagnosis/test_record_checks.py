@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ast import literal_eval
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.diagnosis.series_patterns import spikes
 from bwbayes.record import Record, read_record
+from tests.diagnosis.plants import FINE, RATE, drawn, hysteresis, limited, plant
 from tests.record.spoilt import SPOILT, good, looping
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
@@ -38,11 +40,11 @@ SINE = np.sin(np.linspace(0.0, 12 * np.pi, 3000))
 def test_a_displacement_cut_off_at_its_limit_is_clipping(
     limits: tuple[float, float], step: float
 ) -> None:
-    limited = np.clip(np.round(SINE / step) * step, *limits)
-    (finding,) = findings("clipping", SINE, limited)
+    cut = np.clip(np.round(SINE / step) * step, *limits)
+    (finding,) = findings("clipping", SINE, cut)
     first, last = round(finding.start / 1e-3), round(finding.stop / 1e-3) - 1
-    assert abs(limited[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
-    assert abs(limited[[first - 1, last + 1]]).max() < 0.8
+    assert abs(cut[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
+    assert abs(cut[[first - 1, last + 1]]).max() < 0.8
     assert "use a wider range" == finding.fix
 
 
@@ -182,6 +184,20 @@ def test_a_spike_is_where_it_is_said_to_be() -> None:
     assert (record.time[700], record.time[900] + record.interval) == (finding.start, finding.stop)
     assert f"2 isolated outliers of the displacement, at {record.time[700]:.6g}, " in finding.text
     assert "outliers = true under [model]" == finding.fix
+
+
+@pytest.mark.parametrize("kind", ["saturation", "slew limit"])
+def test_an_amplifier_at_its_limits_is_no_transient(kind: str) -> None:
+    records = [plant(kind, (seed, 1)) for seed in range(12)]
+    if kind == "slew limit":
+        time = np.arange(0, 8, 0.002)
+        for frequency, rate in product((1.0, 3.0), (0.3, 0.4)):
+            voltage = 80 * np.sin(2 * np.pi * frequency * time)
+            slow = limited(voltage, rate * RATE * FINE * float(np.diff(voltage).max()))
+            readings = hysteresis(drawn(np.random.default_rng(0)), slow)
+            readings += 0.02 * np.random.default_rng(1).standard_normal(time.size)
+            records.append(Record(voltage, readings, 0.002))
+    assert not [r for r in records if findings_of("switch-on transient", r)]
 
 
 def test_a_planned_voltage_is_looked_at_too() -> None:
