@@ -16,7 +16,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.model.declaration import Values
 from bwbayes.model.distributions import Distribution
 
 # Draws that stand for a prior, or for a Gaussian posterior.
@@ -123,7 +122,7 @@ def _disagreement(
 
 
 def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:
-    """Yield bounds that the posterior leans on."""
+    """Yield bounds that the posterior leans on: those of a parameter, and those others set."""
     fixed = {p.name: p.fixed for p in prior.parameters if p.fixed is not None}
     size = next(iter(columns.values())).size
     values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
@@ -139,22 +138,19 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
         if np.isfinite(high) and _near(high - values[name]):
             yield _given_bound(parameter, "upper", high)
     for parameter in prior.parameters:
-        visible = prior.seen(values, parameter.record)
-        yield from _pressed_by_others(parameter, values[parameter.name], visible)
-
-
-def _pressed_by_others(parameter: Parameter, x: FloatArray, values: Values) -> Iterator[Finding]:
-    """Yield bounds of draws x (draws,) that other parameters set."""
-    for side, bound in zip(("lower", "upper"), parameter.declared.limits(values), strict=True):
-        advice = parameter.declared.pressed.get(side)
-        if advice is None or not np.isfinite(bound).all():
-            continue
-        gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
-        # Beyond a bound that does not hold here nothing ends, and a ratio that the record hardly
-        # tells leans on it by chance.
-        if float(np.min(gap)) >= 0 and np.std(gap) < 0.05 and _near(gap):
-            stated = parameter.declared.stated_bounds
-            yield Finding(parameter.name, f"lies on its {side} bound of {stated}", advice)
+        declared = parameter.declared
+        limits = declared.limits(prior.seen(values, parameter.record))
+        for side, bound in zip(("lower", "upper"), limits, strict=True):
+            advice = declared.pressed.get(side)
+            if advice is None or not np.isfinite(bound).all():
+                continue
+            x = values[parameter.name]
+            gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
+            # Beyond a bound that does not hold here nothing ends, and a ratio that the record
+            # hardly tells leans on it by chance.
+            if float(np.min(gap)) >= 0 and np.std(gap) < 0.05 and _near(gap):
+                text = f"lies on its {side} bound of {declared.stated_bounds}"
+                yield Finding(parameter.name, text, advice)
 
 
 def _near(gap: FloatArray) -> bool:

@@ -186,20 +186,17 @@ def _distance(
         if name in posterior.names
     }
     farthest = max(shifts, key=lambda name: abs(shifts[name]))
-    cost = max(_cost(own.posterior, own.coordinates, point.mode[columns]), 0.0)
-    return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
-
-
-def _cost(alone: Posterior, coordinates: FloatArray, joint: FloatArray) -> float:
-    """Return D, of coordinates (free,) of a record's own mode and of the joint one."""
     fraction = 1e-3
-    step = fraction * (joint - coordinates)
-    places = np.stack([coordinates, joint, coordinates + step, coordinates - step])
-    _, log_prior = alone.prior.constrain(places)
-    log_likelihood = alone.log_density(places[:2]) - log_prior[:2]
+    step = -fraction * away
+    places = np.stack(
+        [own.coordinates, point.mode[columns], own.coordinates + step, own.coordinates - step]
+    )
+    _, log_prior = own.posterior.prior.constrain(places)
+    log_likelihood = own.posterior.log_density(places[:2]) - log_prior[:2]
     # At the mode, the likelihood's slope is the prior's turned round.
     slope = (log_prior[3] - log_prior[2]) / (2 * fraction)
-    return float(2 * (log_likelihood[0] - log_likelihood[1] + slope))
+    cost = max(float(2 * (log_likelihood[0] - log_likelihood[1] + slope)), 0.0)
+    return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
 
 
 def disagreements(compared: Mapping[str, Agreement]) -> Iterator[Finding]:

@@ -105,7 +105,17 @@ class Standardized:
 
         Of each the least likely, if its chance is below ``DOUBT``.
         """
-        departures = (self._coverage(), self._size(), self._bias())
+        sizes = []
+        for z, size, about in (
+            (self.z, self.square_size, ""),
+            (self.varying, self.varying_size, " about their mean"),
+        ):
+            square = float(np.mean(z**2))
+            if square > ODDS:
+                ratio = f"{np.sqrt(square):.2g} times as large{about}"
+                text = f"the residuals are {ratio} as the sensor band predicts"
+                sizes.append((text, float(scipy.stats.f.sf(square, size, self.noise_size))))
+        departures = (self._coverage(), sizes, self._bias())
         rarest = [min(found, key=lambda pair: pair[1], default=("", 1.0)) for found in departures]
         return [(text, chance) for text, chance in rarest if chance < DOUBT]
 
@@ -115,13 +125,47 @@ class Standardized:
         ``span`` are the lowest and the highest voltage of training, V, ``extent`` is the range of
         its readings, um.
         """
-        return [
+        reasons = [
             *self._reversed(span),
             *(text for text, chance in self.chances() if chance < ALARM),
-            *self._extremes(),
-            *(self._misfit(extent) if self.bands.training else ()),
-            *self._too_wide(),
         ]
+        # Five readings six sds off, so that a bad start or spikes are not lost in a long record: a
+        # good one has them once in five hundred million. A noise whose size is hardly known may
+        # well be larger here.
+        rows = np.flatnonzero(np.abs(self.z) > 6 * np.exp(2 * self.noise_log_sd))
+        if rows.size >= 5:
+            first = clock(self.bands.time[self.judged][rows[0]], self.bands.interval)
+            reasons.append(
+                f"{rows.size} readings lie more than 6 SDs off the mean, first at {first} s, the "
+                f"farthest {np.max(np.abs(self.z)):.2g} SDs"
+            )
+        if self.bands.training:
+            reasons += self._misfit(extent)
+        square = float(np.mean(self.z**2))
+        chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
+        if square < 0.25 and chance < ALARM:
+            ratio = 1 / max(np.sqrt(square), 1e-9)
+            reasons.append(f"the sensor band is {ratio:.2g} times too wide")
+        return reasons
+
+    @property
+    def offset_advice(self) -> str:
+        """A large share of the offset in the variance, and the lead-in that makes it small."""
+        lead, small = self.bands.lead_in, 0.15
+        if lead is None or self.common <= small:
+            return ""
+        # The variance of a mean of correlated readings falls with their time.
+        length = (lead.stop - lead.start) * self.common / small
+        half_duration = float(np.ptp(self.bands.time[self.judged])) / 2
+        longer = (
+            f"lead_in = {length:.2g}"
+            if length < half_duration
+            else f"a record of {3 * length:.2g} s"
+        )
+        return (
+            f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
+            f"{percent(self.common)} of the band's variance; use {longer} for {percent(small)}"
+        )
 
     @property
     def _residual(self) -> FloatArray:
@@ -149,18 +193,6 @@ class Standardized:
             chances = scipy.special.betainc(self.square_size - inside, inside + 1, outside)
             text = f"the {level}% sensor band covers {percent(covered)} of readings"
             yield text, float(np.mean(chances))
-
-    def _size(self) -> Iterator[tuple[str, float]]:
-        """Find residuals that are larger than the sensor band, as they are and about their mean."""
-        for z, size, about in (
-            (self.z, self.square_size, ""),
-            (self.varying, self.varying_size, " about their mean"),
-        ):
-            square = float(np.mean(z**2))
-            if square > ODDS:
-                ratio = f"{np.sqrt(square):.2g} times as large{about}"
-                text = f"the residuals are {ratio} as the sensor band predicts"
-                yield text, float(scipy.stats.f.sf(square, size, self.noise_size))
 
     def _bias(self) -> Iterator[tuple[str, float]]:
         """Find a mean of half an sd or more; a smaller one cannot be seen in the coverage."""
@@ -190,20 +222,6 @@ class Standardized:
         if correlation < -0.5:
             yield f"the readings fall where the voltage rises (correlation {correlation:.2f})"
 
-    def _extremes(self) -> Iterator[str]:
-        """Find five readings six sds off: a good one is so once in five hundred million.
-
-        So a bad start or spikes are not lost in a long record.
-        """
-        # A noise whose size is hardly known may well be larger here.
-        rows = np.flatnonzero(np.abs(self.z) > 6 * np.exp(2 * self.noise_log_sd))
-        if rows.size >= 5:
-            first = clock(self.bands.time[self.judged][rows[0]], self.bands.interval)
-            yield (
-                f"{rows.size} readings lie more than 6 SDs off the mean, first at {first} s, the "
-                f"farthest {np.max(np.abs(self.z)):.2g} SDs"
-            )
-
     def _misfit(self, extent: float) -> Iterator[str]:
         """Find a fit that misses its own readings by more than a sensor's noise would.
 
@@ -221,13 +239,6 @@ class Standardized:
         slow = np.sqrt(max(rms**2 - fast**2, 0.0))
         if slow > max(0.05 * extent, fast) and extent:
             yield f"NRMSE {percent(rms / extent)} on the training readings"
-
-    def _too_wide(self) -> Iterator[str]:
-        """Find residuals that are half as large as the sensor band says, or smaller."""
-        square = float(np.mean(self.z**2))
-        chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
-        if square < 0.25 and chance < ALARM:
-            yield f"the sensor band is {1 / max(np.sqrt(square), 1e-9):.2g} times too wide"
 
 
 def _mean_correlations(judged: BoolArray, interval: float, memory: float) -> tuple[float, float]:

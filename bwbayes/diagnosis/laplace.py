@@ -187,7 +187,13 @@ class _Target:
     def climb(self, state: _State, rounds: int) -> _State:
         """Climb for so many rounds at most, as long as these may reach ``least``."""
         for _ in range(rounds if np.isfinite(state.density) else 0):
-            before, state = state.density, self._step_physics(self._step_noise(state))
+            before, state = state.density, self._step_noise(state)
+            # In the physical coordinates and the sizes, by Fisher scoring.
+            slope, curvature = self._physical_bend(state)
+            step = np.zeros(state.coordinates.size)
+            step[self.physical] = np.linalg.solve(curvature, slope)
+            tried = (self.at(state.coordinates + fraction * step) for fraction in FRACTIONS)
+            state = next((there for there in tried if there.density > state.density), state)
             if state.density < before + max(GAIN, (self.least - state.density) / ROUNDS):
                 break
         return state
@@ -213,14 +219,6 @@ class _Target:
             log_evidence,
             state.displacement,
         )
-
-    def _step_physics(self, state: _State) -> _State:
-        """Step in the physical coordinates and the sizes, by Fisher scoring."""
-        slope, curvature = self._physical_bend(state)
-        step = np.zeros(state.coordinates.size)
-        step[self.physical] = np.linalg.solve(curvature, slope)
-        tried = (self.at(state.coordinates + fraction * step) for fraction in FRACTIONS)
-        return next((there for there in tried if there.density > state.density), state)
 
     def _physical_bend(self, state: _State, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
         """Slope and curvature of the log density in the physical coordinates.

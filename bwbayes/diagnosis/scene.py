@@ -230,6 +230,18 @@ class Scene:
 
         ``cost`` nats are those of its choice; ``facts`` are other fields of the explanation.
         """
+        shift = 0.0
+        if fit.posterior is self.posterior:
+            # The largest shift of the actuator's parameters, in sds of both fits together.
+            of_record = self.posterior.only.table.of_scope("record")
+            rows = [
+                row
+                for row, name in enumerate(self.posterior.names)
+                if name in self.posterior.table.physical and name not in of_record
+            ]
+            variance = np.diag(self.fit.covariance)[rows] + np.diag(fit.covariance)[rows]
+            moved = np.abs(fit.coordinates[rows] - self.fit.coordinates[rows]) / np.sqrt(variance)
+            shift = float(np.max(moved, initial=0.0))
         return Explanation(
             kind,
             text,
@@ -237,18 +249,6 @@ class Scene:
             nats=fit.log_evidence - self.fit.log_evidence - cost,
             rmse=(self.fit.rmse, fit.rmse),
             held_out=(self.fit.error(self.held_out), fit.error(self.held_out)),
-            shift=self._shift(fit) if fit.posterior is self.posterior else 0.0,
+            shift=shift,
             **facts,
         )
-
-    def _shift(self, fit: LocalFit) -> float:
-        """Return the largest shift of the actuator's parameters, in sds of both fits together."""
-        table = self.posterior.only.table
-        mine = [
-            row
-            for row, name in enumerate(self.posterior.names)
-            if name in self.posterior.table.physical and name not in table.of_scope("record")
-        ]
-        variance = np.diag(self.fit.covariance)[mine] + np.diag(fit.covariance)[mine]
-        moved = np.abs(fit.coordinates[mine] - self.fit.coordinates[mine]) / np.sqrt(variance)
-        return float(np.max(moved, initial=0.0))

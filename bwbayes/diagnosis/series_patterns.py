@@ -140,8 +140,9 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     else:
         resolution = float(np.diff(levels).min() / (levels[-1] - levels[0]))
         travel = max(0.01, 3 * resolution) * float(np.ptp(other))
-        moving = _quartile_distances(other[at_top], lengths) > travel
-        enough = _enough(first, first + lengths - 1, (lengths >= 5) & moving)
+        ordered = [np.sort(other[f : f + n]) for f, n in zip(first, lengths, strict=True)]
+        moving = [run[3 * run.size // 4] - run[run.size // 4] > travel for run in ordered]
+        enough = _enough(first, first + lengths - 1, (lengths >= 5) & np.array(moving))
     if enough is None or enough.samples <= 3 * np.count_nonzero(values == levels[-2]):
         return None
     return enough
@@ -214,12 +215,3 @@ def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> Stuck | None:
     """Return the runs that are stuck if these are ten samples in all, enough to say so."""
     runs_stuck = Stuck(first[stuck], last[stuck])
     return runs_stuck if runs_stuck.samples >= 10 else None
-
-
-def _quartile_distances(values: FloatArray, lengths: IntArray) -> FloatArray:
-    """Return third less first quartile of every run, where `values` holds run after run."""
-    run = np.repeat(np.arange(lengths.size), lengths)
-    ordered = values[np.lexsort((values, run))]
-    first = np.cumsum(lengths) - lengths
-    distances: FloatArray = ordered[first + 3 * lengths // 4] - ordered[first + lengths // 4]
-    return distances

@@ -22,7 +22,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
-from bwbayes.diagnosis.departures import Standardized, percent
+from bwbayes.diagnosis.departures import Standardized
 from bwbayes.diagnosis.explanations import followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.scene import Explanation
@@ -168,9 +168,12 @@ def assess(
         return None
     standard = Standardized.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
-    verdict = Verdict(
-        bands.name, bands.training, True, notes=_lead_in(bands), separate=bands.separate
-    )
+    notes, lead = (), bands.lead_in
+    if lead is not None and lead.p_value < LEAD_IN_ALARM:
+        span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
+        p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
+        notes = (f"the lead-in of {span} s does not fit the model ({p_value})",)
+    verdict = Verdict(bands.name, bands.training, True, notes=notes, separate=bands.separate)
     if reasons:
         why = joined(likely_causes(explanations)) or (
             REVERSED_SIGN
@@ -178,9 +181,8 @@ def assess(
             else cause(bands, background.memory, beyond)
         )
         return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
-    advice = _offset_advice(standard)
     doubts = [
-        f"{text}, which may be luck (p = {chance:.1g}){advice}"
+        f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"
         for text, chance in standard.chances()
     ]
     followed = joined(followed_causes(explanations))
@@ -196,32 +198,4 @@ def assess(
         )
     return (
         replace(verdict, holds=None, reasons=tuple(doubts), cause=followed) if doubts else verdict
-    )
-
-
-def _lead_in(bands: Bands) -> tuple[str, ...]:
-    """Note that the lead-in does not fit."""
-    lead = bands.lead_in
-    if lead is None or lead.p_value >= LEAD_IN_ALARM:
-        return ()
-    span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
-    p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
-    return (f"the lead-in of {span} s does not fit the model ({p_value})",)
-
-
-def _offset_advice(standard: Standardized) -> str:
-    """Name a large share of the offset in the variance, and the lead-in that makes it small."""
-    bands, small = standard.bands, 0.15
-    lead = bands.lead_in
-    if lead is None or standard.common <= small:
-        return ""
-    # The variance of a mean of correlated readings falls with their time.
-    length = (lead.stop - lead.start) * standard.common / small
-    half_duration = float(np.ptp(bands.time[standard.judged])) / 2
-    longer = (
-        f"lead_in = {length:.2g}" if length < half_duration else f"a record of {3 * length:.2g} s"
-    )
-    return (
-        f"; the offset, estimated from a lead-in of {lead.stop - lead.start:.3g} s, makes "
-        f"{percent(standard.common)} of the band's variance; use {longer} for {percent(small)}"
     )
