@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import Part
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores, judged
 from bwbayes.shown import brief

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.comparison.candidates import Candidate
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,

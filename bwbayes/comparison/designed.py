@@ -13,7 +13,7 @@ from typing import ClassVar, overload
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.model.limits import Limits
 from bwbayes.record.record import Record
 from bwbayes.report.product import Product

@@ -28,7 +28,7 @@ from bwbayes.control.sampled import (
     search,
     settle,
 )
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span

@@ -16,7 +16,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.record.record import Record

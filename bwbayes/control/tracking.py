@@ -22,7 +22,7 @@ from bwbayes.control.gains import Gains, Margins, Robustness, design
 from bwbayes.control.loop import CONTROLLERS, LoopNoise, Stand, follow, plan_loops
 from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel, require_inverse
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.report.product import Product

@@ -11,12 +11,16 @@ A verdict that fails names the likely cause: on readings that were fitted the ex
 best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
 residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
 the best explanation is a transient, a drift or a step without which a parameter is another one.
+
+What everything carries along that builds on a run is its :class:`Standing`: it goes first on every
+page, into every file of numbers, and decides the exit status of every command.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -26,6 +30,7 @@ from bwbayes.diagnosis.departures import Standardized
 from bwbayes.diagnosis.explanations import followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.scene import Explanation
+from bwbayes.errors import ExitStatus
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, titled
 from bwbayes.prediction.scores import judged
@@ -140,6 +145,69 @@ class Verdict:
             "fix": None if self.cause is None else self.cause.fix,
             "notes": list(self.notes),
         }
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Whether the bands of a run hold on all that they were validated on.
+
+    Attributes
+    ----------
+    holds
+        False if they fail anywhere; else None if validation is inconclusive anywhere.
+    lines
+        What is off, a line for each record or window that fails, or that is inconclusive.
+    """
+
+    holds: bool | None = True
+    lines: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, verdicts: Iterable[Verdict]) -> Self:
+        """Return what the verdicts of a run come to."""
+        return cls._of((verdict.holds, verdict.line) for verdict in verdicts)
+
+    @classmethod
+    def read(cls, summary: Mapping[str, Any]) -> Self:
+        """Return what a converged run's ``summary.json`` says."""
+        every = (summary.get("validation") or {}).items()
+        return cls._of((entry["holds"], entry.get("verdict", name)) for name, entry in every)
+
+    @classmethod
+    def _of(cls, answers: Iterable[tuple[bool | None, str]]) -> Self:
+        every = list(answers)
+        for holds in (False, None):
+            lines = tuple(line for answer, line in every if answer is holds)
+            if lines:
+                return cls(holds, lines)
+        return cls()
+
+    @property
+    def status(self) -> str:
+        """The outcome in a word."""
+        return STATUSES[self.holds]
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """What a command ends with that builds on it."""
+        statuses = {False: ExitStatus.VALIDATION_FAILED, None: ExitStatus.VALIDATION_INCONCLUSIVE}
+        return statuses.get(self.holds, ExitStatus.SUCCESS)
+
+    @property
+    def headline(self) -> str:
+        """What stands above the lines; nothing if validation passed."""
+        titles = {True: "", False: "VALIDATION FAILED", None: "Validation inconclusive"}
+        return titles[self.holds]
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """What to say of it, a line each; nothing if validation passed."""
+        return tuple(f"{self.headline}: {line}" for line in self.lines)
+
+    @property
+    def numbers(self) -> dict[str, object]:
+        """What files of numbers have of it."""
+        return {"status": self.status, "verdicts": list(self.lines)}
 
 
 def assess(

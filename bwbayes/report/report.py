@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 
 if TYPE_CHECKING:
     from matplotlib import figure

@@ -18,8 +18,7 @@ from bwbayes.diagnosis.identifiability import Learned
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.diagnosis.predictive_checks import Replicated
 from bwbayes.diagnosis.scene import Explanation
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import Standing, Verdict
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.loops import Loops

@@ -18,7 +18,7 @@ from bwbayes.app.jobs.check import check
 from bwbayes.app.running.campaign import STATUSES, Campaign, Row
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.designed import Design, Promise
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.model.limits import Limits
 from bwbayes.report.page import render
 from tests.app import example, small

@@ -18,8 +18,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import Standing, Verdict
 
 OFF = "95 % bands cover 55 % of 50 readings"
 STATUS = {False: 3, None: 5}

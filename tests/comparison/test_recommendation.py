@@ -13,7 +13,7 @@ from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.report.screen import as_text
 
 

@@ -21,7 +21,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import Reference
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.limits import Limits
 from bwbayes.prediction.bands import LEVELS

@@ -20,7 +20,7 @@ from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
-    from bwbayes.diagnosis.standing import Standing
+    from bwbayes.diagnosis.validation import Standing
     from bwbayes.report.report import Report
 
 

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
-    from bwbayes.diagnosis.standing import Standing
-    from bwbayes.diagnosis.validation import Verdict
+    from bwbayes.diagnosis.validation import Standing, Verdict
     from bwbayes.prediction.loops import Loops
     from bwbayes.report.report import Report
     from bwbayes.report.result import Result

@@ -30,7 +30,7 @@ from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder,
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.population import FEWEST, Population, population
 from bwbayes.population.specimen import Specimen, specimen_of

@@ -38,7 +38,7 @@ from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import evidence, screening_evidence
 from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
 from bwbayes.comparison.recommendation import recommend
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.parameter_table import ParameterTable

@@ -13,7 +13,7 @@ from bwbayes.app.running.predictions import (
     predict_after,
     predict_another,
 )
-from bwbayes.diagnosis.standing import Standing
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, suggestion
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record

@@ -22,7 +22,7 @@ from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
-    from bwbayes.diagnosis.standing import Standing
+    from bwbayes.diagnosis.validation import Standing
 
 
 class FileOf:
@@ -192,7 +192,7 @@ class RunFolder(Folder):
 
     def standing(self) -> Standing:
         """Return whether the bands of the run hold, which is finished."""
-        from bwbayes.diagnosis.standing import Standing
+        from bwbayes.diagnosis.validation import Standing
 
         self.require_finished()
         return Standing.read(self.numbers())

@@ -19,8 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
-from bwbayes.diagnosis.standing import Standing
-from bwbayes.diagnosis.validation import Background, Verdict, assess
+from bwbayes.diagnosis.validation import Background, Standing, Verdict, assess
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.untried import with_creep
 
