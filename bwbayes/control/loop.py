@@ -130,8 +130,18 @@ def plan_loops(
         np.pad(desired, ((0, 0), (0, longest - desired.shape[1])), mode="edge")
         for desired, _ in references
     ]
-    fed = _feed_forward(model, np.vstack(padded), stand)
-    limits = stand.limits
+    limits, together = stand.limits, np.vstack(padded)
+    # Voltages for the displacements (models, samples), and where the models go with them.
+    voltages, displacements = np.zeros_like(together), np.zeros_like(together)
+    state, last = model.begin(np.zeros(model.models)), np.zeros(model.models)
+    # A voltage is known to a small part of the DAC's step.
+    tolerance = 1e-4 * stand.amplifier.step
+    for t in range(longest - 1):
+        displacements[:, t] = model.displacement(state)
+        guess, last = 2 * state.voltage - last, state.voltage
+        voltages[:, t], state = model.inverse(state, together[:, t + 1], limits, guess, tolerance)
+    displacements[:, -1], voltages[:, -1] = model.displacement(state), state.voltage
+    fed = voltages, displacements
     for (desired, begins), *parts in zip(
         references, *(np.split(values, len(references)) for values in fed), strict=True
     ):
@@ -145,24 +155,6 @@ def plan_loops(
             desired,
             begins,
         )
-
-
-def _feed_forward(
-    model: SampledModel, desired: FloatArray, stand: Stand
-) -> tuple[FloatArray, FloatArray]:
-    """Return voltages for displacements (models, samples), and where the models go with them."""
-    command, reached = np.zeros_like(desired), np.zeros_like(desired)
-    state, last = model.begin(np.zeros(model.models)), np.zeros(model.models)
-    # A voltage is known to a small part of the DAC's step.
-    tolerance = 1e-4 * stand.amplifier.step
-    for t in range(desired.shape[1] - 1):
-        reached[:, t] = model.displacement(state)
-        guess, last = 2 * state.voltage - last, state.voltage
-        command[:, t], state = model.inverse(
-            state, desired[:, t + 1], stand.limits, guess, tolerance
-        )
-    reached[:, -1], command[:, -1] = model.displacement(state), state.voltage
-    return command, reached
 
 
 def follow(

@@ -151,7 +151,14 @@ class Tracking(Product):
         """Return margins, error against frequency, errors, gains and the stand, to be shown."""
         from bwbayes.report.figures.control import draw_tracking  # noqa: PLC0415
 
-        table = self.to_pandas()
+        table, margins, requested = self.to_pandas(), self.margins, self.robustness
+        stable = (
+            f"{margins.gain.size} draws: gain margin at least {margins.gain.min():.2f} (required: "
+            f"{requested.gain:g}), phase margin at least {margins.phase.min():.0f}° (required: "
+            f"{requested.phase:g}°), crossover at {margins.crossover.min():.3g} to "
+            f"{margins.crossover.max():.3g} Hz; by the circle criterion stable however the slope "
+            "of the hysteresis changes"
+        )
         picture = Picture(
             "track",
             "Error against frequency",
@@ -164,7 +171,11 @@ class Tracking(Product):
             heading=f"Closed loop: {self.name}",
             about=f"{self.rms.shape[-1]} draws of the posterior as actuators on the virtual test "
             "stand; its mean is the model that the controller has",
-            banners=[*standing_banner(self.standing), self._stability(), self._comparison()],
+            banners=[
+                *standing_banner(self.standing),
+                Banner(kind_of(self.standing), "Stable with every draw", [stable]),
+                self._comparison(),
+            ],
             blocks=[
                 picture,
                 Section("Errors", [self._errors()], folded=False),
@@ -175,22 +186,9 @@ class Tracking(Product):
             csv=table.to_csv(index=False),
         )
 
-    def _stability(self) -> Banner:
-        margins, requested = self.margins, self.robustness
-        line = (
-            f"{margins.gain.size} draws: gain margin at least {margins.gain.min():.2f} (required: "
-            f"{requested.gain:g}), phase margin at least {margins.phase.min():.0f}° (required: "
-            f"{requested.phase:g}°), crossover at {margins.crossover.min():.3g} to "
-            f"{margins.crossover.max():.3g} Hz; by the circle criterion stable however the slope "
-            "of the hysteresis changes"
-        )
-        return Banner(kind_of(self.standing), "Stable with every draw", [line])
-
-    def _comparison(self, highest: float = 20.0, required: float = 0.95) -> Banner:
-        """Say whether feedback and feed-forward together are best up to a frequency, Hz.
-
-        They are if they are better than either in at least the ``required`` share of the draws.
-        """
+    def _comparison(self) -> Banner:
+        """Say whether feedback and feed-forward together are best in 95 % of the draws or more."""
+        highest, required = 20.0, 0.95  # Hz, and a share
         shares = [self.best[at] for _, frequency, at in self._cases if frequency <= highest]
         if not shares:
             line = f"no frequency up to {highest:g} Hz was simulated"
@@ -315,7 +313,12 @@ def track(
         )
     # A range about zero needs no way to its middle.
     center = ends.middle if abs(ends.middle) > 1e-3 * amplitude else 0.0
-    rise = _rise(mean)
+    # How many samples a jump of a reference is to take. A lag τ needs w = x + τ x′. A jump by two
+    # amplitudes that takes four times τ, with a speed that is a Hann window, stays within the reach
+    # that the amplitude is 80 % of.
+    turns = np.geomspace(1e-4, np.pi, 400)
+    slow = turns[np.abs(mean.frequency_response(turns))[0] < LEFT]
+    rise = max(round(4 / float(slow[0])), 1) if slow.size else 1
     draws = SampledModel.of(actuator, all_theta)
     gains, margins = design(mean, draws, limits, stand.delay, robustness)
     references = [
@@ -334,17 +337,6 @@ def track(
         gains, margins, robustness, stand, frequencies, signals, center, amplitude,
         rise * actuator.interval, rms, largest, limited,
     )  # fmt: skip
-
-
-def _rise(mean: SampledModel) -> int:
-    """Return how many samples a jump of a reference is to take.
-
-    A lag τ needs w = x + τ x′. A jump by two amplitudes that takes four times τ, with a speed that
-    is a Hann window, stays within the reach that the amplitude is 80 % of.
-    """
-    turns = np.geomspace(1e-4, np.pi, 400)
-    slow = turns[np.abs(mean.frequency_response(turns))[0] < LEFT]
-    return max(round(4 / float(slow[0])), 1) if slow.size else 1
 
 
 def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tuple[float, ...]:

@@ -125,7 +125,13 @@ def agreements(
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
     for name, single, joint_free in posterior.each(free):
-        with_noise = _with_noise(single, joint_free)
+        # Its noise is known, as that of the joint fit.
+        theta, physical = single.prior.theta(joint_free)[0], single.table.physical
+        parameters = (
+            p if p.name in physical else replace(p, prior=None, fixed=float(value))
+            for p, value in zip(single.prior.parameters, theta, strict=True)
+        )
+        with_noise = replace(single, prior=JointPrior(parameters, single.prior.constraint))
         names = (posterior.table.name_of(plain, name) for plain in with_noise.names)
         columns = [posterior.names.index(column) for column in names]
         own = climb(with_noise, point.mode[columns])
@@ -147,16 +153,6 @@ def agreements(
             own_residual[step],
         )
     return compared
-
-
-def _with_noise(alone: Posterior, free: FloatArray) -> Posterior:
-    """Return the posterior of a record with the noise of some free parameters (1, free) known."""
-    theta, physical = alone.prior.theta(free)[0], alone.table.physical
-    parameters = (
-        p if p.name in physical else replace(p, prior=None, fixed=float(value))
-        for p, value in zip(alone.prior.parameters, theta, strict=True)
-    )
-    return replace(alone, prior=JointPrior(parameters, alone.prior.constraint))
 
 
 def _distance(

@@ -115,7 +115,15 @@ class Standardized:
                 ratio = f"{np.sqrt(square):.2g} times as large{about}"
                 text = f"the residuals are {ratio} as the sensor band predicts"
                 sizes.append((text, float(scipy.stats.f.sf(square, size, self.noise_size))))
-        departures = (self._coverage(), sizes, self._bias())
+        biases, mean = [], float(np.mean(self.z))
+        # A smaller one cannot be seen in the coverage.
+        if abs(mean) >= 0.5:
+            errors = abs(mean) * np.sqrt(self.mean_size)
+            offset = f"{float(np.mean(self._residual)):+.3g} um off the mean"
+            text = f"the readings lie {offset}, {errors:.2g} of its standard errors"
+            # As sure as the size of the noise is.
+            biases.append((text, 2 * float(scipy.stats.t.sf(errors, self.noise_size))))
+        departures = (self._coverage(), sizes, biases)
         rarest = [min(found, key=lambda pair: pair[1], default=("", 1.0)) for found in departures]
         return [(text, chance) for text, chance in rarest if chance < DOUBT]
 
@@ -193,19 +201,6 @@ class Standardized:
             chances = scipy.special.betainc(self.square_size - inside, inside + 1, outside)
             text = f"the {level}% sensor band covers {percent(covered)} of readings"
             yield text, float(np.mean(chances))
-
-    def _bias(self) -> Iterator[tuple[str, float]]:
-        """Find a mean of half an sd or more; a smaller one cannot be seen in the coverage."""
-        mean = float(np.mean(self.z))
-        if abs(mean) >= 0.5:
-            errors = abs(mean) * np.sqrt(self.mean_size)
-            residual = float(np.mean(self._residual))
-            text = (
-                f"the readings lie {residual:+.3g} um off the mean, {errors:.2g} of its standard "
-                "errors"
-            )
-            # As sure as the size of the noise is.
-            yield text, 2 * float(scipy.stats.t.sf(errors, self.noise_size))
 
     def _reversed(self, span: tuple[float, float]) -> Iterator[str]:
         """Find readings that go against the voltage, where it goes up and down by enough.

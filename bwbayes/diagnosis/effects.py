@@ -108,22 +108,18 @@ def oscillation(scene: Scene) -> Iterator[Explanation]:
     phase = 2 * np.pi * best * scene.time
     sd = SIZE * scene.extent / 10
     fit = scene.extended(add_shapes(np.stack([np.sin(phase), np.cos(phase)]), sd))
-    source = _mains(best, 2 / scene.duration)  # half the width of a line under the window
+    source = ""
+    # Mains are right to a fifth of a percent; half the width of a line under the window.
+    width = max(2e-3 * best, 2 / scene.duration)
+    for mains in (50, 60):
+        harmonic = round(best / mains)
+        if 1 <= harmonic <= 10 and abs(best - harmonic * mains) <= width:
+            times = "" if harmonic == 1 else f"{harmonic} times "
+            source = source or f" (mains: {times}{mains} Hz)"
     text = f"oscillation of {sd * float(np.hypot(*fit.sizes)):.2g} um at {best:.4g} Hz{source}"
     fix = "look for the source: mains, ground loops, vibration"
     cost = float(np.log(readings.rows.size / 2))
     yield scene.explained("oscillation", text, fix, fit, cost)
-
-
-def _mains(frequency: float, resolution: float) -> str:
-    """Say that a frequency, Hz, is one of mains, which is right to a fifth of a percent."""
-    for mains in (50, 60):
-        harmonic = round(frequency / mains)
-        width = max(2e-3 * frequency, resolution)
-        if 1 <= harmonic <= 10 and abs(frequency - harmonic * mains) <= width:
-            times = "" if harmonic == 1 else f"{harmonic} times "
-            return f" (mains: {times}{mains} Hz)"
-    return ""
 
 
 def moving_gain(scene: Scene) -> Iterator[Explanation]:

@@ -220,11 +220,9 @@ class _Target:
             state.displacement,
         )
 
-    def _physical_bend(self, state: _State, step: float = 1e-4) -> tuple[FloatArray, FloatArray]:
-        """Slope and curvature of the log density in the physical coordinates.
-
-        ``step`` may be small: a simulation has no noise but rounding.
-        """
+    def _physical_bend(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Slope and curvature of the log density in the physical coordinates."""
+        step = 1e-4  # a simulation has no noise but rounding
         steps = step * np.eye(state.coordinates.size)[self.physical]
         sides = state.coordinates + np.concatenate([steps, -steps])
         theta, log_prior = self.prior(np.concatenate([state.coordinates[np.newaxis], sides]))
@@ -262,11 +260,9 @@ class _Target:
         density = self.density(*self.prior(coordinates), state.displacement)
         return np.maximum(density, -1e12) - state.density
 
-    def _noise_bend(self, state: _State, step: float = 2e-2) -> tuple[FloatArray, FloatArray]:
-        """Slope and curvature of the log density in the noise's coordinates.
-
-        The posterior's sds are hundredths of the prior's, which are one.
-        """
+    def _noise_bend(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Slope and curvature of the log density in the noise's coordinates."""
+        step = 2e-2  # the posterior's sds are hundredths of the prior's, which are one
         size, (i, j) = self.noise.size, np.tril_indices(self.noise.size, -1)
         single = step * np.eye(size)
         # Along each coordinate, then along each two of them.

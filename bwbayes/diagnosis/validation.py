@@ -236,7 +236,8 @@ def assess(
         return None
     standard = Standardized.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
-    notes, lead = (), bands.lead_in
+    notes: tuple[str, ...] = ()
+    lead = bands.lead_in
     if lead is not None and lead.p_value < LEAD_IN_ALARM:
         span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
         p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"

@@ -23,7 +23,17 @@ EXTRA_WORDS = {
 
 def calibration_report(calibration: Calibration) -> Report:
     """Return what a calibration says: whether it has passed, the tests, and what was run."""
-    bands = _bands(calibration)
+    bands, unconverged = _bands(calibration), calibration.unconverged
+    counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
+    if not calibration.passed:
+        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.shortcomings)
+    elif calibration.telling:
+        verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
+    else:
+        power = "low power: more replicates are needed to detect SDs 20% too small"
+        verdict = Banner("note", "Passed, with too few replicates", [f"{counts}; {power}"])
+    numbers = ", ".join(map(str, unconverged))
+    line = f"not converged, and counted with the others: replicates {numbers}"
     facts = [*calibration.facts, *circumstances(calibration.provenance)]
     free = [
         {"name": p.name, "symbol": symbol(p), "prior": p.prior, "unit": unit_text(p.unit)}
@@ -35,7 +45,10 @@ def calibration_report(calibration: Calibration) -> Report:
     return Report(
         title=f"{calibration.name}, simulation-based calibration",
         heading=f"Simulation-based calibration: {calibration.name}",
-        banners=_banners(calibration),
+        banners=[
+            verdict,
+            *[Banner("note", "Replicates that did not converge", [line])] * bool(unconverged),
+        ],
         blocks=[
             _statistics(calibration),
             *[Section("Bands on samples that were not fitted", [bands], folded=False)]
@@ -47,24 +60,6 @@ def calibration_report(calibration: Calibration) -> Report:
         ],
         numbers=calibration.numbers,
     )
-
-
-def _banners(calibration: Calibration) -> list[Banner]:
-    unconverged = calibration.unconverged
-    counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
-    if not calibration.passed:
-        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.shortcomings)
-    elif calibration.telling:
-        verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
-    else:
-        verdict = Banner(
-            "note",
-            "Passed, with too few replicates",
-            [f"{counts}; low power: more replicates are needed to detect SDs 20% too small"],
-        )
-    numbers = ", ".join(str(number) for number in unconverged)
-    line = f"not converged, and counted with the others: replicates {numbers}"
-    return [verdict, *[Banner("note", "Replicates that did not converge", [line])] * bool(numbers)]
 
 
 def _statistics(calibration: Calibration) -> Table:

@@ -141,7 +141,7 @@ def summary(result: Result) -> dict[str, object]:
     if result.agreement:
         numbers["agreement"] = {n: record.numbers for n, record in result.agreement.items()}
     return numbers | {
-        "parameters": _parameters(result),
+        "parameters": estimates(result),
         "validation": validation,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
@@ -155,7 +155,8 @@ def summary(result: Result) -> dict[str, object]:
     }
 
 
-def _parameters(result: Result) -> dict[str, dict[str, object]]:
+def estimates(result: Result) -> dict[str, dict[str, object]]:
+    """Return mean, sd, quantiles, convergence and unit of each free parameter, by name."""
     flat, check = result.flat_draws, result.outcome.check
     lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
     sd = np.std(flat, axis=0, ddof=1)

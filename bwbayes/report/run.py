@@ -41,16 +41,25 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
     ``go_on``, the command that goes on.
     """
-    pictures = all_pictures(result)
+    pictures, check = all_pictures(result), result.outcome.check
     if result.outcome.converged:
         blocks = [*_answer(result, numbers, pictures), *_evidence(result, numbers, pictures)]
     else:
         sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
         blocks = [Section("Sampling", sampling, folded=False)]
-    moves = Text(_moves(result), on="screen")
+    accepted = ", ".join(
+        f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
+    )
+    cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
+    text = f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
+    moves = Text(text, on="screen")
+    shown = ("record", "fitted", "model", "noise")
+    about = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
+    held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
+    about += [f"predicted: {', '.join(held_out)}"] * bool(held_out)
     return Report(
         title=result.name,
-        about=_about(result),
+        about="; ".join(about),
         banners=[*_verdict_banners(result, numbers), *remarks_banner(result.remarks)],
         blocks=[*blocks, moves, *_details(result, numbers, pictures)],
     )
@@ -200,16 +209,6 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
     return blocks
 
 
-def _moves(result: Result) -> str:
-    """Say in one line how the moves did."""
-    check = result.outcome.check
-    accepted = ", ".join(
-        f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
-    )
-    cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
-    return f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
-
-
 def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> Iterator[Section]:
     priors = priors_table(JointPrior(result.parameters))
     yield Section("Priors and fixed values", [replace(priors, on="page")])
@@ -231,14 +230,6 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
         yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
     yield Section("Moves", [tables.moves_table(result)])
     yield Section("Run details", [Facts([*result.facts.items(), *circumstances(numbers)])])
-
-
-def _about(result: Result) -> str:
-    """Return what was fitted to what, in a line."""
-    shown = ("record", "fitted", "model", "noise")
-    facts = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
-    held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
-    return "; ".join([*facts, *[f"predicted: {', '.join(held_out)}"] * bool(held_out)])
 
 
 def _span(bands: Bands) -> str:

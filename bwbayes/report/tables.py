@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -202,11 +203,24 @@ def other_scores_table(
     scores: Mapping[str, Scores], titles: Mapping[str, str], records: Sequence[Mapping[str, object]]
 ) -> Table:
     """Return the other scores: a column for each of the bands, rows where anything is known."""
-    columns_of = [_other_scores(score) for score in scores.values()]
+    texts = {"CRPS": [length_text(score.crps_um) for score in scores.values()]}
+    # The levels from the widest band.
+    for level, score in product(sorted(LEVELS, reverse=True), scores.values()):
+        sensor = f"{level} % sensor band: "
+        for quantity, text in (
+            (
+                f"{level} % displacement band covers displacement",
+                covered(score, "displacement", level),
+            ),
+            (f"{sensor}worst second", f"{100 * score.worst_second[level]:.1f} %"),
+            (f"{sensor}mean width", length_text(score.width_um[level])),
+            (f"{sensor}interval score", length_text(score.interval_score_um[level])),
+        ):
+            texts.setdefault(quantity, []).append(text)
     rows = [
-        [row[0][0], *(text or UNKNOWN for _, text in row)]
-        for row in zip(*columns_of, strict=True)
-        if any(text for _, text in row)
+        [quantity, *(text or UNKNOWN for text in row)]
+        for quantity, row in texts.items()
+        if any(row)
     ]
     columns = ["Quantity", *(titles[name] for name in scores)]
     return Table("scores", "Other scores", columns, rows, records=records)
@@ -292,17 +306,6 @@ def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str,
         row[key] = digits(numbers[key], numbers["sd"])
     words = Markup("{}, {}").format(parameter.description, symbol(parameter))
     return row | {"name": parameter.name, "words": words, "unit": unit_text(parameter.unit)}
-
-
-def _other_scores(scores: Scores) -> Iterator[tuple[str, str]]:
-    """Yield titles and texts, the levels from the widest band."""
-    yield "CRPS", length_text(scores.crps_um)
-    for level in sorted(LEVELS, reverse=True):
-        displacement = covered(scores, "displacement", level)
-        yield f"{level} % displacement band covers displacement", displacement
-        yield f"{level} % sensor band: worst second", f"{100 * scores.worst_second[level]:.1f} %"
-        yield f"{level} % sensor band: mean width", length_text(scores.width_um[level])
-        yield f"{level} % sensor band: interval score", length_text(scores.interval_score_um[level])
 
 
 def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) -> Table:

@@ -58,7 +58,13 @@ def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyComma
         for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.FunctionDef) and node.name == name
     )
-    texts = _first_sentences(ast.get_docstring(defined) or "")
+    # The description of each parameter, of which the first sentence counts.
+    section = (ast.get_docstring(defined) or "").partition("Parameters\n----------\n")[2]
+    section = re.split(r"\n\w+\n-+\n", section)[0]
+    texts: dict[str, str] = {}
+    for names, text in re.findall(r"^(\S.*)\n((?: {4}.*(?:\n|$))+)", section, re.MULTILINE):
+        first = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.replace("``", "").split()))[0]
+        texts |= dict.fromkeys(names.split(", "), first)
     arguments = [
         (argument.arg, ast.unparse(argument.annotation), ast.literal_eval(default))
         for argument, default in zip(defined.args.kwonlyargs, defined.args.kw_defaults, strict=True)
@@ -74,16 +80,6 @@ def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyComma
         return command
 
     return decorate
-
-
-def _first_sentences(docstring: str) -> dict[str, str]:
-    """Return how the description of each parameter begins, by name."""
-    section = re.split(r"\n\w+\n-+\n", docstring.partition("Parameters\n----------\n")[2])[0]
-    texts: dict[str, str] = {}
-    for names, text in re.findall(r"^(\S.*)\n((?: {4}.*(?:\n|$))+)", section, re.MULTILINE):
-        first = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.replace("``", "").split()))[0]
-        texts |= dict.fromkeys(names.split(", "), first)
-    return texts
 
 
 def _option(

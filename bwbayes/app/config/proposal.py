@@ -27,7 +27,7 @@ from bwbayes.errors import InputWarning
 from bwbayes.model.registry import DYNAMICS
 from bwbayes.model.reversals import rate
 from bwbayes.record import Record
-from bwbayes.record.io.columns import ColumnTable, Naming
+from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.formats import read_table
 from bwbayes.record.io.grid import decimals_of
@@ -68,22 +68,21 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
         table = read_table(path, naming)
         record = Record(**record_fields(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
-    findings = tuple(_with_sign(finding, path, table) for finding in inspect(record))
-    text = _text(path, where, table.naming, record, findings)
-    return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
-
-
-def _with_sign(finding: Finding, path: Path, table: ColumnTable) -> Finding:
-    """Return a finding; of a reversed sign with the command that turns it without a new file."""
-    if finding.kind != "reversed sign":
-        return finding
+    # Of a reversed sign, what turns it without a new file.
     unit = table.columns["displacement"].unit
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
     here = (
         f'units = {{ displacement = "{turned}" }} under [record], or '
         f"`bwbayes init {path} --unit displacement={turned}`"
     )
-    return replace(finding, fix=f"{finding.fix}, or say {here}")
+    findings = tuple(
+        replace(finding, fix=f"{finding.fix}, or say {here}")
+        if finding.kind == "reversed sign"
+        else finding
+        for finding in inspect(record)
+    )
+    text = _text(path, where, table.naming, record, findings)
+    return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
 
 
 def _text(

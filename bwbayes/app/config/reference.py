@@ -191,18 +191,14 @@ def _parameter(numbered: Sequence[Declaration], of: str) -> Iterator[str]:
     limits = declared.stated_bounds or ("positive" if declared.positive else "")
     scope = "of each record" if declared.scope == "record" else f"of the {of}"
     facts = ", ".join(fact for fact in (scope, limits) if fact)
-    yield _wrapped(f"{facts}; {_default(declared)}", "      ")
-
-
-def _default(declared: Declaration) -> str:
-    """Say a default prior at the ring bender's ranges."""
     default, condition = declared.default(Context(RING_BENDER)), ""
     if default is None:
         stiffness = 4.10e5  # N/m, the ring bender's
         default = declared.default(Context(RING_BENDER, {"stiffness": stiffness}))
-        condition = f" if stiffness is fixed, here at {stiffness:g} N/m"
+        if default is not None:
+            condition = f" if stiffness is fixed, here at {stiffness:g} N/m"
+    text = f"fixed at {default:g}" if isinstance(default, float | int) else str(default)
     if default is None:
         why = f" ({declared.without_default})" if declared.without_default else ""
-        return f"no default: give prior or fixed{why}"
-    is_fixed = isinstance(default, float | int)
-    return (f"fixed at {default:g}" if is_fixed else str(default)) + condition
+        text = f"no default: give prior or fixed{why}"
+    yield _wrapped(f"{facts}; {text}{condition}", "      ")

@@ -337,6 +337,7 @@ def campaign(
     from bwbayes.app.config.keywords import config_of
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
     from bwbayes.app.jobs.campaign import config_text, resume, start
+    from bwbayes.record import read_record, write_record
 
     text, where = "", Path()
     if config is not None:
@@ -351,23 +352,17 @@ def campaign(
     path, scratch = folder_or_scratch(folder, "campaign")
     if isinstance(records, Mapping):
         source = path.with_name(f"{path.name}-records")
-        _write(records, source)
+        source.mkdir(parents=True, exist_ok=True)
+        for name, record in records.items():
+            if not re.fullmatch(r"[\w][\w .+-]*", name):
+                raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
+            file = source / f"{name}.h5"
+            # Not again what an earlier call has written.
+            if not file.exists() or read_record(file).sha256 != record.sha256:
+                write_record(record, file)
     else:
         source = Path(records)
     begun = start(source, text, where, path, pictures=pictures, overwrite=overwrite)
     finished = resume(begun, console_of(progress), workers=workers, executor=executor)
     warn(finished.notes, 3)
     return replace(finished, _scratch=scratch)
-
-
-def _write(records: Mapping[str, Record], folder: Path) -> None:
-    """Write the records that are in memory, except those that are written already."""
-    from bwbayes.record import read_record, write_record
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, record in records.items():
-        if not re.fullmatch(r"[\w][\w .+-]*", name):
-            raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
-        path = folder / f"{name}.h5"
-        if not path.exists() or read_record(path).sha256 != record.sha256:
-            write_record(record, path)

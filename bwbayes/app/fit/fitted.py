@@ -230,10 +230,9 @@ class Fit(Shown):
         """
         import pandas as pd
 
-        from bwbayes.report.result import summary
+        from bwbayes.report.result import estimates
 
-        numbers: Any = summary(self._converged())["parameters"]
-        return pd.DataFrame.from_dict(numbers, orient="index")
+        return pd.DataFrame.from_dict(estimates(self._converged()), orient="index")
 
     @cached_property
     def bands(self) -> dict[str, Prediction]:

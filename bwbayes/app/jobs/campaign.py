@@ -13,7 +13,6 @@ import os
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
@@ -24,16 +23,14 @@ from bwbayes.app.config.config import Config, checked, dump, load, parse, read_t
 from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.campaign import Campaign, Row
+from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, digest, ended
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, InputWarning, one_line
-from bwbayes.population.population import FEWEST, Population, population
-from bwbayes.population.specimen import Specimen, specimen_of
+from bwbayes.population.specimen import specimen_of
 from bwbayes.record.io.formats import SUFFIXES
 from bwbayes.report.outputs import save, write_summary
 
@@ -127,41 +124,10 @@ def resume(
             if outcome.refused:
                 refused[outcome.file.name] = outcome.short
         console.print("combining the records ...", highlight=False)
-        rows = tuple(_row(folder, file, refused.get(file.name, "")) for file in files)
-        campaign = Campaign(folder, rows, _population(folder, rows))
+        campaign = Campaign.of(folder, files, refused)
         # Nothing in its files depends on when or how it was computed.
         save(campaign.report(), folder.path, "campaign", pictures="figures")
     return campaign
-
-
-def _population(folder: CampaignFolder, rows: Sequence[Row]) -> Population | str:
-    """Return the population of the records that have converged, or why there is none."""
-    specimens = [
-        Specimen.load(row.name, folder.run(row.name) / SPECIMEN) for row in rows if row.parameters
-    ]
-    if len(specimens) < FEWEST:
-        return f"a population needs {FEWEST} records or more"
-    try:
-        return population(specimens, generator(1, "population"))
-    except InputError as error:
-        return str(error)
-
-
-def _row(folder: CampaignFolder, file: Path, refusal: str) -> Row:
-    """Return the row of a record."""
-    if refusal:
-        return Row(file.stem, file.name, "refused", refusal, {})
-    numbers = RunFolder(folder.run(file.stem)).numbers()
-    if not numbers["converged"]:
-        reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
-        return Row(file.stem, file.name, "not converged", reason, numbers)
-    standing = Standing.read(numbers)
-    status = standing.status if standing.holds else f"validation {standing.status}"
-    return Row(file.stem, file.name, status, "; ".join(standing.lines), numbers)
-
-
-# What a population needs of a run, in the run's folder.
-SPECIMEN = "specimen.npz"
 
 
 class Ended(NamedTuple):

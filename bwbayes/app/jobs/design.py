@@ -135,8 +135,16 @@ def candidates_of(
     """
     if not isinstance(candidates, str | Path):
         return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}
-    standard = str(candidates) == "standard"
-    waveforms = _preset(record, amplifier) if standard else _from_file(Path(candidates))
+    waveforms = _preset(record, amplifier) if str(candidates) == "standard" else {}
+    for name, table in () if waveforms else read_toml(Path(candidates)).items():
+        try:
+            waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
+        except ValidationError as error:
+            raise InputError(one_line(f"{candidates}: {name}", error, SignalConfig)) from None
+        except InputError as error:
+            raise InputError(f"{candidates}: {name}: {error}") from None
+    if not waveforms:
+        raise InputError(f"{candidates}: has no candidate; write a table for each signal")
     return {name: waveform.sample(1 / record.interval)[1] for name, waveform in waveforms.items()}
 
 
@@ -171,21 +179,6 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
         )
         for name, carrier in carriers.items()
     }
-
-
-def _from_file(path: Path) -> dict[str, Waveform]:
-    """Read a table for each signal."""
-    waveforms = {}
-    for name, table in read_toml(path).items():
-        try:
-            waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
-        except ValidationError as error:
-            raise InputError(one_line(f"{path}: {name}", error, SignalConfig)) from None
-        except InputError as error:
-            raise InputError(f"{path}: {name}: {error}") from None
-    if not waveforms:
-        raise InputError(f"{path}: has no candidate; write a table for each signal")
-    return waveforms
 
 
 def _drive(name: str, interval: float) -> FloatArray:

@@ -125,6 +125,16 @@ def assemble(
 
 def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     """Return the draws, and what the problem says of them."""
+    plan, steps = problem.plan, ", ".join(f"{chain.steps(p)} steps of {p}" for p in PHASES)
+    accepted = {
+        phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
+        for phase in PHASES
+    }
+    facts = {
+        "sampling": f"{plan.ensembles} ensembles of {plan.walkers} walkers; {steps}",
+        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
+        "engine": problem.posterior.engine,
+    }
     return Result(
         name=problem.config.name or "run",
         outcome=outcome,
@@ -132,23 +142,9 @@ def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         draws=draws(problem.posterior, chain),
         log_density=log_densities(chain),
         moves=chain.moves("sampling"),
-        facts=_facts(problem, chain),
+        facts=problem.facts | facts,
         truth=problem.config.truth,
     )
-
-
-def _facts(problem: Problem, chain: ChainFile) -> dict[str, str]:
-    """Return what was run, for people: one line each, by subject."""
-    plan, steps = problem.plan, ", ".join(f"{chain.steps(p)} steps of {p}" for p in PHASES)
-    accepted = {
-        phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
-        for phase in PHASES
-    }
-    return problem.facts | {
-        "sampling": f"{plan.ensembles} ensembles of {plan.walkers} walkers; {steps}",
-        "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
-        "engine": problem.posterior.engine,
-    }
 
 
 def save_result(path: Path, problem: Problem, chain: ChainFile, result: Result) -> None:

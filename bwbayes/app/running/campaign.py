@@ -7,20 +7,28 @@ pieces the campaign was done.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from bwbayes.app.problem.records import Validation, generator
-from bwbayes.app.running.folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import ExitStatus, InputError
-from bwbayes.population.population import Population, PopulationParameter, next_specimen
+from bwbayes.population.population import (
+    FEWEST,
+    Population,
+    PopulationParameter,
+    next_specimen,
+    population,
+)
+from bwbayes.population.specimen import Specimen
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.report.figures import drawn
@@ -52,6 +60,9 @@ STATUSES = {
     "passed": ExitStatus.SUCCESS,
 }
 
+# What a population needs of a run, in the run's folder.
+SPECIMEN = "specimen.npz"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -67,6 +78,19 @@ class Row:
     status: str
     reason: str
     numbers: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, folder: CampaignFolder, file: Path, refusal: str) -> Self:
+        """Return the row of a record's file, which was refused, or whose run has ended."""
+        if refusal:
+            return cls(file.stem, file.name, "refused", refusal, {})
+        numbers = RunFolder(folder.run(file.stem)).numbers()
+        if not numbers["converged"]:
+            reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
+            return cls(file.stem, file.name, "not converged", reason, numbers)
+        standing = Standing.read(numbers)
+        status = standing.status if standing.holds else f"validation {standing.status}"
+        return cls(file.stem, file.name, status, "; ".join(standing.lines), numbers)
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, Any]]:
@@ -87,6 +111,19 @@ class Campaign(Product):
     rows: tuple[Row, ...]
     together: Population | str
     _scratch: object = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]) -> Self:
+        """Return what came of the records' files; ``refused`` says why, by the name of the file."""
+        rows = tuple(Row.of(folder, file, refused.get(file.name, "")) for file in files)
+        names = [row.name for row in rows if row.parameters]
+        specimens = [Specimen.load(name, folder.run(name) / SPECIMEN) for name in names]
+        if len(specimens) < FEWEST:
+            return cls(folder, rows, f"a population needs {FEWEST} records or more")
+        try:
+            return cls(folder, rows, population(specimens, generator(1, "population")))
+        except InputError as error:
+            return cls(folder, rows, str(error))
 
     @property
     def population(self) -> Population:
@@ -306,18 +343,17 @@ class Campaign(Product):
 
     def _records_table(self) -> Table:
         """Return a row for each record: its parameters by themselves."""
-        columns = [
-            TableColumn("Record", text=lambda row: row.name),
-            TableColumn("Status", text=lambda row: mark(row.status)),
-        ]
-        for name, unit in self._units.items():
-            text = partial(_own_interval, name)
-            columns.append(TableColumn(label_with_unit(name, unit), text=text))
-        return Table.of(
+        rows = []
+        for row in self.rows:
+            estimates = [row.parameters.get(name) for name in self._units]
+            intervals = [_range(e["lower_95"], e["upper_95"]) if e else "" for e in estimates]
+            rows.append([row.name, mark(row.status), *intervals])
+        labels = [label_with_unit(name, unit) for name, unit in self._units.items()]
+        return Table(
             "records",
             "Records, 95 % intervals of each by itself",
-            self.rows,
-            columns,
+            ["Record", "Status", *labels],
+            rows,
             records=self.table.reset_index().to_dict("records"),
             note="More is in campaign.json; each record's own run is in records/.",
         )
@@ -351,11 +387,6 @@ class Campaign(Product):
             "is above 0.7, or few draws count, a record's likelihood was taken for normal.",
             on="both",
         )
-
-
-def _own_interval(name: str, row: Row) -> str:
-    estimate = row.parameters.get(name)
-    return "" if estimate is None else _range(estimate["lower_95"], estimate["upper_95"])
 
 
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:

@@ -64,17 +64,17 @@ class Artist:
         self.draw(result)
         works = _works(result)
         # From the last to the first: whatever is not begun by then is drawn here.
-        drawn = {name: self._drawn(name, works[name]) for name in reversed(works)}
+        drawn: dict[str, Any] = {}
+        for name in reversed(works):
+            if name in self.begun and not self.begun[name].cancel():
+                with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
+                    drawn[name] = self.begun[name].result()
+            if name not in drawn:
+                drawn[name] = works[name]()
         images = {name: drawn[name] for name in works}
         plots = images.pop(PLOTS, NO_PLOTS)
         save_pictures(images, folder)
         return images, plots
-
-    def _drawn(self, name: str, work: Callable[[], Any]) -> Any:
-        if name in self.begun and not self.begun[name].cancel():
-            with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
-                return self.begun[name].result()
-        return work()
 
 
 def _prepare() -> None:

@@ -66,7 +66,18 @@ def executor(
     Raises InputError: another word, or a cluster that does not answer.
     """
     if backend is not None and not isinstance(backend, str):
-        yield _given(backend)
+        # Calls go to others than threads by value.
+        if hasattr(backend, "get_executor"):
+            yield _on_client(backend)
+        elif isinstance(backend, ThreadPoolExecutor | ByValue):
+            yield backend
+        elif callable(getattr(backend, "submit", None)):
+            yield ByValue(backend)
+        else:
+            raise InputError(
+                f"executor: {type(backend).__name__} has no submit; give an executor of "
+                "concurrent.futures, or one of " + ", ".join(KINDS)
+            )
         return
     count = workers or os.cpu_count() or 1
     kind, _, address = (backend or "local").partition("://")
@@ -119,20 +130,6 @@ def side_by_side(pool: Executor, workers: int | None, calls: int) -> int:
     workers_there = getattr(pool, "workers", None)
     count = 2 * workers_there if isinstance(workers_there, int) else workers or os.cpu_count() or 1
     return max(min(count, calls), 1)
-
-
-def _given(backend: Any) -> Executor:
-    """Return an executor that somebody made; calls go to others than threads by value."""
-    if isinstance(backend, ThreadPoolExecutor | ByValue):
-        return backend
-    if hasattr(backend, "get_executor"):
-        return _on_client(backend)
-    if not callable(getattr(backend, "submit", None)):
-        raise InputError(
-            f"executor: {type(backend).__name__} has no submit; give an executor of "
-            "concurrent.futures, or one of " + ", ".join(KINDS)
-        )
-    return ByValue(backend)
 
 
 class ByValue(Executor):
