@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -203,25 +202,22 @@ def other_scores_table(
     scores: Mapping[str, Scores], titles: Mapping[str, str], records: Sequence[Mapping[str, object]]
 ) -> Table:
     """Return the other scores: a column for each of the bands, rows where anything is known."""
-    texts = {"CRPS": [length_text(score.crps_um) for score in scores.values()]}
-    # The levels from the widest band.
-    for level, score in product(sorted(LEVELS, reverse=True), scores.values()):
-        sensor = f"{level} % sensor band: "
-        for quantity, text in (
-            (
-                f"{level} % displacement band covers displacement",
-                covered(score, "displacement", level),
-            ),
-            (f"{sensor}worst second", f"{100 * score.worst_second[level]:.1f} %"),
-            (f"{sensor}mean width", length_text(score.width_um[level])),
-            (f"{sensor}interval score", length_text(score.interval_score_um[level])),
-        ):
-            texts.setdefault(quantity, []).append(text)
-    rows = [
-        [quantity, *(text or UNKNOWN for text in row)]
-        for quantity, row in texts.items()
-        if any(row)
-    ]
+    judged = scores.values()
+    rows = [["CRPS", *(length_text(score.crps_um) for score in judged)]]
+    for level in sorted(LEVELS, reverse=True):
+        covers = [covered(score, "displacement", level) for score in judged]
+        if any(covers):
+            title = f"{level} % displacement band covers displacement"
+            rows.append([title, *(text or UNKNOWN for text in covers)])
+        sensor = f"{level} % sensor band:"
+        rows += [
+            [f"{sensor} worst second", *(f"{100 * s.worst_second[level]:.1f} %" for s in judged)],
+            [f"{sensor} mean width", *(length_text(s.width_um[level]) for s in judged)],
+            [
+                f"{sensor} interval score",
+                *(length_text(s.interval_score_um[level]) for s in judged),
+            ],
+        ]
     columns = ["Quantity", *(titles[name] for name in scores)]
     return Table("scores", "Other scores", columns, rows, records=records)
 
