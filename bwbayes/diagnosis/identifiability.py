@@ -51,22 +51,9 @@ def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
         return
     parts, directions = spectrum(posterior, point)
     count = int(np.count_nonzero(parts > LEFT_OPEN))
-    for i in range(min(count, 2)):
-        text = f"{combined(directions[:, i], names)}: {percent(parts[i])} of the prior's SD remains"
-        if i == count - 1 < parts.size - 1:
-            text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
-        elif i == 1:
-            text += f", and more than {percent(LEFT_OPEN)} of {count - 2} other combinations"
-        yield Finding("not identifiable", text, _advice(posterior, point))
-
-
-def percent(share: float) -> str:
-    """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
-    return "all" if share >= 0.995 else f"{share:.0%}"
-
-
-def _advice(posterior: Posterior, point: PointFit) -> str:
-    """Say what to measure instead."""
+    if not count:
+        return
+    # What to measure instead.
     windows = [data.voltage[window] for data in posterior.datasets for window in data.training]
     half = max(float(np.ptp(voltage)) / 2 for voltage in windows)
     swings = np.concatenate([np.abs(np.diff(v[turning_points(v)])) for v in windows])
@@ -74,12 +61,24 @@ def _advice(posterior: Posterior, point: PointFit) -> str:
     _, single, record_free = next(posterior.each(free))
     columns = single.only.table.columns(single.prior.theta(record_free))
     opening = single.only.actuator.hysteresis.opening(columns, half)
+    advice = "add larger and smaller amplitudes"
     # A loop closes where its opening is about one; below 0.3 it hardly opens.
     if opening is not None and opening[0] < 0.3:
-        return f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
-    if swings.size < 2 or swings.min() > 0.8 * swings.max():
-        return "vary the amplitude: let it decay to a tenth over ten periods"
-    return "add larger and smaller amplitudes"
+        advice = f"drive over more than {2 * half:.3g} V peak to peak, if the actuator allows it"
+    elif swings.size < 2 or swings.min() > 0.8 * swings.max():
+        advice = "vary the amplitude: let it decay to a tenth over ten periods"
+    for i in range(min(count, 2)):
+        text = f"{combined(directions[:, i], names)}: {percent(parts[i])} of the prior's SD remains"
+        if i == count - 1 < parts.size - 1:
+            text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
+        elif i == 1:
+            text += f", and more than {percent(LEFT_OPEN)} of {count - 2} other combinations"
+        yield Finding("not identifiable", text, advice)
+
+
+def percent(share: float) -> str:
+    """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
+    return "all" if share >= 0.995 else f"{share:.0%}"
 
 
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -295,7 +294,19 @@ def learned(
         name: Taught(float(contraction[i]), *sensitivities[name])
         for i, name in enumerate(prior.free_names)
     }
-    return Learned(parameters, tuple(_combinations(prior.free_names, before, after)))
+    # The three directions that keep most of their prior sd, in the prior's own normal scores, whose
+    # spread the constraints may have changed: the eigenvectors of the posterior's covariance
+    # relative to the prior's.
+    given, left = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
+    variances, directions = scipy.linalg.eigh(left, given)
+    combinations = []
+    for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
+        sd = float(np.sqrt(max(variances[i], 0.0)))
+        if sd >= LEFT_OPEN:
+            # How the scores move together along it, and not what picks it out.
+            text = combined(left @ directions[:, i], prior.free_names)
+            combinations.append(Combination(text, sd))
+    return Learned(parameters, tuple(combinations))
 
 
 def _sensitivities(
@@ -317,20 +328,3 @@ def _sensitivities(
     )
     by_prior, by_likelihood = (psense(tree, group=group) for group in ("prior", "likelihood"))
     return {name: (float(by_prior[name]), float(by_likelihood[name])) for name in prior.free_names}
-
-
-def _combinations(
-    names: Sequence[str], before: FloatArray, after: FloatArray
-) -> Iterator[Combination]:
-    """Yield the three directions that keep most of their prior sd, in words.
-
-    In the prior's own normal scores, whose spread the constraints may have changed: the
-    eigenvectors of the posterior's covariance relative to the prior's.
-    """
-    prior, posterior = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
-    variances, directions = scipy.linalg.eigh(posterior, prior)
-    for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
-        sd = float(np.sqrt(max(variances[i], 0.0)))
-        if sd >= LEFT_OPEN:
-            # How the scores move together along it, and not what picks it out.
-            yield Combination(combined(posterior @ directions[:, i], names), sd)
