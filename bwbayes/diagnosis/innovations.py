@@ -9,7 +9,9 @@ and large enough to matter; of records that the model describes fewer than one i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import scipy
@@ -138,30 +140,39 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
     """Return where the innovations depart from what the noise model assumes."""
     if series.white.size < 100:  # these show nothing
         return ()
-    findings = []
+    sides = [_one_sided(series, quantity) for quantity in ("rate", "voltage", "direction")]
+    return tuple(chain(_correlated(series), *sides))
+
+
+def _correlated(series: Innovations) -> Iterator[Finding]:
+    """Find an autocorrelation beyond chance, and of at least 0.1."""
     correlation = series.correlation
-    # An autocorrelation beyond chance, and of at least 0.1.
     bound = scipy.stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
     lag = int(np.argmax(np.abs(correlation)))
     if abs(correlation[lag]) > max(bound, 0.1):
         distance = series.time[lag + 1] - series.time[0]
-        text = f"innovations {distance:.3g} s apart correlate by {correlation[lag]:.2f}"
-        fix = "check whether the sensor filters; else the discrepancy does not forget exponentially"
-        findings.append(Finding("noise model", text, fix))
-    for quantity in ("rate", "voltage", "direction"):
-        groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
-        if len(groups) < 2:
-            continue
-        scores = [
-            float(np.mean(white)) * np.sqrt(white.size) / max(float(np.std(white)), 1e-300)
-            for _, white in groups
-        ]
-        # The group with the surest mean, if it is beyond chance and at least 0.15 SD.
-        name, white = groups[int(np.argmax(np.abs(scores)))]
-        mean = float(np.mean(white))
-        if np.max(np.abs(scores)) > scipy.stats.norm.isf(ALARM / 6) and abs(mean) > 0.15:
-            subject = "drive" if quantity == "rate" else "voltage"
-            text = f"the innovations average {mean:+.2f} SD where the {subject} is {name}"
-            fix = "try what explains it: fit with the option improve"
-            findings.append(Finding("noise model", text, fix))
-    return tuple(findings)
+        yield Finding(
+            "noise model",
+            f"innovations {distance:.3g} s apart correlate by {correlation[lag]:.2f}",
+            "check whether the sensor filters; else the discrepancy does not forget exponentially",
+        )
+
+
+def _one_sided(series: Innovations, quantity: str) -> Iterator[Finding]:
+    """Find the group with the surest mean, if it is beyond chance and at least 0.15 SD."""
+    groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
+    if len(groups) < 2:
+        return
+    scores = [
+        float(np.mean(white)) * np.sqrt(white.size) / max(float(np.std(white)), 1e-300)
+        for _, white in groups
+    ]
+    name, white = groups[int(np.argmax(np.abs(scores)))]
+    mean = float(np.mean(white))
+    if np.max(np.abs(scores)) > scipy.stats.norm.isf(ALARM / 6) and abs(mean) > 0.15:
+        subject = "drive" if quantity == "rate" else "voltage"
+        yield Finding(
+            "noise model",
+            f"the innovations average {mean:+.2f} SD where the {subject} is {name}",
+            "try what explains it: bwbayes run --improve",
+        )
