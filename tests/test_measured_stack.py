@@ -22,6 +22,7 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record, thinned
 from bwbayes.record import Record, read_record
+from tests.app import small
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT.parent / "shared" / "data" / "picma_stack_open_loop.csv"
@@ -42,6 +43,7 @@ def run(folder: Path, config: Path, statuses: tuple[int, ...] = (0,)) -> Any:
     argv = ["bwbayes", "run", str(config), "--record", str(RECORD), "--out", str(folder), "--quiet"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", argv)
+        small.without_pictures(patch)
         with pytest.raises(SystemExit) as ended:
             cli.main()
     assert ended.value.code in statuses

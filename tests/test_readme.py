@@ -16,6 +16,7 @@ import pytest
 from bwbayes.app.commands import cli
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Waveform
+from tests.app import small
 from tests.examples import README, ROOT, blocks
 from tests.measured import measured
 
@@ -34,6 +35,7 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["bwbayes", "run", "runs/ring_bender.toml", "--out", str(folder)])
         patch.chdir(ROOT)
+        small.without_pictures(patch)
         with pytest.raises(SystemExit) as ended:
             cli.main()
     assert ended.value.code == 0

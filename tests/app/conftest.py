@@ -37,8 +37,8 @@ def copy(run: Path, tmp_path: Path) -> RunFolder:
 
 @pytest.fixture
 def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the time that pictures take, where they are not what is tested."""
-    monkeypatch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
+    """Spare the time that pictures take."""
+    small.without_pictures(monkeypatch)
 
 
 @dataclass(frozen=True)

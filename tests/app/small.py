@@ -69,6 +69,11 @@ def typed(command: click.Command, *words: object) -> int:
     return status
 
 
+def without_pictures(patch: pytest.MonkeyPatch) -> None:
+    """Spare the time that pictures take, where they are not what is tested."""
+    patch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
+
+
 def quiet() -> Console:
     """Return a console that prints nothing."""
     return Console(quiet=True)

@@ -216,8 +216,7 @@ def linear_algebra_threads() -> set[int]:
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(("workers", "engine"), [(1, "numpy"), (2, "numba")])
 def test_workers_get_the_whole_model_and_use_one_thread_each(workers: int, engine: Engine) -> None:
     model = replace(posterior(), engine=engine)
     theta = truth(model)

@@ -251,15 +251,10 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
-    """Also where the process that was to draw them has died, and nothing was begun."""
+    """Also where the process that was to draw them has died."""
     artist, run = Artist(Broken()), example.run(converged=False)
+    artist.draw(run)
     drawn, plots = artist.drawn(run, tmp_path)
     assert plots == NO_PLOTS
     assert ["trace", "ranks"] == list(drawn)
     assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}
-
-
-def test_pictures_outlive_the_process_that_was_to_draw_them(tmp_path: Path) -> None:
-    artist, run = Artist(Broken()), short()
-    artist.draw(run)
-    assert list(pictures(run)) == list(artist.drawn(run, tmp_path)[0])

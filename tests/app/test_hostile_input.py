@@ -5,7 +5,8 @@ and make a run's folder that reads back the same, with nothing written beside it
 prior draws stands in for the point fit, no misfit is explained and no page is drawn, which take
 longer than all the rest, but for a few cases.
 
-The default run takes the first cases; ``-m slow`` takes all. A case is made again from its number:
+The default run takes the first 150, ten of each kind, which find what befalls one case in 50 with a
+probability of 0.95; ``-m slow`` takes all. A case is made again from its number:
 ``tests.app.mutations.case(SEED, number)``.
 """
 
@@ -39,7 +40,7 @@ from tests.app.mutations import KINDS, QUICK, Case, case, made
 from tests.measured import keep
 
 SEED = 1
-FEW, ALL = 300, 10_000
+FEW, ALL = 150, 10_000
 SECONDS = 10  # of processor time, for a case that takes some hundredths
 LONGEST_LINE = 700
 
@@ -178,15 +179,16 @@ def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
 
 
 @pytest.mark.usefixtures("quick_fit")
-def test_300_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
-    for kind, counts in spoilt(range(FEW), place).items():
-        assert counts[0] > 0, f"{kind}: nothing was used"
+def test_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+    result = spoilt(range(FEW), place)
+    assert sum(counts[0] for counts in result.values()) > 0.1 * FEW, "hardly any is used"
+    for kind, counts in result.items():
         assert counts[2] > 0, f"{kind}: nothing was refused"
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_fit")
-def test_10000_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+def test_ten_thousand_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
     result = spoilt(range(ALL), place)
     used, refused = (sum(counts[status] for counts in result.values()) for status in (0, 2))
     keep("hostile input", {"used": used, "refused": refused})

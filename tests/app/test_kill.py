@@ -53,7 +53,7 @@ def follow(where: Path, arguments: list[str], last_step: str) -> None:
         with (where / name).open("w") as file:
             os.dup2(file.fileno(), number)
     patched = pytest.MonkeyPatch()
-    patched.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
+    small.without_pictures(patched)
     if last_step:
         patched.setattr(run_module, last_step, die)
     sys.argv = ["bwbayes", *arguments]

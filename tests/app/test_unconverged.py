@@ -88,13 +88,10 @@ def test_whatever_builds_on_it_is_refused_with_its_status(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("_without_pictures")
 def test_larger_budget_converges_to_what_it_would_have_been(
-    run: Path,
-    cut_short: tuple[RunFolder, int],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    run: Path, cut_short: tuple[RunFolder, int], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
     shutil.copytree(cut_short[0].path, tmp_path / "small")
     made = RunFolder.open(tmp_path / "small")
     result = resume(made, small.quiet(), workers=1, steps=20_000)

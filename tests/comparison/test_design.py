@@ -142,9 +142,3 @@ def test_what_the_amplifier_cannot_make_is_refused_and_comes_last(
 def test_what_cannot_be_asked_is_one_line(known: tuple[Posterior, FloatArray]) -> None:
     with pytest.raises(InputError, match="'bet' is not a free parameter of the actuator; did you"):
         promised(known, {"one": steady()}, "bet")
-    with pytest.raises(InputError, match=r"capacitance \(F\) together"):
-        Limits(0.0, 1.0, current=1.0)
-    with pytest.raises(InputError, match="no voltage from 1 to 1 V"):
-        Limits(1.0, 1.0)
-    with pytest.raises(InputError, match="slew 0; must be positive"):
-        Limits(0.0, 1.0, slew=0.0)

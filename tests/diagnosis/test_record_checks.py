@@ -52,8 +52,11 @@ TRAPEZOID = np.clip(SINE, -0.7, 0.7)
 SQUARE = np.sign(SINE + 1e-9)
 
 
-@pytest.mark.parametrize("step", [0.3, 0.1, 0.03, 0.01, 0.001])
-@pytest.mark.parametrize("shift", [0.0, 0.25, 0.5, 0.99])
+@pytest.mark.parametrize(
+    ("step", "shift"),
+    # The coarser, the more its phase matters.
+    [*((0.3, shift) for shift in (0.0, 0.25, 0.5, 0.99)), (0.1, 0.0), (0.1, 0.5), (0.03, 0.25)],
+)
 @pytest.mark.parametrize(
     ("voltage", "lag"),
     [(SINE, 0), (SINE, 40), (SINE, 125), (TRAPEZOID, 0), (TRAPEZOID, 20), (SQUARE, 1)],
@@ -91,7 +94,7 @@ def test_good_records_of_all_drives_raise_no_alarm() -> None:
 
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_is_wrong_is_named(kind: str) -> None:
-    assert [] == missed(kind, range(4))
+    assert [] == missed(kind, range(3))
 
 
 @pytest.mark.slow
@@ -119,12 +122,12 @@ def without_memory(seed: int, loop: float = 0.0) -> Record:
 
 
 @pytest.mark.parametrize(
-    ("records", "named"), [(40, 38), pytest.param(100, 97, marks=pytest.mark.slow)]
+    ("records", "named"), [(20, 19), pytest.param(100, 97, marks=pytest.mark.slow)]
 )
 def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not(
     records: int, named: int
 ) -> None:
-    """Of 100 records four are not named by chance once in 50 times, of 40 three once in 100.
+    """Of 100 records four are not named by chance once in 50 times, of 20 two once in 60.
 
     Loops are 1 % of the range.
     """

@@ -11,7 +11,6 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import InputError
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
@@ -105,23 +104,9 @@ def test_another_record_is_forecast_from_its_lead_in(from_rest: bool, own_offset
     assert np.isfinite(told.crps).all()
 
 
-def test_a_forecast_without_readings_is_refused() -> None:
-    posterior, record, _ = whole(3)
-    planned = replace(record, displacement=None)
-    with pytest.raises(InputError, match="has no readings after which a forecast could start"):
-        predict_record(
-            posterior,
-            free_truth(posterior),
-            planned,
-            Start(after=True),
-            np.random.default_rng(1),
-        )
-
-
 # Forecasts from a posterior are calibrated: truth from the prior, what comes later in the bands
 
-# Samples of a record, of what follows, and those after it that are looked at.
-LEAD, LATER = 80, 120
+# Samples after a record that are looked at.
 AT = (0, 2, 10, 30, LATER - 1)
 
 PRIORS = {
@@ -194,15 +179,10 @@ def known(replicates: Iterable[Replicate]) -> list[Replicate]:
     return [one._replace(draws=one.draws.mean(axis=0, keepdims=True)) for one in replicates]
 
 
-@pytest.fixture(scope="module")
-def few() -> list[Replicate]:
-    return [replicate(seed) for seed in range(36)]
-
-
 @pytest.mark.slow
-def test_parameters_taken_for_known_are_noticed(few: list[Replicate]) -> None:
+def test_parameters_taken_for_known_are_noticed() -> None:
     """The twin: bands that are those of the discrepancy alone."""
-    assert smallest_p(ranks(known(few))) < 1e-4
+    assert smallest_p(ranks(known(replicate(seed) for seed in range(36)))) < 1e-4
 
 
 @pytest.mark.slow
