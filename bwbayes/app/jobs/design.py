@@ -135,14 +135,17 @@ def candidates_of(
     """
     if not isinstance(candidates, str | Path):
         return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}
-    waveforms = _preset(record, amplifier) if str(candidates) == "standard" else {}
-    for name, table in () if waveforms else read_toml(Path(candidates)).items():
-        try:
-            waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
-        except ValidationError as error:
-            raise InputError(one_line(f"{candidates}: {name}", error, SignalConfig)) from None
-        except InputError as error:
-            raise InputError(f"{candidates}: {name}: {error}") from None
+    if str(candidates) == "standard":
+        waveforms = _preset(record, amplifier)
+    else:
+        waveforms = {}
+        for name, table in read_toml(Path(candidates)).items():
+            try:
+                waveforms[name] = sampled_waveform(SignalConfig.model_validate(table))
+            except ValidationError as error:
+                raise InputError(one_line(f"{candidates}: {name}", error, SignalConfig)) from None
+            except InputError as error:
+                raise InputError(f"{candidates}: {name}: {error}") from None
     if not waveforms:
         raise InputError(f"{candidates}: has no candidate; write a table for each signal")
     return {name: waveform.sample(1 / record.interval)[1] for name, waveform in waveforms.items()}

@@ -18,7 +18,6 @@ from rich.live import Live
 from rich.text import Text
 
 from bwbayes.app.running.workers import executor, side_by_side
-from bwbayes.calibration.replicates import as_done
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
@@ -143,6 +142,8 @@ def batch[T](
     this ``kind`` that were there before. They go into processes, also with the compiled engine:
     most of their time goes into Python.
     """
+    from bwbayes.calibration.replicates import as_done  # noqa: PLC0415  # of no use to one run
+
     if not arguments:
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
