@@ -88,7 +88,6 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
 def _text(
     path: Path, where: Path, naming: Naming, record: Record, findings: tuple[Finding, ...]
 ) -> str:
-    """Write the config."""
     notes, fixes = [], {"record": "", "model": ""}
     for finding in findings:
         notes.append(f"# {finding.kind}: {finding.text}")

@@ -346,7 +346,6 @@ class Fit(Shown):
             )
 
     def _converged(self) -> Result:
-        """Return the result, or refuse."""
         self.require_converged()
         return self.result
 

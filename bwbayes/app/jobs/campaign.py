@@ -170,7 +170,6 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
 
 
 def _config_of(file: Path, campaign: CampaignFolder) -> Config:
-    """Return the config of a record."""
     if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:

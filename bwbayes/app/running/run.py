@@ -205,7 +205,6 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
 
 
 def _rewrite(folder: RunFolder, config: Config) -> None:
-    """Write another config into a run's folder."""
     text = dump(config)
     parse(text, "resume")  # refuses what a config cannot say
     draft = folder.config.with_suffix(".partial")
