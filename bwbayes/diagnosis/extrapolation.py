@@ -63,7 +63,20 @@ def beyond_training(
             f"{low:.4g} to {high:.4g} V; the bands extrapolate"
         )
         findings.append(Finding("range", text, "train on a record that spans this range"))
-    findings += _speed(posterior, turn_times, planned, interval)
+    turn_time, speeds = time_between_turns(planned, interval), []
+    for dataset, fitted_turn_time in zip(posterior.datasets, turn_times, strict=True):
+        over = PART * min(fitted_turn_time, turn_time)
+        fitted = fastest(dataset.voltage, dataset.actuator.interval, over, dataset.training)
+        speeds.append((fastest(planned, interval, over), fitted))
+    # Of several records the one that comes nearest to the drive.
+    speed, slower = min(speeds, key=lambda pair: pair[0] / max(pair[1], 1e-300))
+    # Noise and the sampling change a speed by a tenth or so.
+    if speed > 1.5 * slower:
+        text = (
+            f"voltage speed of up to {speed:.3g} V/s exceeds the {slower:.3g} V/s of training; the "
+            "bands extrapolate, because the lag is not known that well"
+        )
+        findings.append(Finding("speed", text, "train on a record that is as fast"))
     findings += _slow(posterior, (low, high), min(turn_times), voltage, interval, window)
     duration = voltage[: window.stop].size * interval
     before = max(
@@ -76,25 +89,6 @@ def beyond_training(
         )
         findings.append(Finding("duration", text, "train on a record that is as long"))
     return findings
-
-
-def _speed(
-    posterior: Posterior, turn_times: Sequence[float], voltage: FloatArray, interval: float
-) -> Iterator[Finding]:
-    turn_time, speeds = time_between_turns(voltage, interval), []
-    for dataset, fitted_turn_time in zip(posterior.datasets, turn_times, strict=True):
-        over = PART * min(fitted_turn_time, turn_time)
-        fitted = fastest(dataset.voltage, dataset.actuator.interval, over, dataset.training)
-        speeds.append((fastest(voltage, interval, over), fitted))
-    # Of several records the one that comes nearest to the drive.
-    now, before = min(speeds, key=lambda pair: pair[0] / max(pair[1], 1e-300))
-    # Noise and the sampling change a speed by a tenth or so.
-    if now > 1.5 * before:
-        text = (
-            f"voltage speed of up to {now:.3g} V/s exceeds the {before:.3g} V/s of training; the "
-            "bands extrapolate, because the lag is not known that well"
-        )
-        yield Finding("speed", text, "train on a record that is as fast")
 
 
 def _slow(

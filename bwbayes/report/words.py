@@ -27,23 +27,22 @@ def symbol(parameter: Parameter) -> Markup:
 
     Greek letters, one subscript and ``\mathrm`` are understood.
     """
+
+    def greek(command: re.Match[str]) -> str:
+        size = "CAPITAL" if command[1][0].isupper() else "SMALL"
+        try:
+            return unicodedata.lookup(f"GREEK {size} LETTER {command[1].upper()}")
+        except KeyError:
+            return command[0]
+
     text = re.sub(r"\\mathrm\{(\w*)\}", r"\1", parameter.label)
-    text = re.sub(r"\\([A-Za-z]+)", _greek, text)
+    text = re.sub(r"\\([A-Za-z]+)", greek, text)
     match = re.fullmatch(r"([^\\{}_^$]+)(?:_(?:\{([^\\{}_^$]+)\}|(\w+)))?", text)
     if match is None:
         return Markup("<i>{}</i>").format(parameter.name)
     base, *below = match.groups("")
     subscript = Markup("<sub>{}</sub>").format("".join(below)) if any(below) else ""
     return Markup("<i>{}</i>").format(base) + subscript
-
-
-def _greek(match: re.Match[str]) -> str:
-    """Return the Greek letter that a LaTeX command stands for, or the command."""
-    size = "CAPITAL" if match[1][0].isupper() else "SMALL"
-    try:
-        return unicodedata.lookup(f"GREEK {size} LETTER {match[1].upper()}")
-    except KeyError:
-        return match[0]
 
 
 def unit_text(unit: str) -> str:

@@ -8,7 +8,6 @@ figures alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING
 
 from bwbayes.control.loop import CONTROLLERS
@@ -40,7 +39,18 @@ class Plots:
     def __getattr__(self, kind: str) -> Callable[..., Figure]:
         if kind not in PICTURES:
             raise AttributeError(f"{kind} is no figure of a fit")
-        return partial(self._draw, kind)
+
+        def draw(name: str | None = None) -> Figure:
+            if kind not in ("trace", "ranks"):
+                self._fit.require_converged()
+            shown = {
+                key.removeprefix(f"{kind}_"): picture
+                for key, picture in pictures(self._fit.result).items()
+                if key.partition("_")[0] == kind
+            }
+            return drawn(_named(shown, name or next(iter(shown), kind))[1].draw)
+
+        return draw
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *PICTURES]
@@ -64,16 +74,6 @@ class Plots:
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
         return drawn(draw_tracking, tracked.to_pandas(), CONTROLLERS)
-
-    def _draw(self, kind: str, name: str | None = None) -> Figure:
-        if kind not in ("trace", "ranks"):
-            self._fit.require_converged()
-        shown = {
-            key.removeprefix(f"{kind}_"): picture
-            for key, picture in pictures(self._fit.result).items()
-            if key.partition("_")[0] == kind
-        }
-        return drawn(_named(shown, name or next(iter(shown), kind))[1].draw)
 
 
 def _named[T](items: Mapping[str, T], name: str | None) -> tuple[str, T]:

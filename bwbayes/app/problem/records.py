@@ -84,8 +84,21 @@ def training_records(
             purpose = "record" if name == ALONE else f"record {name}"
             records[name] = _measured(stand, drive, generator(config.seed, purpose))
     for name, source in config.records.items():
-        records[name] = _cut(source, records[name], place_of(name))
-        require_readable(records[name], place_of(name))
+        record, table = records[name], place_of(name)
+        end = record.start + record.duration
+        if source.outliers:
+            rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
+            if rows.min() < 0 or rows.max() >= record.samples:
+                raise InputError(
+                    f"{table}.outliers: a time outside of {record.start:g} to {end:g} s"
+                )
+            record = record.without(rows.astype(np.int64))
+        if source.exclude is not None:
+            record = record.exclude([(start, stop) for start, stop in source.exclude])
+        if source.start is not None or source.stop is not None:
+            record = record.upto(end if source.stop is None else source.stop, source.start)
+        records[name] = record.decimate(source.decimate) if source.decimate > 1 else record
+        require_readable(records[name], table)
     return records, stand
 
 
@@ -95,21 +108,6 @@ def _measured(
     record = stand.run(sampled_waveform(drive), rng)
     name = drive if isinstance(drive, str) else drive.shape
     return replace(record, origin=f"{record.origin}, {name} signal")
-
-
-def _cut(source: RecordConfig, record: Record, table: str) -> Record:
-    """Leave out the readings that a config leaves out."""
-    end = record.start + record.duration
-    if source.outliers:
-        rows = np.rint((np.array(source.outliers) - record.start) / record.interval)
-        if rows.min() < 0 or rows.max() >= record.samples:
-            raise InputError(f"{table}.outliers: a time outside of {record.start:g} to {end:g} s")
-        record = record.without(rows.astype(np.int64))
-    if source.exclude is not None:
-        record = record.exclude([(start, stop) for start, stop in source.exclude])
-    if source.start is not None or source.stop is not None:
-        record = record.upto(end if source.stop is None else source.stop, source.start)
-    return record.decimate(source.decimate) if source.decimate > 1 else record
 
 
 def _read(

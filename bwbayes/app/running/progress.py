@@ -82,7 +82,16 @@ class Progress(_Line):
         if check is None:
             self.steps += self.plan.block / self.plan.ensembles
         else:
-            self.check, self.end = check, self._forecast(check)
+            self.check, self.end = check, None
+            # No end is in sight while the draws disagree, which more of them may or may not cure; a
+            # run that goes on is checked before its first step.
+            if self.steps and not check.disagreements() and check.lowest_ess > 0:
+                needed = check.steps * self.plan.ess / check.lowest_ess
+                needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
+                remaining = max(min(needed, self.plan.most_steps) - check.steps, 0)
+                now = time.monotonic()
+                if np.isfinite(needed):
+                    self.end = now + remaining * (now - self.begun) / self.steps
         self.show(self.line(phase), printed=check is not None)
 
     def line(self, phase: Phase) -> str:
@@ -101,22 +110,6 @@ class Progress(_Line):
             f"R-hat {np.max(check.rhat):.3f}   ESS {check.lowest_ess:.0f} of {self.plan.ess:.0f}   "
             f"{cover}"
         )
-
-    def _forecast(self, check: Check) -> float | None:
-        """Guess the end from the effective draws per step so far and the autocorrelation time.
-
-        There is none while the draws disagree, which more of them may or may not cure; and a run
-        that goes on is checked before its first step.
-        """
-        if not self.steps or check.disagreements() or not check.lowest_ess > 0:
-            return None
-        needed = check.steps * self.plan.ess / check.lowest_ess
-        needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
-        if not np.isfinite(needed):
-            return None
-        remaining = max(min(needed, self.plan.most_steps) - check.steps, 0)
-        now = time.monotonic()
-        return now + remaining * (now - self.begun) / self.steps
 
 
 def _minutes(seconds: float) -> str:
