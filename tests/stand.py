@@ -24,6 +24,15 @@ def process(samples: int, step: float, generator: np.random.Generator) -> FloatA
     return drawn
 
 
+def play(values: FloatArray, threshold: float) -> FloatArray:
+    """Follow values with play, from zero."""
+    followed, reached = np.empty_like(values), 0.0
+    for number, value in enumerate(values.tolist()):
+        reached = min(max(reached, value - threshold), value + threshold)
+        followed[number] = reached
+    return followed
+
+
 @dataclass(frozen=True)
 class Stand:
     """The ring bender: its lag (s), discrepancy (um, s) and sensor (um), and the rate (Hz)."""

@@ -3,8 +3,8 @@
 ``-m slow`` makes 500 replicates of ``runs/calibration.toml``: each draws nine parameters from the
 prior, simulates a record and fits it as a run does. The calibration itself must pass; it raises a
 false alarm once in 100 times. A sharper test looks at all parameters of a replicate together
-(:mod:`tests.together`), at a level of 0.01; 40 replicates, as in the default suite's
-``test_calibration_moving.py``, find sds a fifth too small or a bias of 0.3 sd 24 times in 25, 500
+(:mod:`tests.together`), at a level of 0.01; 32 replicates, as in the default suite's
+``test_calibration_moving.py``, find sds a fifth too small or a bias of 0.3 sd 9 times in 10, 500
 sds a tenth too small.
 
 These are planted on the stored draws, as twins. The other defects are planted in the likelihood or

@@ -8,11 +8,11 @@ rate, with a start and an offset of its own, and predicts it after a lead-in of 
 priors are so wide that some truths have next to no hysteresis; their posteriors are long and
 curved. A replicate that does not converge in its budget is ranked as it is; one in ten may.
 
-The default suite makes 40 replicates with the lag, and with priors of someone who knows the kind
+The default suite makes 32 replicates with the lag, and with priors of someone who knows the kind
 of actuator for d and the hysteresis alone, which takes a third of the steps. All parameters are
 tested together (:mod:`tests.together`), and each by the calibration's own tests; twins plant a
-wrong width and a bias on the draws (sds a fifth too small are seen with a probability of 0.96, a
-bias of 0.3 sd with 0.99). Coverages of the 18 bands are held to the spread between replicates: by
+wrong width and a bias on the draws (sds a fifth too small are seen with a probability of 0.89, a
+bias of 0.3 sd with 0.96). Coverages of the 18 bands are held to the spread between replicates: by
 chance one in 100 sound calibrations has one that is off by more (Bonferroni's bound). ``-m slow``
 makes 150 of each variant and of each part of a model, and 50 with a free exponent beside known
 hysteresis: four
@@ -44,7 +44,7 @@ from tests.measured import keep
 from tests.together import LEVEL, SEED, Plant, errors_off, made, narrowed, shifted, together_test
 
 # Replicates of the default suite, and of the slow one.
-QUICK, REPLICATES = 40, 150
+QUICK, REPLICATES = 32, 150
 
 # Part of the replicates that may end before they have converged.
 MOST_UNCONVERGED = 0.1

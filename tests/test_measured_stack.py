@@ -153,14 +153,15 @@ def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
         gaussian_filter1d(displacement, width / record.interval) if width else displacement
         for width in WIDTHS
     ]
+    windows = record.window_slice(25.0, 36.0), record.window_slice(3.0, 17.0)
     # As far as the windows go.
-    until = record.window_slice(25.0, 36.0).stop
+    until = windows[0].stop
     asked = np.array(smooth)[:, :until]
     voltages = inverse(actuator, np.tile(model, (len(WIDTHS), 1)), asked)
     missed = {}
     for width, voltage in zip(WIDTHS, voltages, strict=True):
         parts = []
-        for window in (record.window_slice(25.0, 36.0), record.window_slice(3.0, 17.0)):
+        for window in windows:
             slope = np.polyfit(record.voltage[window], displacement[window], 1)[0]
             rms = np.sqrt(np.mean((voltage[window] - record.voltage[window]) ** 2))
             parts.append(float(slope * rms / np.ptp(displacement[window])))

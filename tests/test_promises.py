@@ -65,7 +65,7 @@ FIGURES: dict[str, list[str]] = {
         f"calibration/{key}"
         for key in ("replicates", "unconverged", "tests", "shortcomings", "power")
     ],
-    "40 of one: `pytest tests/test_calibration_moving.py": [
+    "32 of one: `pytest tests/test_calibration_moving.py": [
         f"count {MOVING}",
         f"worst {MOVING}",
         "100 calibration, little noise/bands cover/sensor 90",

@@ -26,9 +26,9 @@ from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
-from tests.diagnosis.plants import play
 from tests.measured import keep
 from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.stand import play
 
 RATE, SECONDS = 5000.0, 4.0
 EVERY = (1, 5, 25, 100)

@@ -49,9 +49,8 @@ from_rest = true
 """
 
 
-def config(*changes: tuple[str, str]) -> Config:
-    """Return the small config with parts of its text replaced."""
-    text = TEXT
+def config(*changes: tuple[str, str], text: str = TEXT) -> Config:
+    """Return the small config, or another one, with parts of its text replaced."""
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)

@@ -141,6 +141,18 @@ class Opened:
         self.page.close()
 
 
+def assert_can_be_read_aloud(page: Any) -> None:
+    """Find language, landmarks, one heading at the top, words for pictures, headers for tables."""
+    assert [1, 1, 1] == [page.locator(one).count() for one in ("html[lang=en]", "main", "h1")]
+    for missing in (
+        "img:not([alt]), img[alt='']",
+        "th:not([scope])",
+        "table:not([aria-label]):not([aria-labelledby])",
+        "table:not(:has(th[scope=row]))",
+    ):
+        assert 0 == page.locator(missing).count(), missing
+
+
 @pytest.mark.parametrize(
     ("width", "scheme"),
     [
@@ -168,6 +180,7 @@ def test_a_page_is_whole_alone_and_readable(
         assert (scheme == "light") == (dark == "rgb(255, 255, 255)")
         outside = [u for u in opened.requests if not u.startswith(("data:", pages[name].as_uri()))]
         assert ([], []) == (opened.wrong, outside)
+        assert_can_be_read_aloud(page)
 
 
 def test_low_contrast_would_be_noticed(chromium: Any, pages: dict[str, Path]) -> None:
@@ -236,19 +249,3 @@ def test_without_scripts_there_are_the_pictures(chromium: Any, pages: dict[str, 
     with Opened(chromium, pages["run"], java_script_enabled=False) as opened:
         assert opened.page.locator("#loop img").is_visible()
         assert not opened.page.locator("#loop .plot").is_visible()
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_a_page_can_be_read_aloud(chromium: Any, pages: dict[str, Path], name: str) -> None:
-    """Language, landmarks, one heading at the top, words for pictures, headers for tables."""
-    with Opened(chromium, pages[name]) as opened:
-
-        def number(selector: str) -> int:
-            outcome: int = opened.page.locator(selector).count()
-            return outcome
-
-        assert [1, 1, 1] == [number(s) for s in ("html[lang=en]", "main", "h1")]
-        assert 0 == number("img:not([alt]), img[alt='']")
-        assert 0 == number("th:not([scope])")
-        assert 0 == number("table:not([aria-label]):not([aria-labelledby])")
-        assert 0 == number("table:not(:has(th[scope=row]))")

@@ -22,6 +22,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.grid import decimals_of
+from tests.stand import play
 
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
@@ -49,15 +50,10 @@ def drive(kind: str, periods: float, time: FloatArray) -> FloatArray:
     return voltage / 2 + 45.0 if kind == "unipolar" else voltage
 
 
-def play(voltage: FloatArray, rng: np.random.Generator) -> FloatArray:
+def moved(voltage: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return the displacement of two plays and a gain, with noise, um."""
-    result = 0.4 * voltage
-    for radius, weight in ((8.0, 0.2), (25.0, 0.15)):
-        state, states = voltage[0], np.empty_like(voltage)
-        for i, value in enumerate(voltage):
-            state = min(max(state, value - radius), value + radius)
-            states[i] = state
-        result = result + weight * states
+    away = voltage - voltage[0]
+    result = 0.4 * voltage + 0.2 * play(away, 8.0) + 0.15 * play(away, 25.0)
     return result + 0.05 * rng.standard_normal(voltage.size)
 
 
@@ -120,7 +116,7 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
 ) -> None:
     """Every window holds readings, and what is held out is a quarter, or nothing."""
     voltage = drive(kind, periods, np.arange(samples) / samples)
-    displacement = play(voltage, np.random.default_rng(seed))
+    displacement = moved(voltage, np.random.default_rng(seed))
     options: dict[str, Any] = {"rate": rate, "start": start, "units": units}
     path = written(tmp_path / "a.csv", voltage, displacement, separator=separator, **options)
     problem = resolved(path)
@@ -153,7 +149,7 @@ def held_out(problem: Problem) -> np.ndarray[Any, Any]:
 def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: float) -> None:
     """Of every amplitude and rate that the drive has: no tail, and no end of a chirp."""
     voltage = drive(kind, periods, np.arange(4000) / 4000)
-    path = written(tmp_path / "a.csv", voltage, play(voltage, np.random.default_rng(0)))
+    path = written(tmp_path / "a.csv", voltage, moved(voltage, np.random.default_rng(0)))
     held = held_out(resolved(path))
     rates = np.abs(np.gradient(voltage))
     for values in (voltage, rates):

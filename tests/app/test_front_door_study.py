@@ -19,7 +19,7 @@ from bwbayes.app.config.proposal import propose
 from bwbayes.app.running.run import resume, start
 from bwbayes.errors import InputError, InputWarning
 from tests.app import small
-from tests.app.test_front_door import SEPARATORS, UNITS, drive, play, written
+from tests.app.test_front_door import SEPARATORS, UNITS, drive, moved, written
 from tests.measured import keep
 from tests.record.instruments import INSTRUMENTS, Written
 
@@ -33,7 +33,7 @@ def ordinary(folder: Path, number: int) -> Path:
     kind = str(generator.choice(["sine", "decaying", "growing", "unipolar", "chirp", "triangle"]))
     voltage = drive(kind, generator.uniform(1.5, 20), np.arange(samples) / samples)
     size = float(np.exp(generator.uniform(np.log(0.01), np.log(10))))
-    displacement = size * play(voltage, generator) + generator.normal(0, 100)
+    displacement = size * moved(voltage, generator) + generator.normal(0, 100)
     options: dict[str, Any] = {
         "rate": float(f"{10 ** generator.uniform(0, 5):.4g}"),
         "start": float(generator.choice([0.0, -1.5, 12.5, 3600.0, 1.7e9])),

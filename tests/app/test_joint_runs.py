@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bwbayes
-from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
@@ -61,24 +61,15 @@ from_rest = true
 """
 
 
-def config(*changes: tuple[str, str]) -> Config:
-    """Return the config with parts of its text replaced."""
-    text = TEXT
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    return parse(text, "joint.toml")
-
-
 def problem(*changes: tuple[str, str]) -> Problem:
-    return resolve(config(*changes), Path())
+    return resolve(small.config(*changes, text=TEXT), Path())
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
-    folder = start(config(), path.parent, path)
+    folder = start(parse(TEXT, "joint.toml"), path.parent, path)
     resume(folder, small.quiet(), workers=1)
     return folder
 

@@ -70,21 +70,12 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     np.testing.assert_allclose(compiled.run("inverse", 0.0, reference), command[:-1], atol=1e-6)
 
 
+@pytest.mark.parametrize("from_rest", [True, False])
 @pytest.mark.parametrize(
-    ("hysteresis", "from_rest"),
+    "hysteresis",
     [
-        *(
-            (name, True)
-            if name in ("bouc-wen", "preisach")
-            else pytest.param(name, True, marks=pytest.mark.slow)
-            for name in HYSTERESIS
-        ),
-        *(
-            (name, False)
-            if name in ("bouc-wen", "plays")
-            else pytest.param(name, False, marks=pytest.mark.slow)
-            for name in HYSTERESIS
-        ),
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in ("bouc-wen", "plays")))
+        for name in HYSTERESIS
     ],
 )
 def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool) -> None:

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record
-from tests.stand import process
+from tests.stand import play, process
 
 RATE, FINE = 200.0, 8
 
@@ -102,15 +102,6 @@ def plays(part: Plant, voltage: FloatArray) -> FloatArray:
     for threshold in np.linspace(4, 80, 20):
         total += part.d * 0.03 * play(voltage, threshold)
     return total
-
-
-def play(values: FloatArray, threshold: float) -> FloatArray:
-    """Follow values with play."""
-    followed, reached = np.empty_like(values), 0.0
-    for number, value in enumerate(values.tolist()):
-        reached = min(max(reached, value - threshold), value + threshold)
-        followed[number] = reached
-    return followed
 
 
 def lagged(values: FloatArray, time: float) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from itertools import pairwise
 from typing import get_args
 
@@ -21,23 +22,12 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.registry import DYNAMICS
+from bwbayes.record.teststand import RingBender
 from tests.model.operators.slow import Model, assert_close, random_walk
 
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 # The paper's Table 1 in the package's units, with a mass that lets the second order ring.
-VALUES = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 1.5,
-    "lag": 3.85e-3,
-    "mass": 2.0,
-    "damping": 1580.0,
-    "stiffness": 4.10e5,
-    "offset": 12.0,
-}
+VALUES = asdict(RingBender()) | {"initial": 1.5, "lag": 3.85e-3, "mass": 2.0, "offset": 12.0}
 
 
 def theta_of(actuator: Actuator, **changes: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +20,7 @@ from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.record.teststand import RingBender
 from tests.control import cases
 from tests.inference.problems import decaying_sine
 from tests.model.operators.test_every_operator import drawn_from, every_operator, posterior
@@ -29,16 +30,7 @@ SPAN = Span(-100.0, 100.0)
 # Of the range: what simulating the inverse may miss the reference by.
 CLOSE = 1e-9
 
-TABLE_1 = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 0.0,
-    "mass": 0.00134,
-    "damping": 1580.0,
-    "stiffness": 4.1e5,
+TABLE_1 = asdict(RingBender()) | {
     "lag": 3.85e-3,
     "quadratic": 3.0,
     "cubic": -1.5,

@@ -21,6 +21,7 @@ from bwbayes.prediction.loops import (
     steady_loop,
 )
 from tests.inference.problems import decaying_sine, posterior_of
+from tests.model.operators.slow import by_plays
 
 
 def still(operator: Operator | None = None) -> Actuator:
@@ -36,16 +37,6 @@ def measured(loop: Traced) -> dict[str, float]:
     return {name: float(values[0]) for name, values in every.items()}
 
 
-def slow_plays(voltage: FloatArray, d: float, thresholds: Any, weights: Any) -> FloatArray:
-    """Sum plays sample by sample, from the demagnetized state."""
-    plays = [0.0 for _ in thresholds]
-    result = []
-    for u in voltage.tolist():
-        plays = [max(u - r, min(u + r, z)) for r, z in zip(thresholds, plays, strict=True)]
-        result.append(d * u + sum(w * z for w, z in zip(weights, plays, strict=True)))
-    return np.array(result)
-
-
 @pytest.mark.parametrize(("low", "high"), [(-80.0, 80.0), (-20.0, 100.0), (10.0, 90.0)])
 def test_plays_are_measured_as_in_a_slow_loop(low: float, high: float) -> None:
     """By the shoelace formula along the path, and by a search along each branch."""
@@ -55,7 +46,7 @@ def test_plays_are_measured_as_in_a_slow_loop(low: float, high: float) -> None:
     got = measured(steady_loop(actuator, column, low, high, 1201))
     up = np.linspace(low, high, 24_001)
     path = np.concatenate([np.linspace(0, high, 9000), up[::-1], up, up[::-1]])
-    x = slow_plays(path, d, thresholds, weights)
+    x = by_plays(d, np.array(thresholds), np.array(weights), path.tolist())
     (rising, falling), u = (x[-2 * up.size : -up.size], x[-up.size :][::-1]), up
     middle = (rising[-1] + falling[0]) / 2
     expected = {

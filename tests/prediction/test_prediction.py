@@ -17,39 +17,22 @@ from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of
-from tests.stand import process
+from tests.stand import Stand
 
-TRUTH = {
-    "d": 0.7,
-    "alpha": 0.3575,
-    "beta": 0.0272,
-    "gamma": 0.0172,
-    "exponent": 1.0,
-    "initial": 0.0,
-    "lag": 0.004,
-    "offset": 5.0,
-    "sensor_sd": 0.5,
-    "discrepancy_sd": 1.0,
-    "discrepancy_time": 0.2,
-}
-INTERVAL = 0.01
+STAND = Stand(lag=0.004, discrepancy=1.0, memory=0.2, sensor=0.5)
+TRUTH = STAND.truth | {"offset": 5.0}
+INTERVAL = 1 / STAND.rate
 
 
 def random() -> np.random.Generator:
     return np.random.default_rng(2)
 
 
-def made(samples: int = 1200, offset: float = 5.0, start: float = 0.0) -> Record:
-    """Simulate a record of a decaying sine: model, discrepancy and sensor noise."""
+def made(samples: int = 1200, start: float = 0.0) -> Record:
+    """Simulate a record of a decaying sine."""
     time = np.arange(samples) * INTERVAL
     voltage = 100 * np.sin(2 * np.pi * 0.5 * time + start) * np.exp(-0.1 * time)
-    actuator = Actuator("lag", "first", INTERVAL)
-    theta = np.array([[TRUTH[n] for n in actuator.parameters]])
-    generator = np.random.default_rng(4)
-    x = process(samples, INTERVAL / TRUTH["discrepancy_time"], generator)
-    truth = actuator.displacement(theta, voltage)[0] - TRUTH["offset"] + offset + x
-    reading = truth + TRUTH["sensor_sd"] * generator.standard_normal(samples)
-    return Record(voltage, reading, INTERVAL, truth=truth, origin="made up")
+    return STAND.measure(voltage, np.random.default_rng(4), offset=TRUTH["offset"])
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +103,7 @@ def test_a_window_is_the_same_part_of_the_whole_record(
 
 def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray) -> None:
     """A command acts when it is held, whatever the training record's voltage was."""
-    planned = replace(made(), displacement=None, truth=None)
+    planned = replace(made(), displacement=None)
     output = predicted(posterior, draws, planned, Start(from_rest=True))
     command = predicted(
         posterior, draws, replace(planned, voltage_is="command"), Start(from_rest=True)
@@ -140,7 +123,7 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
 
 
 def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
-    planned = replace(made(start=1.2), displacement=None, truth=None)
+    planned = replace(made(start=1.2), displacement=None)
     bands = predicted(posterior, draws, planned, Start(from_rest=True))
     theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
     theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0

@@ -15,6 +15,8 @@ import numpy as np
 import pandas as pd
 import scipy.io
 
+from tests.stand import play
+
 SAMPLES, INTERVAL = 600, 0.005
 
 Array = Any
@@ -41,19 +43,10 @@ def _instrument(name: str) -> Callable[[Writer], Writer]:
     return register
 
 
-def _displacement(voltage: Array) -> Array:
-    """Return the displacement of a play with a gain, um."""
-    state, states = 0.0, []
-    for value in voltage:
-        state = min(max(state, value - 6), value + 6)
-        states.append(state)
-    noise = np.random.default_rng(1).normal(scale=0.02, size=SAMPLES)
-    return np.round(0.3 * voltage + 0.2 * np.array(states) + noise, 5)
-
-
 TIME = INTERVAL * np.arange(SAMPLES)  # s
 VOLTAGE = np.round(60 * np.exp(-0.5 * TIME) * np.sin(2 * np.pi * TIME / 0.5), 4)
-DISPLACEMENT = _displacement(VOLTAGE)
+_NOISE = np.random.default_rng(1).normal(scale=0.02, size=SAMPLES)
+DISPLACEMENT = np.round(0.3 * VOLTAGE + 0.2 * play(VOLTAGE, 6.0) + _NOISE, 5)  # um
 COLUMNS = [TIME, VOLTAGE, DISPLACEMENT]
 UNITS = {"time": "s", "voltage": "V", "displacement": "um"}
 

@@ -40,7 +40,7 @@ PLAN = SamplingPlan(
 
 @pytest.mark.parametrize("name", HARD)
 def test_hard_chain_never_passes(name: str) -> None:
-    for seed in range(3):
+    for seed in range(2):
         draws = hard(name, np.random.default_rng(seed))
         assert [] != check(draws, moved(draws), BLOCK).shortcomings(1), seed
 

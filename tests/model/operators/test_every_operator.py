@@ -319,4 +319,4 @@ def assert_finite(name: str, draws: int) -> None:
 
 @every_operator
 def test_draws_of_the_default_priors_have_a_likelihood(name: str) -> None:
-    assert_finite(name, 100 if name in ("jiles-atherton", "domain-wall") else 2000)
+    assert_finite(name, 100 if name in ("jiles-atherton", "domain-wall") else 1000)
