@@ -106,7 +106,7 @@ class Candidate:
             for several in ([s.coverage for s in scores], [s.coverage_error for s in scores])
         )
         return {
-            "log_score": float(shares @ np.array([s.log_score for s in scores], np.float64)),
+            "log_score": float(shares @ [score.log_score for score in scores]),
             "crps_um": float(shares @ [score.crps_um for score in scores]),
             "nrmse": float(np.sqrt(shares @ np.square([score.nrmse for score in scores]))),
             "coverage": float(shares @ covered),

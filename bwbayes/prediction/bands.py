@@ -75,11 +75,11 @@ class Bands:
     upper: dict[tuple[Kind, int], FloatArray]
     pit: FloatArray | None
     crps: FloatArray | None
+    log_score: FloatArray | None
     interval: float
     scored_from: int = 0
     training: bool = False
     lead_in: LeadIn | None = None
-    log_score: FloatArray | None = None
     inside: BoolArray | None = None
     time_offset: float = 0.0
     common_sd: float = 0.0

@@ -30,8 +30,8 @@ class Scores:
     max_error_um
         Largest absolute measured - mean.
     log_score, crps_um
-        Mean log density of a reading under the sensor's distribution, nats, per um (None if it is
-        not known), and mean continuous ranked probability score.
+        Mean log density of a reading under the sensor's distribution, nats, per um, and mean
+        continuous ranked probability score.
     width_um
         Mean width of the sensor band by level.
     interval_score_um
@@ -52,13 +52,13 @@ class Scores:
 
     nrmse: float
     max_error_um: float
+    log_score: float
     crps_um: float
     width_um: dict[int, float]
     interval_score_um: dict[int, float]
     coverage: dict[str, dict[int, float] | None]
     coverage_error: dict[str, dict[int, float] | None]
     worst_second: dict[int, float]
-    log_score: float | None = None
     nrmse_full: float | None = None
 
     @property
@@ -68,14 +68,11 @@ class Scores:
         def by_level(values: dict[int, float] | None) -> dict[str, float] | None:
             return None if values is None else {str(level): x for level, x in values.items()}
 
-        def finite(value: float | None) -> float | None:
-            return value if value is not None and np.isfinite(value) else None
-
         return {
-            "nrmse": finite(self.nrmse),
+            "nrmse": self.nrmse if np.isfinite(self.nrmse) else None,
             "nrmse_full": self.nrmse_full,
             "max_error_um": self.max_error_um,
-            "log_score": finite(self.log_score),
+            "log_score": self.log_score if np.isfinite(self.log_score) else None,
             "crps_um": self.crps_um,
             **{f"width_{level}_um": width for level, width in self.width_um.items()},
             **{f"interval_score_{level}_um": s for level, s in self.interval_score_um.items()},
@@ -102,7 +99,7 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
     InputError
         If there is no measurement to judge by, or no sample from ``scored_from`` on.
     """
-    if bands.measured is None or bands.crps is None:
+    if bands.measured is None or bands.crps is None or bands.log_score is None:
         raise InputError(
             f"{bands.name}: nothing was measured, so the bands cannot be scored; "
             "give a record with a displacement"
@@ -144,13 +141,13 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
         nrmse=rmse / extent if extent > 0 else np.nan,
         nrmse_full=rmse / full if full else None,
         max_error_um=float(np.abs(residual).max()),
+        log_score=float(bands.log_score[rows].mean()),
         crps_um=float(bands.crps[rows].mean()),
         width_um=width,
         interval_score_um=interval_score,
         coverage=coverage,
         coverage_error=error,
         worst_second=worst,
-        log_score=None if bands.log_score is None else float(bands.log_score[rows].mean()),
     )
 
 

@@ -65,6 +65,7 @@ def scores(truth: bool = True) -> Scores:
     return Scores(
         nrmse=0.0123,
         max_error_um=5.52,
+        log_score=-1.32,
         crps_um=0.817,
         width_um={50: 2.11, 90: 5.12, 95: 6.13},
         interval_score_um={50: 5.21, 90: 8.22, 95: 9.23},

@@ -96,6 +96,7 @@ def normal_bands(
         upper={key: mean + width for key, width in half.items()},
         pit=None if measured is None else ndtr((measured - mean) / sds["sensor"]),
         crps=None if measured is None else np.abs(measured - mean),
+        log_score=None if measured is None else -np.abs(measured - mean),
         interval=float(time[1] - time[0]),
         training=training,
     )
