@@ -109,14 +109,13 @@ def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
 
 def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float]) -> float:
     """Return a parameter's prior sd around its value in ``values``."""
-    assert parameter.prior is not None
     columns = {name: np.array([value]) for name, value in values.items()}
     lower, upper = parameter.declared.limits(prior.seen(columns, parameter.record))
     if np.isfinite(lower).all() and np.isfinite(upper).all():
         # What the bounds leave to a parameter of which nothing else is known.
         return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))
     # Half of the central 68 % stands for the sd: some distributions have none.
-    low, high = (float(v) for v in parameter.prior.frozen.ppf([0.16, 0.84]))
+    low, high = (float(v) for v in parameter.distribution.frozen.ppf([0.16, 0.84]))
     if parameter.positive:
         return float(values[parameter.name] * np.log(high / low) / 2)
     return (high - low) / 2

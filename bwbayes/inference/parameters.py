@@ -99,6 +99,12 @@ class Parameter:
         """Whether it lies above zero."""
         return self.declared.positive
 
+    @property
+    def distribution(self) -> Distribution:
+        """The prior of a parameter that is free."""
+        assert self.prior is not None
+        return self.prior
+
     def above_floor(self, x: FloatArray) -> BoolArray:
         """Tell which values are not too low. Some parameters reach their floor."""
         return np.asarray(x >= self.floor if self.declared.reaches_floor else x > self.floor)
@@ -106,30 +112,26 @@ class Parameter:
     @cached_property
     def support(self) -> tuple[float, float]:
         """Where prior, bounds and sign allow the parameter."""
-        assert self.prior is not None
-        low, high = self.prior.support
+        low, high = self.distribution.support
         return max(low, self.lower, self.floor), min(high, self.upper)
 
     @property
     def formula(self) -> Scored | None:
         """The formula that maps normal scores to values, if there is one and nothing cuts it."""
-        assert self.prior is not None
-        form, uncut = self.prior.form, self.support == self.prior.support
+        form, uncut = self.distribution.form, self.support == self.distribution.support
         free = self.declared.bounds is None
         return form if isinstance(form, Scored) and uncut and free else None
 
     @cached_property
     def mass_between(self) -> tuple[float, float]:
         """The prior's cumulative probability at both ends of the support."""
-        assert self.prior is not None
-        ends = scipy.special.ndtr(self.prior.form.score(np.array(self.support)))
+        ends = scipy.special.ndtr(self.distribution.form.score(np.array(self.support)))
         return float(ends[0]), float(ends[1])
 
     def draw(self, generator: np.random.Generator, size: int) -> FloatArray:
         """Draw from its own prior between its bounds, whatever others are, (size,)."""
-        assert self.prior is not None
         uniform = generator.uniform(*self.mass_between, size)
-        return np.asarray(self.prior.frozen.ppf(uniform), dtype=np.float64)
+        return np.asarray(self.distribution.frozen.ppf(uniform), dtype=np.float64)
 
 
 class JointPrior:
@@ -214,8 +216,7 @@ class JointPrior:
         result = np.zeros(free.shape[0])
         inside = np.ones(free.shape[0], dtype=bool)
         for parameter in self.free:
-            assert parameter.prior is not None
-            result += parameter.prior.frozen.logpdf(values[parameter.name])
+            result += parameter.distribution.frozen.logpdf(values[parameter.name])
             x, (low, high) = values[parameter.name], self._limits(parameter, values)
             inside &= (low <= x) & (x <= high) & parameter.above_floor(x)
         inside &= self._possible(values)
@@ -244,9 +245,8 @@ class JointPrior:
         values = self._values(free)
         scores = []
         for parameter in self.free:
-            assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            scores.append(parameter.prior.to_normal(values[parameter.name], *bounds))
+            scores.append(parameter.distribution.to_normal(values[parameter.name], *bounds))
         return np.clip(np.stack(scores, axis=1), -FARTHEST, FARTHEST)
 
     def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -272,9 +272,8 @@ class JointPrior:
         values.update(zip(self.free_names, free, strict=True))
         room = np.ones(coordinates.shape[0])
         for row, parameter in self._cut:
-            assert parameter.prior is not None
             bounds = self._limits(parameter, values)
-            free[row], between = parameter.prior.from_normal(safe[row], *bounds)
+            free[row], between = parameter.distribution.from_normal(safe[row], *bounds)
             room *= between
         # Rounding may put a positive parameter on its open bound, where there is no model.
         possible &= ((free > self._above) & (free >= self._at_least)).all(axis=0)

@@ -84,9 +84,7 @@ class Dataset:
     @property
     def span(self) -> Span:
         """The voltages that the actuator may have seen, V."""
-        span = self.actuator.within(self.voltage).span
-        assert span is not None
-        return span
+        return self.actuator.range_of(self.voltage)
 
     @property
     def extent(self) -> float:

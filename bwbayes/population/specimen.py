@@ -156,8 +156,6 @@ def _log_prior(
     at some quantiles of x, and on straight lines between those.
     """
     places, n_others = 33, 400
-    marginal = prior.free[column].prior
-    assert marginal is not None
     others = np.stack([p.draw(generator, n_others) for p in prior.free], axis=1)
     at = np.quantile(x, np.linspace(0, 1, places))
     tried = np.tile(others, (places, 1))
@@ -165,5 +163,6 @@ def _log_prior(
     inside = np.isfinite(prior.log_density(tried)).reshape(places, n_others)
     # A place where draws of the posterior lie has not nothing.
     possible = np.maximum(np.mean(inside, axis=1), 0.5 / n_others)
-    density: FloatArray = marginal.frozen.logpdf(x) + np.interp(x, at, np.log(possible))
+    density: FloatArray = prior.free[column].distribution.frozen.logpdf(x)
+    density += np.interp(x, at, np.log(possible))
     return density

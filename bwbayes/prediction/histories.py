@@ -85,13 +85,12 @@ class States:
         if likelihood.from_rest:
             self.ordered = np.zeros((4, len(theta)))
             return
-        actuator = likelihood.actuator
-        assert actuator.span is not None
+        actuator, span = likelihood.actuator, likelihood.actuator.range_of(likelihood.voltage)
         column, voltage = self.table.columns(theta), float(likelihood.voltage[0])
-        low, high = actuator.hysteresis.reachable(column, voltage, actuator.span)
+        low, high = actuator.hysteresis.reachable(column, voltage, span)
         self.ordered = np.stack([low, low, high, high])
         if single:
-            ranges = narrower(actuator.span, further=(1.0,))
+            ranges = narrower(span, further=(1.0,))
             states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
             self.ordered = np.sort(np.concatenate(states), axis=0)
             self.ordered[0] = np.minimum(self.ordered[0], low)

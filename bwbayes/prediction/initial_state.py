@@ -183,7 +183,7 @@ def started(
         training.noise,
         posterior.engine,
         start.from_rest,
-        (span.high - span.low) / 2,
+        span.half,
         # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
         training.extent if own_offset else 0.0,
     )
