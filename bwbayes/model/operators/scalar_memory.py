@@ -50,10 +50,6 @@ class OneState(Operator):
         """Return d."""
         return column["d"]
 
-    def opening(self, column: Values, half_range: float) -> FloatArray | None:
-        """Return β U, if there is a β."""
-        return column["beta"] * half_range if "beta" in column else None
-
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
