@@ -134,6 +134,16 @@ class Forgetful(TanhLoop):
         return super().parameters[:-1]
 
 
+class Unbounded(TanhLoop):
+    """Misspells another parameter in the bounds of one."""
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Those of the loop."""
+        slope, *others = super().parameters
+        return replace(slope, bounds=lambda earlier: (earlier["alhpa"], np.inf)), *others
+
+
 class Stranger:
     """Is no operator."""
 
@@ -234,6 +244,7 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
         (f"{HERE}:Stranger", "makes a Stranger, which is not a bwbayes.model.operator.Operator"),
         (f"{HERE}:Incomplete", "cannot be made: Can't instantiate abstract class Incomplete"),
         (f"{HERE}:Forgetful", 'declares d, alpha, width; the last must be "initial"'),
+        (f"{HERE}:Unbounded", "ask for 'alhpa', which it does not declare; declare it"),
     ],
 )
 def test_what_is_no_operator_is_one_clear_line(
