@@ -82,9 +82,10 @@ class Recursion:
         return np.zeros((self.numerator.shape[0], self.numerator.shape[1] - 1))
 
     def run(self, drive: FloatArray, state: FloatArray) -> FloatArray:
-        """Filter ``drive`` (models, samples) in place from ``state``, which moves on with it."""
-        if drive.shape[1] == 0:
-            return drive  # lfilter would leave the state undefined
+        """Filter ``drive`` (models, samples) in place from ``state``, which moves on with it.
+
+        There is a sample at least.
+        """
         for row, values in enumerate(drive):
             values[:], state[row] = scipy.signal.lfilter(
                 self.numerator[row], self.denominator[row], values, zi=state[row]
@@ -122,11 +123,6 @@ class Sections:
 
     recursions: tuple[Recursion, ...]
     gains: tuple[FloatArray, ...]
-
-    @property
-    def unknowns(self) -> int:
-        """How many numbers say in which state the sections are."""
-        return sum(recursion.unknowns for recursion in self.recursions)
 
     @property
     def taps(self) -> Taps:

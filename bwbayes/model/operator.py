@@ -45,8 +45,6 @@ def narrower(span: Span, further: tuple[float, ...] = (0.8, 1.0, 1.25)) -> tuple
     ``further`` is how far up they go, as parts of how far down.
     """
     low, center, half = span.low, span.middle, span.half
-    if not half > 0:
-        return (span,)
     # Fewer ranges leave steps that show; more take longer.
     ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in further]
     return tuple(

@@ -154,15 +154,13 @@ class Loops:
         }
 
 
-def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS) -> Loops:
+def measure_loops(posterior: Posterior, draws: FloatArray) -> Loops:
     """Measure the loops of every draw (draws, free), in the range of the records' voltages.
-
-    ``points`` is the number of voltages along each branch.
 
     Raises
     ------
     InputError
-        A voltage that does not change, or an even number of points.
+        A voltage that does not change.
     """
     _, single, record_draws = next(posterior.each(draws))
     dataset = single.only
@@ -171,10 +169,10 @@ def measure_loops(posterior: Posterior, draws: FloatArray, points: int = POINTS)
     low = min(float(np.min(record.voltage)) for record in posterior.datasets)
     high = max(float(np.max(record.voltage)) for record in posterior.datasets)
     quarter = (high - low) / 4
-    voltage, curve = initial_curve(actuator, column, low, high, points)
+    voltage, curve = initial_curve(actuator, column, low, high)
     return Loops(
-        Loop.of(steady_loop(actuator, column, low, high, points)),
-        Loop.of(steady_loop(actuator, column, low + quarter, high - quarter, points)),
+        Loop.of(steady_loop(actuator, column, low, high)),
+        Loop.of(steady_loop(actuator, column, low + quarter, high - quarter)),
         voltage,
         Curve.of(curve),
     )

@@ -97,17 +97,12 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
     Raises
     ------
     InputError
-        If there is no measurement to judge by, or no sample from ``scored_from`` on.
+        If there is no measurement to judge by, or no reading from ``scored_from`` on.
     """
     if bands.measured is None or bands.crps is None or bands.log_score is None:
         raise InputError(
             f"{bands.name}: nothing was measured, so the bands cannot be scored; "
             "give a record with a displacement"
-        )
-    if bands.scored_from >= bands.measured.size:
-        raise InputError(
-            f"{bands.name}: no sample is left after the lead-in of "
-            f"{bands.scored_from * bands.interval:g} s; shorten the lead-in or give a longer record"
         )
     rows = judged(bands, bands.measured)
     if not rows.any():
