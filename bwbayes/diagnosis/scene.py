@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -182,7 +183,7 @@ class Scene:
         """Range of the readings, um."""
         return self.posterior.only.extent
 
-    @property
+    @cached_property
     def innovations(self) -> FloatArray:
         """Innovations of the fit (readings,), in sds."""
         return innovations(self.posterior, self.fit.free).white
