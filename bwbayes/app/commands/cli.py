@@ -70,15 +70,6 @@ for command in (compensate, export, track, compare, design, config, models):
     cli.add_command(command)
 
 
-def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
-    """Ask to stop once more where the first request fell into a callback, which cannot raise."""
-    if ignored.exc_type is KeyboardInterrupt:
-        # Later: raised in here it would be lost too.
-        threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
-    else:
-        sys.__unraisablehook__(ignored)
-
-
 def _failure(error: BaseException) -> tuple[str, int]:
     """Return the line that says what went wrong, and the exit status; raise what is a defect."""
     text, status = str(error), ExitStatus.INVALID_INPUT
@@ -119,7 +110,16 @@ def main() -> None:
     gc.set_threshold(50_000)
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.unraisablehook = _interrupt_again
+
+    def interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+        # The request fell into a callback, which cannot raise.
+        if ignored.exc_type is KeyboardInterrupt:
+            # Later: raised in here it would be lost too.
+            threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
+        else:
+            sys.__unraisablehook__(ignored)
+
+    sys.unraisablehook = interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"bwbayes: {as_typed(str(message))}\n"
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
