@@ -112,8 +112,8 @@ class Problem:
             for (name, source), record in zip(sources.items(), self.records.values(), strict=True)
             if source.outliers is not None
         ]
-        for name in self.validations:
-            remarks += [f"{name}: {finding.note}" for finding in self.extrapolations(name)]
+        for name, beyond in self.extrapolations.items():
+            remarks += [f"{name}: {finding.note}" for finding in beyond]
         return tuple(remarks)
 
     @property
@@ -158,15 +158,15 @@ class Problem:
         records = {name: validation.record for name, validation in self.validations.items()}
         return {name: record for name, record in records.items() if record is not None}
 
-    def extrapolations(self, name: str) -> list[Finding]:
-        """Return in what the drive of the band of that name leaves the training data."""
-        validation = self.validations.get(name)
-        if validation is None:
-            return []
-        record = validation.record or self.records[validation.of]
-        windows = validation.windows
-        window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
-        return beyond_training(self.posterior, record.voltage, record.interval, window)
+    @cached_property
+    def extrapolations(self) -> dict[str, list[Finding]]:
+        """In what the drive of each validation leaves the training data, by its name."""
+        found = {}
+        for name, validation in self.validations.items():
+            record, windows = validation.record or self.records[validation.of], validation.windows
+            window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
+            found[name] = beyond_training(self.posterior, record.voltage, record.interval, window)
+        return found
 
     def reconfigured(
         self, changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]

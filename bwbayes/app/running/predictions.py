@@ -191,7 +191,7 @@ def predictions(
             bands += predict_windows(alone, own_draws, record, windows, source, more)
     for name, held_out in problem.validations.items():
         if held_out.record is not None:
-            beyond = problem.extrapolations(name)
+            beyond = problem.extrapolations[name]
             bands.append(_of_another(problem, chosen, held_out, name, beyond, more))
     return tuple(bands)
 
@@ -241,7 +241,7 @@ def judged(
     verdicts = {}
     for predicted in bands:
         explained = explanations.get(records[predicted.name], ()) if predicted.training else ()
-        beyond = problem.extrapolations(predicted.name)
+        beyond = problem.extrapolations.get(predicted.name, ())
         verdict = assess(predicted, background, explanations=explained, beyond=beyond)
         if verdict is not None:
             verdicts[predicted.name] = verdict
