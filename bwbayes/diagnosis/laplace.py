@@ -84,12 +84,14 @@ class LocalFit:
 
     def error(self, windows: Sequence[slice]) -> float:
         """Root mean square, um, of what it misses of the readings in windows; nan of none."""
+        if not windows:
+            return np.nan
         record = self.posterior.only
         likelihood = self.posterior.likelihood
         model = likelihood.table.actuator(self.posterior.prior.theta(self.free[np.newaxis]))
         simulate = partial(likelihood.simulate, model)
         missed = record.displacement - self.effect.apply(simulate, record.voltage, self.sizes)[0]
-        inside = np.concatenate([np.empty(0), *(missed[window] for window in windows)])
+        inside = np.concatenate([missed[window] for window in windows])
         return float(np.sqrt(np.nanmean(inside**2))) if np.isfinite(inside).any() else np.nan
 
 

@@ -188,6 +188,11 @@ class Scene:
         """Innovations of the fit (readings,), in sds."""
         return innovations(self.posterior, self.fit.free).white
 
+    @cached_property
+    def held_out_error(self) -> float:
+        """Root mean square of what the fit misses of the readings held out, um; nan of none."""
+        return self.fit.error(self.held_out)
+
     def clock(self, time: float) -> str:
         """Write a time since the first reading as one of the record, s."""
         first = self.begin + self.interval * float(self.posterior.only.readings.rows[0])
@@ -249,7 +254,7 @@ class Scene:
             fix,
             nats=fit.log_evidence - self.fit.log_evidence - cost,
             rmse=(self.fit.rmse, fit.rmse),
-            held_out=(self.fit.error(self.held_out), fit.error(self.held_out)),
+            held_out=(self.held_out_error, fit.error(self.held_out)),
             shift=shift,
             **facts,
         )
