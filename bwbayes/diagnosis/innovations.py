@@ -73,6 +73,25 @@ class Innovations:
         lags = range(1, min(40, centered.size - 1) + 1)
         return np.array([np.sum(centered[lag:] * centered[:-lag]) / total for lag in lags])
 
+    def octaves(self) -> tuple[FloatArray, FloatArray, float]:
+        """Return the edges (octaves + 1,) of octaves, Hz, the innovations' power, and a p value.
+
+        The power (octaves,) is over what white innovations of the same variance have. The p value
+        is that of Bartlett's test: how likely chance makes powers so unequal. The logarithm of its
+        likelihood ratio is about what another noise model could gain, nats.
+        """
+        count = self.white.size
+        amplitude = np.fft.rfft(self.white - np.mean(self.white))[1 : (count + 1) // 2]
+        # The lowest has eight frequencies; what is left at the top is part of the last one.
+        octaves = max(int(np.log2(max(amplitude.size, 1) / 6)), 0)
+        cuts = 8 * 2 ** np.arange(octaves)
+        parts = np.split(np.stack([amplitude.real, amplitude.imag]), cuts, axis=1)
+        power = np.array([np.mean(part**2) for part in parts])
+        edges = np.array([0, *cuts, amplitude.size]) / (count * self.interval)
+        total = np.mean(amplitude.real**2 + amplitude.imag**2) / 2
+        test = scipy.stats.bartlett(*map(np.ravel, parts)) if octaves else None
+        return edges, power / total, 1.0 if test is None else float(test.pvalue)
+
     def by(self, quantity: str) -> tuple[tuple[str, FloatArray], ...]:
         """Return innovations by the voltage's "rate", "voltage" or "direction", each with a name.
 
@@ -141,20 +160,20 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
     if series.white.size < 100:  # these show nothing
         return ()
     sides = [_one_sided(series, quantity) for quantity in ("rate", "voltage", "direction")]
-    return tuple(chain(_correlated(series), *sides))
+    return tuple(chain(_colored(series), *sides))
 
 
-def _correlated(series: Innovations) -> Iterator[Finding]:
-    """Find an autocorrelation beyond chance, and of at least 0.1."""
-    correlation = series.correlation
-    bound = scipy.stats.norm.isf(ALARM / 2 / correlation.size) / np.sqrt(series.white.size)
-    lag = int(np.argmax(np.abs(correlation)))
-    if abs(correlation[lag]) > max(bound, 0.1):
-        distance = series.time[lag + 1] - series.time[0]
+def _colored(series: Innovations) -> Iterator[Finding]:
+    """Find the octave whose power is least that of white innovations, by a fifth at least."""
+    frequency, power, p = series.octaves()
+    octave = int(np.argmax(np.diff(frequency) * (power - 1 - np.log(power))))
+    if p < ALARM and not 0.8 < power[octave] < 1.25:
+        low, high = frequency[octave : octave + 2]
         yield Finding(
             "noise model",
-            f"innovations {distance:.3g} s apart correlate by {correlation[lag]:.2f}",
-            "check whether the sensor filters; else the discrepancy does not forget exponentially",
+            f"between {low:.3g} and {high:.3g} Hz the innovations have {power[octave]:.2g} times "
+            "the power that white ones have",
+            "check whether the sensor filters; else try what explains it: bwbayes run --improve",
         )
 
 

@@ -1,9 +1,9 @@
 """Where bands fail, the likely cause's fix is followed, and the plant's next record is covered.
 
-Each of the plants of :mod:`tests.diagnosis.plants` is fitted with the good model. Its likely cause
-is looked up, and what the fix says is done: lines of config are set, channels are shifted, or the
-plant is measured again without the cause, if it has that. Then the next record of the plant,
-another drive that is cut from a running one, is predicted.
+Each of the plants of :mod:`tests.diagnosis.plants` is fitted with the good model and the noise that
+it has evidence for. Its likely cause is looked up, and what the fix says is done: lines of config
+are set, channels are shifted, or the plant is measured again without the cause, if it has that.
+Then the next record of the plant, another drive that is cut from a running one, is predicted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.explaining import explained
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import likely_causes
@@ -27,7 +27,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, bench
 from tests.measured import keep
-from tests.prediction.runs import covered, judge
+from tests.prediction.runs import covered, judge, problem_of
 
 SEEDS, GOOD = range(10, 30), 100
 
@@ -115,13 +115,13 @@ def study(kind: str, seed: int, folder: Path) -> Outcome:
     """Fit a plant, follow the leading cause's fix, if there is one, and predict the next record."""
     put(bench(kind, (6, seed)).records, folder)
     config = parse(CONFIG, "config")
-    problem = resolve(config, folder)
+    problem = problem_of(config, folder)
     source = np.random.default_rng((6, seed))
     point = pointfit.fit(problem.posterior, source)
     found = likely_causes(explained(problem, "record", point.optima, thorough=kind != "good"))
     if found:
         config = followed(config, problem, found[0], kind, seed, folder)
-    judged = judge(resolve(config, folder), source, again=False)
+    judged = judge(problem_of(config, folder), source, again=False)
     return Outcome(
         tuple(cause.kind for cause in found),
         bool({cause.kind for cause in found} & CAUSES.get(kind, set())),

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from arviz_stats.base import array_stats  # not in an __all__
 
-from bwbayes.app.config.config import parse
+from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, explained
@@ -50,9 +50,9 @@ class Judged:
         return self.draws[:, self.problem.posterior.names.index(name)]
 
 
-def problem_of(text: str, folder: Path) -> Problem:
-    """Resolve a config's text, its files in ``folder``; its noise is chosen as a run does it."""
-    config = parse(text, "config")
+def problem_of(config: str | Config, folder: Path) -> Problem:
+    """Resolve a config or its text, files in ``folder``; its noise is chosen as a run does it."""
+    config = config if isinstance(config, Config) else parse(config, "config")
     problem = resolve(config, folder)
     if config.model.noise != "auto":
         return problem

@@ -174,7 +174,7 @@ class ModelConfig(ActuatorConfig):
     """What the voltage does between samples: straight lines (first), held (zero), or held if it is
     a command (auto).
     """
-    noise: str = key("discrepancy", example='"auto"')
+    noise: str = key("auto", example='"smooth"')
     """The model of the residual; auto: the one that a single record has evidence for."""
     per_record: Texts = key([], example='["sensor_sd"]')
     """Parameters that each of several records has of its own, besides initial and offset."""

@@ -2,7 +2,8 @@
 
 :func:`chosen_noise` takes the noise that a record has evidence for: each is fitted from the mode of
 the rough one, and taken if its evidence leads by odds of twenty to one: the rough discrepancy
-claims least, because it has white noise as a limit, and corners that a smooth one has not.
+claims least, because it has white noise as a limit, and corners that a smooth one has not. What
+another noise could gain shows in the rough one's innovations, which are cheap to look at.
 
 :func:`improve_model` gives a model the parts for which its record has evidence. Each round fits the
 model, explains its readings better in every way there is, and takes the part of the model that
@@ -23,6 +24,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
+from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.errors import InputError
@@ -30,6 +32,9 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
+
+# Innovations less likely than this by chance may be explained by another noise.
+COLORED = 0.05
 
 
 def explained(
@@ -75,7 +80,8 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy; of several
-    records that stays.
+    records that stays. White noise is always compared; any other has nothing to gain where the
+    innovations are white already.
     """
     default = "discrepancy"
     if len(problem.records) > 1:
@@ -83,7 +89,8 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     posterior = problem.posterior
     rough = climb(posterior, point.optima)
     worth = {default: rough.log_evidence}
-    for noise in NOISES.keys() - worth:
+    p = innovations(posterior, rough.free).octaves()[2]
+    for noise in [n for n in NOISES if n not in worth and (n == "white" or p < COLORED)]:
         other = problem.reconfigured({"noise": noise}, {})
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         # What only the other noise has starts at its prior's median.
@@ -93,12 +100,14 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     best = max(worth, key=lambda noise: worth[noise])
     if worth[best] < worth[default] + TIED:
         best = default
-    against = ", ".join(
-        f"{worth[best] - worth[noise]:+.3g} nats against {noise}"
-        for noise in NOISES
+    against = [
+        f"{worth[best] - nats:+.3g} nats against {noise}"
+        for noise, nats in worth.items()
         if noise != best
-    )
-    return best, f"noise: {best} ({against})"
+    ]
+    if p >= COLORED:
+        against.append(f"innovations are white, p = {p:.2g}")
+    return best, f"noise: {best} ({', '.join(against)})"
 
 
 def improve_model(
