@@ -255,7 +255,9 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
     middle = (rising[:, -1] + falling[:, 0]) / 2
     # A displacement may fall with the voltage.
     sign = np.where(size < 0, -1.0, 1.0)[:, np.newaxis]
-    up, down = (_crossing(voltage, sign * (x - middle[:, np.newaxis])) for x in (rising, falling))
+    up, down = (
+        first_passage(voltage, sign * (x - middle[:, np.newaxis]), 0.0) for x in (rising, falling)
+    )
     through_zero = bool(voltage[0] < 0 < voltage[-1])
     return {
         "range_um": size,
@@ -290,12 +292,15 @@ def _at_zero(voltage: FloatArray, branch: FloatArray) -> FloatArray:
     return between
 
 
-def _crossing(voltage: FloatArray, branch: FloatArray) -> FloatArray:
-    """Return the voltage (models,) at which a branch (models, points) first passes zero upwards."""
-    after = np.maximum(np.argmax(branch >= 0, axis=1), 1)
-    rows = np.arange(after.size)
-    below, above = branch[rows, after - 1], branch[rows, after]
-    # A model that does not move passes everywhere.
-    step = np.where(above > below, above - below, 1.0)
-    crossed: FloatArray = voltage[after] - above / step * (voltage[after] - voltage[after - 1])
-    return crossed
+def first_passage(axis: FloatArray, values: FloatArray, level: float) -> FloatArray:
+    """Return where on an axis (points,) values (models, points) first reach a level, (models,).
+
+    On straight lines between the points; nan where they never do.
+    """
+    reached = values >= level
+    after = np.argmax(reached, axis=1)
+    rows, before = np.arange(after.size), np.maximum(after - 1, 0)
+    low, high = values[rows, before], values[rows, after]
+    share = np.where(after > 0, (level - low) / np.where(high > low, high - low, 1.0), 0.0)
+    at = axis[before] + share * (axis[after] - axis[before])
+    return np.where(reached.any(axis=1), at, np.nan)

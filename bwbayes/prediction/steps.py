@@ -17,7 +17,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.prediction.loops import Curve, Estimate
+from bwbayes.prediction.loops import Curve, Estimate, first_passage
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 
@@ -120,7 +120,8 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     estimates["level_um"] = Estimate.of(settled)
     if actuator.filter.parameters:
         share = without / settled[:, np.newaxis]
-        estimates["rise_s"] = Estimate.of(_passes(time, share, 0.9) - _passes(time, share, 0.1))
+        begin, end = (np.exp(first_passage(np.log(time), share, part)) for part in (0.1, 0.9))
+        estimates["rise_s"] = Estimate.of(end - begin)
         overshoot = 100 * np.maximum(np.max(share, axis=1) - 1, 0.0)
         estimates["overshoot_percent"] = Estimate.of(overshoot)
     crept = None
@@ -160,20 +161,3 @@ def _responses(
         moved = [gain * u * by for gain, u, by in zip(sections.gains, units, steps, strict=True)]
         parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))
     return settled, parts[0], parts[1]
-
-
-def _passes(time: FloatArray, fraction: FloatArray, level: float) -> FloatArray:
-    """Return the times (models,) at which responses (models, times) first pass a level.
-
-    On straight lines over the log of the time; before the first of the times, that; beyond the
-    last, nan.
-    """
-    passed = fraction >= level
-    after = np.argmax(passed, axis=1)
-    rows = np.arange(after.size)
-    before = np.maximum(after - 1, 0)
-    low, high = fraction[rows, before], fraction[rows, after]
-    share = np.where(after > 0, (level - low) / np.where(high > low, high - low, 1.0), 0.0)
-    logs = np.log(time)
-    at = np.exp(logs[before] + share * (logs[after] - logs[before]))
-    return np.where(passed.any(axis=1), at, np.nan)
