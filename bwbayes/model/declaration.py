@@ -52,6 +52,11 @@ class Ranges:
         return self.displacement / self.voltage
 
     @property
+    def farthest(self) -> float:
+        """The largest distance of the voltage from zero, V."""
+        return self.voltage + abs(self.bias)
+
+    @property
     def reach(self) -> float:
         """What the voltage's distance from zero may add to offset and hysteresis, um."""
         return self.displacement + self.gain * abs(self.bias)

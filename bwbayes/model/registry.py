@@ -122,7 +122,7 @@ def made[Part](
 
 
 def _check_parameters(where: str, name: str, operator: Operator) -> None:
-    """Refuse an operator from outside whose state before a record has no place."""
+    """Refuse an operator from outside that lacks a place for its state, or what bounds ask for."""
     names = [declared.name for declared in operator.parameters]
     if len(set(names)) < len(names):
         raise InputError(f"{where}: {name!r} declares a parameter twice: {', '.join(names)}")

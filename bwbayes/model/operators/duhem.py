@@ -13,7 +13,6 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.model.declaration import (
-    Context,
     Declaration,
     Values,
     normal,
@@ -81,7 +80,7 @@ class Duhem(OneState):
             "growth of the hysteresis with the voltage's square",
             lambda context: Distribution(
                 "halfnormal",
-                {"scale": rounded(0.3 * context.ranges.gain / _farthest(context) ** 2)},
+                {"scale": rounded(0.3 * context.ranges.gain / context.ranges.farthest**2)},
             ),
             floor=0.0,
             reaches_floor=True,
@@ -106,7 +105,7 @@ class Duhem(OneState):
             "um/V^2",
             r"\alpha_1",
             "growth of the hysteresis with the voltage",
-            lambda context: normal(0.0, 0.2 * context.ranges.gain / _farthest(context)),
+            lambda context: normal(0.0, 0.2 * context.ranges.gain / context.ranges.farthest),
             bounds=_alpha1_bounds,
             stated_bounds="beta^2 (4 alpha alpha2 - alpha1^2) >= alpha2^2",
             loop=True,
@@ -176,14 +175,11 @@ def _coefficient(name: str, power: int, label: str, description: str) -> Declara
         f"um/V^{power}",
         label,
         description,
-        lambda context: normal(0.0, 0.1 * context.ranges.gain / _farthest(context) ** (power - 1)),
+        lambda context: normal(
+            0.0, 0.1 * context.ranges.gain / context.ranges.farthest ** (power - 1)
+        ),
         loop=True,
     )
-
-
-def _farthest(context: Context) -> float:
-    """Return the largest |u| of the record, V."""
-    return context.ranges.voltage + abs(context.ranges.bias)
 
 
 def _alpha1_bounds(earlier: Values) -> tuple[ArrayLike, ArrayLike]:

@@ -37,7 +37,7 @@ DENSITY = (
         "V",
         "u_s",
         "voltage beyond which relays become rare",
-        lambda ranges: 2 * (ranges.voltage + abs(ranges.bias)),
+        lambda ranges: 2 * ranges.farthest,
     ),
 )
 
