@@ -12,22 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import (
-    Declaration,
-    Values,
-    normal,
-    refuse,
-    rounded,
-)
+from bwbayes.model.declaration import Declaration, Values, normal, refuse, rounded
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
-from bwbayes.model.operators.scalar_memory import (
-    OneState,
-    alpha,
-    beta,
-    d,
-    initial,
-)
+from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
