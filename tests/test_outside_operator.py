@@ -26,6 +26,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, noise_model
+from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
 from bwbayes.model.elementwise import select
@@ -244,7 +245,6 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
         (f"{HERE}:Stranger", "makes a Stranger, which is not a bwbayes.model.operator.Operator"),
         (f"{HERE}:Incomplete", "cannot be made: Can't instantiate abstract class Incomplete"),
         (f"{HERE}:Forgetful", 'declares d, alpha, width; the last must be "initial"'),
-        (f"{HERE}:Unbounded", "ask for 'alhpa', which it does not declare; declare it"),
     ],
 )
 def test_what_is_no_operator_is_one_clear_line(
@@ -269,6 +269,13 @@ def test_what_is_no_operator_is_one_clear_line(
     (line,) = printed.err.splitlines()
     assert line.startswith("bwbayes: model.hysteresis: ")
     assert said in line
+
+
+def test_bounds_that_ask_for_what_no_part_declares_are_refused() -> None:
+    actuator = Actuator("lag", "first", 1e-3, Unbounded())
+    said = "model: the bounds of d ask for 'alhpa', which no part here declares; declare it"
+    with pytest.raises(InputError, match=f"^{said}$"):
+        ParameterTable(actuator, noise_model("white", 1e-3))
 
 
 def test_an_option_that_an_operator_from_outside_does_not_have_is_refused() -> None:

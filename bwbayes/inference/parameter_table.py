@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
+
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.state_space import Noise
@@ -48,7 +50,7 @@ class ParameterTable:
     Raises
     ------
     InputError
-        A parameter that no part has, or that is to be both.
+        A parameter that no part has, or that is to be both; bounds that ask for one.
     """
 
     __repr__ = brief
@@ -72,6 +74,18 @@ class ParameterTable:
                 f"model.per_record: {repeated[0]!r} is in model.shared too; "
                 "remove it from one of them"
             )
+        every = {name: np.ones(1) for name in plain}
+        for declaration in self.declarations:
+            if declaration.bounds is None:
+                continue
+            try:
+                with np.errstate(all="ignore"):
+                    declaration.bounds(every)
+            except KeyError as unknown:
+                raise InputError(
+                    f"model: the bounds of {declaration.name} ask for {unknown}, which no part "
+                    "here declares; declare it"
+                ) from None
 
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:

@@ -11,8 +11,6 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
 from bwbayes.model.operator import Operator
@@ -122,7 +120,7 @@ def made[Part](
 
 
 def _check_parameters(where: str, name: str, operator: Operator) -> None:
-    """Refuse an operator from outside that lacks a place for its state, or what bounds ask for."""
+    """Refuse an operator from outside whose state before a record has no place."""
     names = [declared.name for declared in operator.parameters]
     if len(set(names)) < len(names):
         raise InputError(f"{where}: {name!r} declares a parameter twice: {', '.join(names)}")
@@ -131,12 +129,3 @@ def _check_parameters(where: str, name: str, operator: Operator) -> None:
             f'{where}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
             'scope = "record": the state before a record'
         )
-    for declared in operator.parameters:
-        try:
-            if declared.bounds is not None:
-                declared.bounds({known: np.ones(1) for known in names})
-        except KeyError as unknown:
-            raise InputError(
-                f"{where}: the bounds of {declared.name} in {name!r} ask for {unknown}, which it "
-                "does not declare; declare it"
-            ) from None
