@@ -133,15 +133,15 @@ def level_error(seed: int) -> tuple[float, float]:
 
 
 def test_states_between_two_histories_widen_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of twelve records after any drive; without that, the planted defect, none is right.
+    """Of eight records after any drive; without that, the planted defect, none is right.
 
-    By chance the root-mean-square of twelve errors exceeds 1.6 sds in one test of 500.
+    By chance the root-mean-square of eight errors exceeds 1.6 sds in one test of 100.
     """
-    errors, covered = np.transpose([level_error(seed) for seed in range(12)])
+    errors, covered = np.transpose([level_error(seed) for seed in range(8)])
     assert np.sqrt(np.mean(errors**2)) < 1.6
     assert 0.93 < np.mean(covered) < 0.99
     monkeypatch.setattr(initial_state, "_between", lambda *_: 0.0)
-    errors, covered = np.transpose([level_error(seed) for seed in range(4)])
+    errors, covered = np.transpose([level_error(seed) for seed in range(3)])
     assert np.sqrt(np.mean(errors**2)) > 5
     assert np.mean(covered) < 0.9
 

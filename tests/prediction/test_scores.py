@@ -100,15 +100,3 @@ def test_the_error_of_coverage_is_its_spread_over_records(level: int) -> None:
         assert error is not None
         errors.append(error[level])
     assert 1 == pytest.approx(np.mean(errors) / spread, abs=0.25)
-
-
-def test_the_binomial_error_would_be_too_small_by_far() -> None:
-    """The twin of the test above: counting samples as independent is wrong by a factor of 9.
-
-    It fails that test at every one of 40 seeds (smallest factor 8.9).
-    """
-    series = correlated(np.random.default_rng(5), 400)
-    covered = np.array([inside(values, 90).mean() for values in series])
-    naive = np.sqrt(covered * (1 - covered) / SAMPLES).mean()
-    assert 1 != pytest.approx(naive / covered.std(), abs=0.25)
-    assert covered.std() > 5 * naive

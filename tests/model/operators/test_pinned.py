@@ -13,7 +13,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.operators import walls
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
-from tests.model.operators.slow import SPAN, by_integration, paths, rows, run
+from tests.model.operators.slow import by_integration, paths, rows, run
 
 BOTH = (JilesAtherton(), DomainWall())
 MODEL = {
@@ -122,18 +122,6 @@ def test_the_curve_of_langevin_and_its_inverse(y: float) -> None:
     assert float(slope[1]) == pytest.approx(steepness, rel=2e-13)
     back = walls.curve(False, walls.field_at(False, level))[0]
     np.testing.assert_allclose(back, level, rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("operator", BOTH, ids=lambda one: type(one).__name__)
-def test_without_pinning_there_is_next_to_no_loop(operator: Pinned) -> None:
-    """At the weakest pinning it is the anhysteretic curve, but for k times its slope."""
-    field = curve_of(operator)[1] * 80.0 / (0.62 * 0.7)
-    column = rows(**{**MODEL, "pinning": 1e-3 * field, "initial": 0.0})
-    voltage = 60 * np.sin(np.linspace(0, 4, 30))
-    got = run(operator, column, voltage)[0]
-    curve = [float(operator.begin(column, u, SPAN, from_rest=False).state[0]) for u in voltage]
-    np.testing.assert_allclose(got, curve, rtol=0, atol=1e-3 * field * 0.62)
-    assert np.abs(got - curve).max() > 1e-4 * field * 0.62
 
 
 @pytest.mark.parametrize(
