@@ -36,6 +36,7 @@ from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.model.step import OneStateStep
+from tests.app import small
 from tests.control.compiled import Compiled
 from tests.programs import needs
 
@@ -190,12 +191,15 @@ def config(folder: Path, kind: str) -> Config:
     return parse(CONFIG.replace("HYSTERESIS", f"{HERE}:{kind}"), "outside.toml")
 
 
-def test_an_operator_from_outside_goes_all_the_way(tmp_path: Path) -> None:
+def test_an_operator_from_outside_goes_all_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Resolved, fitted, sampled, predicted and reported; the truth is within four sds.
 
     Of three parameters, such a bound is missed by chance in one of 5,000 runs.
     """
     kind = "TanhLoop"
+    small.without_pictures(monkeypatch)
     folder = start(config(tmp_path, kind), tmp_path, tmp_path / "run")
     result = resume(folder, Console(quiet=True), workers=1)
     assert result.outcome.converged
