@@ -246,7 +246,12 @@ class VirtualTestStand:
         """
         command = self._command(drive)
         output = self.amplifier.output(command, 1 / self.sample_rate)
-        truth = self._displacement(output)
+        actuator = replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
+        theta = np.array([[self._values[name] for name in actuator.parameters]])
+        try:
+            (truth,) = actuator.displacement(theta, output, from_rest=self._from_rest)
+        except InputError as error:
+            raise InputError(f"test stand: {error}") from None
         truth = truth + self._discrepancy(output, truth, generator)
         return Record(
             voltage=command,
@@ -286,15 +291,6 @@ class VirtualTestStand:
         """Whether the voltage came straight from zero; else ``initial`` is the first state."""
         one_state = isinstance(self.actuator.hysteresis, OneState)
         return not one_state and "initial" not in self.true
-
-    def _displacement(self, output: FloatArray) -> FloatArray:
-        actuator = replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
-        theta = np.array([[self._values[name] for name in actuator.parameters]])
-        try:
-            (displacement,) = actuator.displacement(theta, output, from_rest=self._from_rest)
-        except InputError as error:
-            raise InputError(f"test stand: {error}") from None
-        return np.asarray(displacement, dtype=np.float64)
 
     def _discrepancy(
         self, output: FloatArray, displacement: FloatArray, generator: np.random.Generator
