@@ -137,6 +137,10 @@ def _alone(values: FloatArray) -> FloatArray:
     return matrices
 
 
+# Below it is an Ornstein-Uhlenbeck process to rounding, and its square is none that can be divided by.
+LEAST_QUALITY = 1e-9
+
+
 @dataclass(frozen=True)
 class SmoothNoise(Noise):
     """A smooth discrepancy, a driven oscillator: what a model misses of an actuator has no corners.
@@ -189,6 +193,7 @@ class SmoothNoise(Noise):
         White noise drives the second state.
         """
         _, process, time, quality = theta.T
+        quality = np.maximum(quality, LEAST_QUALITY)
         fast = (1 + np.sqrt(np.maximum(1 - 4 * quality**2, 0))) / (2 * time * quality**2)
         fast = np.maximum(fast, 1 / (time * quality))
         kept, passed = self.transition(theta, readings), readings * self.interval
@@ -207,12 +212,13 @@ def _oscillation(theta: FloatArray, time: float | FloatArray) -> FloatArray:
     """Return F (models, times, 2, 2) over times (times,), s; (models, 2, 2) over one."""
     shape = (-1, *[1] * np.ndim(time))
     memory, quality = (theta[:, column].reshape(shape) for column in (2, 3))
+    quality = np.maximum(quality, LEAST_QUALITY)
     frequency = 1 / (memory * quality)
     middle = frequency / (2 * quality)
     # At Q = 1/2 both rates are the same.
     apart = np.maximum(np.sqrt(np.abs(1 - 4 * quality**2)) * middle, 1e-150)
     fast = middle + apart
-    slow = frequency**2 / fast
+    slow = frequency * (frequency / fast)
     lasting = np.exp(-slow * time)
     swelled = -lasting * np.expm1(-2 * apart * time) / (2 * apart)
     first, last = lasting + slow * swelled, np.exp(-fast * time) - slow * swelled

@@ -140,6 +140,20 @@ def test_without_quality_it_is_an_ornstein_uhlenbeck_process() -> None:
     np.testing.assert_allclose(kept, (1 + 10 * time) * np.exp(-10 * time), atol=1e-12)
 
 
+@given(st.floats(-250, 250), st.floats(-280, np.log10(2) / -2), st.floats(-6, 6), st.floats(-3, 3))
+def test_any_time_and_quality_have_a_density(
+    time: float, quality: float, sd: float, sensor: float
+) -> None:
+    """Exponents of ten: where a search for the mode may step, however wild, is a number."""
+    residual = np.random.default_rng(3).standard_normal((1, 20))
+    theta = 10 ** np.array([[sensor, sd, time, quality]])
+    density = SmoothNoise(INTERVAL).log_density(theta, residual)[0]
+    assert np.isfinite(density)
+    if quality < -9:
+        rough = DiscrepancyNoise(INTERVAL).log_density(theta[:, :3], residual)[0]
+        assert density == pytest.approx(rough, rel=1e-6, abs=1e-6)
+
+
 def altered(quality: float | None, **changes: object) -> tuple[Posterior, FloatArray]:
     """Return a posterior and a place in it (free,) of that quality."""
     kind = "discrepancy" if quality is None else "smooth"
