@@ -26,6 +26,7 @@ from bwbayes.record import Record, write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
 from bwbayes.report.figures import picture_of
+from bwbayes.report.page import NO_PLOTS
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens
 from tests.app.specimens import record as specimen
@@ -49,9 +50,10 @@ SHORTER = {
     "--frequency 1 --frequency 10": "--frequency 10",
 }
 
-# So are what a command does by default, and its options: pictures are blank, models and simulated
-# actuators few.
+# So are what a command does by default, and its options: pictures are blank, pages have no plots,
+# models and simulated actuators are few.
 DEFAULTS = {
+    "bwbayes.report.figures.plots_of": lambda _: NO_PLOTS,
     "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
     "bwbayes.report.outputs.picture_of": lambda _: picture_of(Figure),
     "bwbayes.app.fit.calls.USUAL_MODELS": "linear; bouc-wen",

@@ -137,7 +137,7 @@ def _alone(values: FloatArray) -> FloatArray:
     return matrices
 
 
-# Below it is an Ornstein-Uhlenbeck process to rounding, and its square is none that can be divided by.
+# Below it is an Ornstein-Uhlenbeck process to rounding, and nothing can be divided by its square.
 LEAST_QUALITY = 1e-9
 
 
