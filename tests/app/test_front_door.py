@@ -89,7 +89,7 @@ def resolved(path: Path, naming: Naming | None = None) -> Problem:
         return resolve(propose(path, path.parent, naming).config, path.parent)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     samples=st.integers(200, 3000),
     rate=st.one_of(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bwbayes as bw
@@ -99,6 +99,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(VALUES, VALUES)
 def test_anything_is_shown_shortly(one: Any, another: Any) -> None:
     for thing in (Anything(one, another), Anything(Anything(one, another), [one] * 50)):
