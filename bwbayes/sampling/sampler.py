@@ -12,9 +12,9 @@ To judge costs as much as many steps, so each judgment predicts how long the cha
 and the next one waits until then, and until the chain is long against its autocorrelation times.
 
 A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
-from there. It is judged on the draws that it made: by Pareto k, and, until there are half of the
-draws that are to be reached, by whether effective draws grow with the steps. Where k is above 0.7,
-or where they do not, the draws are set aside, and the sampling starts again from where the
+from there. It is judged on the draws that it made: by Pareto k, and by whether effective draws grow
+with the steps. Where k is above 0.7, or where what is left would take longer than a new beginning
+at the best rate so far, the draws are set aside, and the sampling starts again from where the
 ensembles are with another proposal, which is fitted to all that was set aside, for that has been
 where the first hardly goes. If k is above 0.7 after half of the budget, differential evolution goes
 on alone, which needs about ten times the steps. So all draws that count come from one kernel, fixed
@@ -61,7 +61,9 @@ FIRST_CHECK = 2
 LARGEST_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
-# A longer chain that has fewer effective draws a step by this factor needs another proposal.
+# Another proposal is worth the draws where what is left takes this much longer, as effective draws
+# grow now, than all of it at the best rate so far; or where more draws show that this much more of
+# them are needed than fewer did.
 LARGEST_SLOWDOWN = 1.2
 
 # Of the two checks that a chain must pass: for the first, this part of the draws that are to be
@@ -206,18 +208,19 @@ class _Sampling:
         budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
         fitted_to = chain.set_aside if chain.refit else 0
         blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
-        needed, efficiency = math.inf, 0.0  # blocks, and effective draws of a block, as told so far
+        needed, best = math.inf, 0.0  # blocks, and most effective draws of a block, as told so far
+        judged = 0, 0.0  # blocks and effective draws of the last check
         while True:
             blocks = min(blocks, budget)
             while chain.blocks("sampling") < blocks:
                 self._extend("sampling")
             at_end = blocks == chain.blocks("sampling")
             drawn = chain.set_aside + blocks
-            may_refit = not passed and at_end and drawn >= 2 * fitted_to and self._is_early
+            may_refit = at_end and drawn >= 2 * fitted_to and self._is_early
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
             if required > blocks and blocks < budget:
-                if may_refit and required > LARGEST_SLOWDOWN * needed:
+                if may_refit and not passed and required > LARGEST_SLOWDOWN * needed:
                     return None
                 needed = required
                 blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
@@ -235,13 +238,12 @@ class _Sampling:
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
             first = not latest.shortcomings(plan.ess, FIRST_PART)
-            if (
-                may_refit
-                and not first
-                and LARGEST_SLOWDOWN * latest.lowest_ess < efficiency * blocks
-            ):
+            ess = latest.lowest_ess
+            growth, best = (ess - judged[1]) / (blocks - judged[0]), max(best, ess / blocks)
+            lags = (plan.ess - ess) * best > LARGEST_SLOWDOWN * plan.ess * growth
+            if may_refit and judged[0] and lags:
                 return None
-            efficiency = latest.lowest_ess / blocks
+            judged = blocks, ess
             passed = (passed or blocks) if first else 0
             blocks = chain.blocks("sampling") if done else _next_check(plan, blocks, passed, latest)
 

@@ -253,7 +253,7 @@ class SamplingConfig(ConfigTable):
     walkers: Annotated[int, Field(ge=4, multiple_of=2)] | None = key(None, example="40")
     """Walkers of each ensemble; by default 64 (numba) or 32 (NumPy), or more for many parameters.
     """
-    block: int = key(50, ge=10, example="25")
+    block: int = key(25, ge=10, example="50")
     """Steps between two looks at convergence."""
     steps: int = key(20_000, ge=1, example="40_000", called="iterations budget")
     """Largest number of steps that count."""
