@@ -17,6 +17,7 @@ from rich.console import Console
 import bwbayes as bw
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
@@ -136,6 +137,14 @@ def test_the_noise_is_chosen_by_evidence(
     # A noise that could not gain anything is not fitted, which is said.
     assert why.count("nats against") == 1 + ("innovations are white" not in why)
     assert ("innovations are white" in why) == (expected != {"smooth"})
+
+
+def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
+    write_record(thinned(records(2)[0]), tmp_path / "record.h5")
+    report = check(parse(CONFIG, "config"), tmp_path, tmp_path / "out")
+    assert "noise: smooth (" in report.about
+    page = (tmp_path / "out" / "check.html").read_text(encoding="utf-8")
+    assert "discrepancy_quality" in page
 
 
 def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """What to know of a record and a config before a run: on the screen, and as a page with pictures.
 
-:func:`check` resolves the config, looks at the record, fits a point, and says what the record
-shows to be wrong with it, each with the line of config that deals with it.
+:func:`check` resolves the config, looks at the record, fits a point with the noise that a run would
+take, and says what the record shows to be wrong with it, each with the line of config that deals
+with it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import explained, lines
+from bwbayes.app.running.explaining import chosen_noise, explained, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.report.outputs import save
@@ -37,9 +38,15 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem = resolve(config, folder)
-    posterior, seed = problem.posterior, problem.config.seed
-    point = pointfit.fit(posterior, generator(seed, "point fit"))
+    problem, seed, about = resolve(config, folder), config.seed, []
+    point = pointfit.fit(problem.posterior, generator(seed, "point fit"))
+    if config.model.noise == "auto":
+        noise, why = chosen_noise(problem, point)
+        about.append(why)
+        if noise != config.model.noise_until_chosen:
+            problem = resolve(problem.changed(config, {"noise": noise}, {}), folder)
+            point = pointfit.fit(problem.posterior, generator(seed, "point fit"))
+    posterior = problem.posterior
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
     # The findings are remarks too, but here they come with what to do.
@@ -59,7 +66,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
     facts = problem.facts.items()
-    about = "; ".join(fact for subject, fact in facts if subject.startswith("record"))
+    about = [fact for subject, fact in facts if subject.startswith("record")] + about
     pictures: list[Picture] = []
     for name, record in problem.records.items():
         training, found = problem.posterior.alone(name).only.training, problem.findings[name]
@@ -74,7 +81,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     report = Report(
         title=f"{name}, check",
         heading=f"Check: {name}",
-        about=about,
+        about="; ".join(about),
         banners=[
             Banner("note", "Problems of the record", (), problems, (), "problem", name="findings")
             if problems
@@ -82,7 +89,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
             *remarks_banner(remarks),
         ],
         blocks=[
-            Text(about, on="screen"),
+            Text("; ".join(about), on="screen"),
             *pictures,
             Section("Priors and MAP estimate", [priors, Text(meaning, note=True)], folded=False),
         ],
