@@ -86,8 +86,13 @@ def advance(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         proposed = {number: next(walk) for number, walk in enumerate(walks)}
         while proposed:
-            density = _log_density(posterior, np.concatenate([*proposed.values()]))
-            ends = np.cumsum([len(places) for places in proposed.values()])[:-1]
+            places = np.concatenate([*proposed.values()])
+            # Without a proper posterior walkers come to places that are not finite sooner or later.
+            finite = np.isfinite(places).all(axis=1)
+            density = np.full(len(places), -np.inf)
+            if finite.any():
+                density[finite] = posterior.log_density(places[finite])
+            ends = np.cumsum([len(proposal) for proposal in proposed.values()])[:-1]
             answers = zip([*proposed], np.split(density, ends), strict=True)
             proposed = {}
             for number, answer in answers:
@@ -96,20 +101,6 @@ def advance(
                 except StopIteration as end:
                     blocks[number] = end.value
     return [blocks[number] for number in range(len(walks))]
-
-
-def _log_density(posterior: Posterior, coordinates: FloatArray) -> FloatArray:
-    """Log density (models,) at coordinates (models, free), −∞ where they are not finite.
-
-    Without a proper posterior walkers go there sooner or later.
-    """
-    finite = np.isfinite(coordinates).all(axis=1)
-    if finite.all():
-        return posterior.log_density(coordinates)
-    density: FloatArray = np.full(len(coordinates), -np.inf)
-    if finite.any():
-        density[finite] = posterior.log_density(coordinates[finite])
-    return density
 
 
 class _Path:

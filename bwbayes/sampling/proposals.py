@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import QuadraticMap, subsample
 from bwbayes.shown import brief
 
@@ -79,7 +79,8 @@ class StudentMixture:
         _require_spread(draws)
         count, straightened, modes = len(draws), draws, draws[:0]
         if guess is not None and guess._lesser:
-            straightened = draws[guess._mode_of(draws) == 0]
+            likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
+            straightened = draws[np.asarray(guess._modes)[likeliest] == 0]
             draws = np.concatenate([draws, guess._stand_ins(count // 20)])
             modes = guess.centers[guess._lesser]
         bend = QuadraticMap.fitted(straightened)
@@ -194,11 +195,6 @@ class StudentMixture:
     def _lesser(self) -> list[int]:
         """The first component of each mode but the first."""
         return [self._modes.index(mode) for mode in range(1, max(self._modes) + 1)]
-
-    def _mode_of(self, draws: FloatArray) -> IntArray:
-        """Return to which mode draws (count, free) belong, (count,)."""
-        likeliest = np.argmax(self.log_parts(self.squares(draws)), axis=0)
-        return np.asarray(self._modes)[likeliest]
 
     def _stand_ins(self, count: int) -> FloatArray:
         """Return points (some, free) that stand for ``count`` draws of each mode but the first.

@@ -51,7 +51,7 @@ from bwbayes.sampling.diagnostics import (
     times,
 )
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import Weighted, pilot_moves, sampling_moves
+from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 
@@ -141,10 +141,16 @@ class _Sampling:
     def _extend(self, phase: Phase) -> None:
         """Advance every ensemble by a block, wherever the executor likes."""
         plan, chain = self.plan, self.chain
+        proposal = chain.proposal_in_use(phase)
+        # Only where draws count has a step several places.
+        places = plan.places if phase == "sampling" else 1
         futures, ends = [], chain.ends
         for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
             # Moves of its own for each: some of emcee's write to themselves.
-            moves = [self._moves(phase) for _ in group]
+            moves = [
+                pilot_moves(proposal) if phase == "pilot" else sampling_moves(proposal, places)
+                for _ in group
+            ]
             futures.append(self.executor.submit(advance, self.posterior, moves, group, plan.block))
         blocks: list[Block] = []
         for future in futures:
@@ -152,13 +158,6 @@ class _Sampling:
                 blocks.append(block)
                 self.watcher(phase, None)
         chain.append(phase, blocks)
-
-    def _moves(self, phase: Phase) -> Weighted:
-        """Return an ensemble's moves; only where draws count has a step several places."""
-        proposal = self.chain.proposal_in_use(phase)
-        if phase == "pilot":
-            return pilot_moves(proposal)
-        return sampling_moves(proposal, self.plan.places if phase == "sampling" else 1)
 
     def _pilot_is_done(self) -> bool:
         """Tell whether the ensembles have met.
