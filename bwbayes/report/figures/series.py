@@ -32,7 +32,13 @@ def draw_bands(bands: Bands) -> Figure:
     for column, shown in zip(axes.T, (bands, bands.within([zoom])), strict=True):
         _draw_column(column, shown)
     for panel in axes[:, 0]:
-        _mark(panel, bands, zoom)
+        zoomed: style.Look = {"color": style.Color.ZOOM, "alpha": 0.5, "zorder": 0.5}
+        start, stop = bands.time[zoom][[0, -1]]
+        panel.axvspan(start, stop, lw=1, label="shown on the right", **zoomed)
+        if bands.scored_from:
+            lead_in = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]]
+            label = "lead-in, not judged"
+            panel.axvspan(*lead_in, fc=style.Color.LEAD_IN, alpha=0.35, lw=0, label=label)
     axes[2, 1].xaxis.set_major_locator(MaxNLocator(5))
     is_measured = bands.measured is not None
     axes[0, 0].set(ylabel="voltage (V)", title=style.plain(style.title(bands)))
@@ -89,17 +95,6 @@ def _around_largest_error(bands: Bands, height: float = 8.0, least: int = 40) ->
     reach = min([bands.time.size // 20, *np.abs(samples[is_distant] - at)])
     reach = max(reach, least)
     return slice(max(at - reach, window.start), min(at + reach + 1, window.stop))
-
-
-def _mark(panel: Axes, bands: Bands, zoom: slice) -> None:
-    """Show where the zoom is, and which samples are not judged."""
-    start, stop = bands.time[zoom][[0, -1]]
-    zoomed: style.Look = {"color": style.Color.ZOOM, "alpha": 0.5, "zorder": 0.5}
-    panel.axvspan(start, stop, lw=1, label="shown on the right", **zoomed)
-    if bands.scored_from:
-        lead_in = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]]
-        label = "lead-in, not judged"
-        panel.axvspan(*lead_in, fc=style.Color.LEAD_IN, alpha=0.35, lw=0, label=label)
 
 
 LOOP_KINDS: tuple[Kind, ...] = ("sensor", "parameter")

@@ -59,46 +59,39 @@ def draw_ecdf(calibration: Calibration) -> Figure:
 
 
 def draw_coverage(calibration: Calibration) -> Figure:
-    """Draw the coverage of the posteriors' intervals, and of the bands on held-out samples."""
-    others = calibration.predicted
-    size = 7.5 + 3.5 * len(others), 0.28 * len(calibration.statistics) + 1.8
-    figure, ((first, *panels),) = style.new_figure(*size, 1, 1 + len(others))
-    _draw_intervals(first, calibration)
-    for panel, other in zip(panels, others, strict=True):
-        _draw_bands(panel, calibration, other)
-    return figure
+    """Draw the coverage of the posteriors' intervals, and of the bands on held-out samples.
 
-
-def _draw_intervals(panel: Axes, calibration: Calibration) -> None:
-    """Draw a row for each statistic, and binomial limits around each level."""
-    labels = _labels(calibration)
+    Each statistic's intervals are a row, with binomial limits around each level. Of each kind of
+    band there is how far its mean coverage is off, with three standard errors.
+    """
+    others, labels = calibration.predicted, _labels(calibration)
+    size = 7.5 + 3.5 * len(others), 0.28 * len(labels) + 1.8
+    figure, ((intervals, *panels),) = style.new_figure(*size, 1, 1 + len(others))
     for level, color in zip(LEVELS, style.COLORS, strict=False):
         low, high = calibration.limits[level]
-        panel.axvspan(100 * low, 100 * high, color=color, alpha=0.13, lw=0)
-        panel.axvline(level, color=color, lw=0.8, ls="--")
+        intervals.axvspan(100 * low, 100 * high, color=color, alpha=0.13, lw=0)
+        intervals.axvline(level, color=color, lw=0.8, ls="--")
         covered = [100 * ranks.covered[level] for ranks in calibration.statistics.values()]
-        panel.plot(covered, range(len(labels)), "o", color=color, ms=4.5, label=f"{level} %")
-    panel.set_yticks(range(len(labels)), labels)
-    panel.invert_yaxis()
-    panel.set_xlabel("truths inside the interval (%)")
-    panel.set_title("posterior intervals (shaded: 99 % binomial limits)")
-    panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=len(LEVELS))
-
-
-def _draw_bands(panel: Axes, calibration: Calibration, other: str) -> None:
-    """Draw how far each band's mean coverage is off, with three standard errors."""
+        intervals.plot(covered, range(len(labels)), "o", color=color, ms=4.5, label=f"{level} %")
+    intervals.set_yticks(range(len(labels)), labels)
+    intervals.invert_yaxis()
+    intervals.set_xlabel("truths inside the interval (%)")
+    intervals.set_title("posterior intervals (shaded: 99 % binomial limits)")
+    intervals.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=len(LEVELS))
     x = np.arange(len(LEVELS))
-    for i, kind in enumerate(KINDS):
-        coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
-        off = [100 * cover.mean - level for cover, level in zip(coverages, LEVELS, strict=True)]
-        error = [100 * LIMIT * coverage.error for coverage in coverages]
-        look: style.Look = {"fmt": "os^"[i], "ms": 5, "capsize": 3, "color": style.COLORS[i]}
-        panel.errorbar(x + 0.15 * (i - 1), off, error, label=f"{kind} band", **look)
-    panel.axhline(0.0, color=style.Color.EXPECTED, lw=0.8, ls="--")
-    panel.set_xticks(x, [f"{level} %" for level in LEVELS])
-    panel.set(xlabel="nominal coverage (%)", ylabel="measured less nominal coverage (%)")
-    panel.set_title(f"bands on {other or 'held-out samples'} (whiskers: 3 standard errors)")
-    panel.legend(loc="best")
+    for panel, other in zip(panels, others, strict=True):
+        for i, kind in enumerate(KINDS):
+            coverages = [calibration.bands[f"{other} {kind} {level}".strip()] for level in LEVELS]
+            off = [100 * cover.mean - level for cover, level in zip(coverages, LEVELS, strict=True)]
+            error = [100 * LIMIT * coverage.error for coverage in coverages]
+            look: style.Look = {"fmt": "os^"[i], "ms": 5, "capsize": 3, "color": style.COLORS[i]}
+            panel.errorbar(x + 0.15 * (i - 1), off, error, label=f"{kind} band", **look)
+        panel.axhline(0.0, color=style.Color.EXPECTED, lw=0.8, ls="--")
+        panel.set_xticks(x, [f"{level} %" for level in LEVELS])
+        panel.set(xlabel="nominal coverage (%)", ylabel="measured less nominal coverage (%)")
+        panel.set_title(f"bands on {other or 'held-out samples'} (whiskers: 3 standard errors)")
+        panel.legend(loc="best")
+    return figure
 
 
 def _labels(calibration: Calibration) -> list[str]:
