@@ -25,7 +25,14 @@ FEW = 4
 
 def brief(thing: object) -> str:
     """Return class and fields of an object, on one line or one each; long values by their size."""
-    return _called(thing, [f"{name}={_value(value)}" for name, value in _fields(thing)])
+    name, parts = type(thing).__name__, [f"{n}={_value(v)}" for n, v in _fields(thing)]
+    line = f"{name}({', '.join(parts)})"
+    if len(line) <= WIDTH:
+        return line
+    room = MOST_LINES - 2
+    if len(parts) > room:
+        parts = [*parts[: room - 1], f"... {len(parts) - room + 1} more"]
+    return "\n".join([f"{name}(", *(f"    {part[: WIDTH - 5]}," for part in parts), ")"])
 
 
 def head(text: str) -> str:
@@ -39,17 +46,6 @@ def head(text: str) -> str:
             break
         shown.append(line)
     return "\n".join([*shown, f"... {len(lines) - len(shown)} more lines: print it to see them"])
-
-
-def _called(thing: object, parts: list[str]) -> str:
-    name = type(thing).__name__
-    line = f"{name}({', '.join(parts)})"
-    if len(line) <= WIDTH:
-        return line
-    room = MOST_LINES - 2
-    if len(parts) > room:
-        parts = [*parts[: room - 1], f"... {len(parts) - room + 1} more"]
-    return "\n".join([f"{name}(", *(f"    {part[: WIDTH - 5]}," for part in parts), ")"])
 
 
 def _fields(thing: object) -> Iterator[tuple[str, Any]]:
