@@ -31,9 +31,6 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.operator import Span
 from bwbayes.model.reversals import time_between_turns
 
-# Strengths a decade of time apart are alike: creep goes with the logarithm of the time.
-ALIKE = 0.9
-
 # Step of the slopes, in prior sds, and steps to the mode.
 STEP, ROUNDS = 1e-3, 4
 
@@ -64,9 +61,10 @@ def with_creep(
     strengths = np.array([extended.names.index(name) for name in creep.names])
     moving = [i for i, n in enumerate(extended.names) if n in extended.table.physical]
     others = np.setdiff1d(moving, strengths)
-    apart = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
+    # Creep goes with the logarithm of the time: strengths a decade of it apart are alike.
+    decades = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
     prior = np.eye(len(extended.names))
-    prior[np.ix_(strengths, strengths)] = np.linalg.inv(ALIKE**apart)
+    prior[np.ix_(strengths, strengths)] = np.linalg.inv(0.9**decades)
 
     begin = places.mean(axis=0)
     mode, bend = begin.copy(), prior
@@ -105,10 +103,14 @@ def _creep(posterior: Posterior, duration: float) -> Creep:
 def _extended(posterior: Posterior, creep: Creep) -> Posterior:
     """Return the posterior of the same records with creep."""
     datasets = tuple(
-        replace(one, actuator=replace(one.actuator, creep=creep)) for one in posterior.datasets
+        replace(dataset, actuator=replace(dataset.actuator, creep=creep))
+        for dataset in posterior.datasets
     )
     declared = {parameter.name: parameter for parameter in posterior.prior.parameters}
-    declared |= {one.name: Parameter.of(one, creep.strength) for one in creep.parameters}
+    declared |= {
+        declaration.name: Parameter.of(declaration, creep.strength)
+        for declaration in creep.parameters
+    }
     joint = replace(posterior.table, actuator_part=datasets[0].actuator)
     prior = JointPrior((declared[name] for name in joint.names), posterior.prior.constraint)
     return Posterior(datasets, prior, posterior.engine, joint)

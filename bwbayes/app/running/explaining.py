@@ -33,9 +33,6 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
 
-# Innovations less likely than this by chance may be explained by another noise.
-COLORED = 0.05
-
 
 def explained(
     problem: Problem,
@@ -89,8 +86,9 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     posterior = problem.posterior
     rough = climb(posterior, point.optima)
     worth = {default: rough.log_evidence}
-    p = innovations(posterior, rough.free).octaves()[2]
-    for noise in [n for n in NOISES if n not in worth and (n == "white" or p < COLORED)]:
+    # Innovations less likely than this by chance may be explained by another noise.
+    p, colored = innovations(posterior, rough.free).octaves()[2], 0.05
+    for noise in [n for n in NOISES if n not in worth and (n == "white" or p < colored)]:
         other = problem.reconfigured({"noise": noise}, {})
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         # What only the other noise has starts at its prior's median.
@@ -105,7 +103,7 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
         for noise, nats in worth.items()
         if noise != best
     ]
-    if p >= COLORED:
+    if p >= colored:
         against.append(f"innovations are white, p = {p:.2g}")
     return best, f"noise: {best} ({', '.join(against)})"
 
