@@ -196,15 +196,15 @@ def margins(
     # Phase margin: where the size is one at some slope. The lag is least at one of these angles,
     # or at the two ends.
     between = (size * largest >= 1) & (size * smallest <= 1)
-    least = np.min(np.where(between, np.abs(lag), np.pi), axis=1)
+    smallest_lag = np.min(np.where(between, np.abs(lag), np.pi), axis=1)
     for slope in (smallest, largest):
         level = log_size + np.log(slope)
         crossed = (level[:, :-1] >= 0) != (level[:, 1:] >= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             fraction = level[:, :-1] / (level[:, :-1] - level[:, 1:])
         at_one = np.abs(lag[:, :-1] + fraction * turned)
-        least = np.minimum(least, np.min(np.where(crossed, at_one, np.pi), axis=1))
-    phase = np.degrees(np.where(gain < 1, -least, least))
+        smallest_lag = np.minimum(smallest_lag, np.min(np.where(crossed, at_one, np.pi), axis=1))
+    phase = np.degrees(np.where(gain < 1, -smallest_lag, smallest_lag))
     circle = np.min(((1 + largest * loop) * np.conj(1 + smallest * loop)).real, axis=1)
     above = size * largest >= 1
     last = ANGLES[::-1][np.argmax(above[:, ::-1], axis=1)]

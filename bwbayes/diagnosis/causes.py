@@ -103,7 +103,7 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
     kinds = set(likely.kind.split(" or "))
     # Creep widens loops, and is too small for another gain, a delay or what looks like outliers.
     shapeless = kinds <= {"loop", "noise", "unknown"}
-    possible = [way for way in beyond if shapeless or way.kind in ("range", "speed")]
+    possible = [finding for finding in beyond if shapeless or finding.kind in ("range", "speed")]
     if possible and kinds <= {"loop", "noise", "unknown", "gain", "delay", "outliers"}:
         return Finding("extrapolation", f"extrapolation: {possible[0].text}", possible[0].fix)
     return likely

@@ -155,11 +155,11 @@ class _Target:
         voltage = likelihood.voltage[: readings.samples]
         moved = np.empty((len(theta), readings.rows.size))
         # An effect is worked out once for all models that have the same sizes.
-        every, which = np.unique(coordinates[:, self.free :], axis=0, return_inverse=True)
-        for number, sizes in enumerate(every):
-            alike = np.flatnonzero(which.ravel() == number)
-            for batch in batches(alike.size, voltage.size):
-                rows = alike[batch]
+        distinct, which = np.unique(coordinates[:, self.free :], axis=0, return_inverse=True)
+        for number, sizes in enumerate(distinct):
+            models = np.flatnonzero(which.ravel() == number)
+            for batch in batches(models.size, voltage.size):
+                rows = models[batch]
                 model = likelihood.table.actuator(theta[rows])
                 simulate = partial(likelihood.simulate, model)
                 moved[rows] = self.effect.apply(simulate, voltage, sizes)[:, readings.where]
@@ -195,7 +195,7 @@ class _Target:
             step = np.zeros(state.coordinates.size)
             step[self.physical] = np.linalg.solve(curvature, slope)
             tried = (self.at(state.coordinates + fraction * step) for fraction in FRACTIONS)
-            state = next((there for there in tried if there.density > state.density), state)
+            state = next((ahead for ahead in tried if ahead.density > state.density), state)
             if state.density < before + max(GAIN, (self.least - state.density) / ROUNDS):
                 break
         return state

@@ -85,8 +85,8 @@ def fit_loop(record: Record) -> LoopFit:
     turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
     edges = np.concatenate([[0], turns, [record.samples - 1]])
     slowest = 0.3 * record.interval * float(np.median(np.diff(edges)))
-    some = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
-    lags = np.concatenate([[0.0], some])
+    lagging = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
+    lags = np.concatenate([[0.0], lagging])
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), judged), strict=True):
         basis = np.column_stack([loops, trend_shape])
@@ -94,7 +94,7 @@ def fit_loop(record: Record) -> LoopFit:
         if best is None or remainder < best[0]:
             best = remainder, basis, lag, which
     assert best is not None
-    least, basis, lag, which = best
+    remainder, basis, lag, which = best
     design = np.column_stack([basis, decays[:, which]])
     products = _products(design, centered[:, np.newaxis])
     among = _products(design, design)
@@ -117,11 +117,12 @@ def fit_loop(record: Record) -> LoopFit:
     samples = lags / record.interval
     nearest = int(np.argmin([curved(lag) for lag in samples]))
     between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
-    found = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
-    (loops,) = _bases(_lagged(record.voltage, found.x)[np.newaxis, rows], judged)
-    least = min(least, _best_decay(np.column_stack([loops, trend_shape]), decays, centered)[0])
-    added, left = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
-    ratio = (found.fun - least) / added / max(least / left, 1e-300)
+    optimum = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
+    (loops,) = _bases(_lagged(record.voltage, optimum.x)[np.newaxis, rows], judged)
+    behind_lag = _best_decay(np.column_stack([loops, trend_shape]), decays, centered)[0]
+    remainder = min(remainder, behind_lag)
+    added, degrees = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
+    ratio = (optimum.fun - remainder) / added / max(remainder / degrees, 1e-300)
     return LoopFit(
         rows[judged],
         residual,
@@ -134,7 +135,7 @@ def fit_loop(record: Record) -> LoopFit:
         float(coefficients[-2]),
         1 - imitated / float(trend_shape @ trend_shape),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
-        float(scipy.stats.f.sf(ratio, added, left)),
+        float(scipy.stats.f.sf(ratio, added, degrees)),
     )
 
 

@@ -141,7 +141,9 @@ def _by_grids(
     Those of one draw follow one another, (draws * repeats,).
     """
     single = len(likelihoods) == 1
-    grids = [_grid(one, States(one, theta, single=single)) for one in likelihoods]
+    grids = [
+        _grid(likelihood, States(likelihood, theta, single=single)) for likelihood in likelihoods
+    ]
     evidence = np.stack([grid[2] for grid in grids])
     rows = np.repeat(np.arange(len(theta)), repeats)
     best = np.max(evidence, axis=0)

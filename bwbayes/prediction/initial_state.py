@@ -199,7 +199,7 @@ def started(
         # The mean is in the domain, which is convex; a median of each parameter need not be.
         typical = whole.table.actuator(np.mean(theta, axis=0)[np.newaxis])
         between = _between(likelihoods, typical)
-        likelihoods = tuple(replace(each, offset_sd=between) for each in likelihoods)
+        likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator)
     informed = _informed(histories, start_theta, record, window, generator)
     return going_on(informed, whole, theta, generator) if start.after else informed
@@ -213,7 +213,7 @@ def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
     """
     first = likelihoods[0]
     voltage = first.voltage[: first.readings.samples]
-    paths = [each.simulate(model, voltage)[0, first.readings.rows] for each in likelihoods]
+    paths = [history.simulate(model, voltage)[0, first.readings.rows] for history in likelihoods]
     return float(np.sqrt(np.mean(np.diff(np.mean(paths, axis=1)) ** 2)) / 2)
 
 

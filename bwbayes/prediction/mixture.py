@@ -28,9 +28,9 @@ def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
     together have one in each of S K.
     """
     # One value of each of as many draws as predictions take: quantiles are as sure as the draws.
-    each = -(-1000 // draws)
-    ranks = rng.permuted(np.tile(np.arange(draws), (each, 1)), axis=1)
-    below = (np.arange(each)[:, np.newaxis] + (ranks + 0.5) / draws) / each
+    n_scores = -(-1000 // draws)
+    ranks = rng.permuted(np.tile(np.arange(draws), (n_scores, 1)), axis=1)
+    below = (np.arange(n_scores)[:, np.newaxis] + (ranks + 0.5) / draws) / n_scores
     scores: FloatArray = scipy.special.ndtri(below)
     return scores
 
@@ -100,8 +100,8 @@ def log_density(z: Floating, sds: Floating) -> Floating:
     ``z`` (draws, samples) is (value - mean) / sd, and ``sds``, all above zero, as in
     :func:`ranked_values`. nan where a value is missing.
     """
-    each = -0.5 * z**2 - np.log(sds)
-    largest = np.max(each, axis=0)
-    mean = np.mean(np.exp(each - largest), axis=0)
+    by_draw = -0.5 * z**2 - np.log(sds)
+    largest = np.max(by_draw, axis=0)
+    mean = np.mean(np.exp(by_draw - largest), axis=0)
     density: Floating = largest + np.log(mean) - 0.5 * math.log(2 * math.pi)
     return density

@@ -274,8 +274,8 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
         bulk, low, high, mean, cap = (_arviz().ess(s, method="mean") for s in series)
         cap *= np.var(values) / np.var(means)
     # np.minimum keeps a nan of either.
-    least: list[float] = np.minimum([bulk, np.minimum(low, high), mean], cap).tolist()
-    return least[0], least[1], least[2]
+    capped: list[float] = np.minimum([bulk, np.minimum(low, high), mean], cap).tolist()
+    return capped[0], capped[1], capped[2]
 
 
 def _rhat(scores: Sequence[FloatArray], ensembles: int) -> float:

@@ -256,8 +256,8 @@ class _Judgment:
 
     def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> None:
         self.blocks, self.block = blocks, plan.block
-        most = max(chains.MOST_DRAWS, round(4 * plan.ess))
-        self.thin = thinning(chain.draws("sampling", blocks), most)
+        max_draws = max(chains.MOST_DRAWS, round(4 * plan.ess))
+        self.thin = thinning(chain.draws("sampling", blocks), max_draws)
         coordinates = chain.coordinates("sampling", self.thin, blocks)
         self.accepted = chain.accepted("sampling")[:blocks]
         self.draws = constrain_steps(posterior, coordinates)

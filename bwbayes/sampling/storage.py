@@ -197,9 +197,9 @@ class ChainFile(Chain):
         point["log_density"] = float(point["log_density"])
         states = zip(*(arrays[field.name] for field in fields(EnsembleState)), strict=True)
         starts = [EnsembleState(*state) for state in states]
-        begun = cls(path, PointFit(**point), starts, text["block"], text["attributes"])
-        begun.proposals["pilot"] = StudentMixture.of_arrays(arrays)
-        return begun
+        chain = cls(path, PointFit(**point), starts, text["block"], text["attributes"])
+        chain.proposals["pilot"] = StudentMixture.of_arrays(arrays)
+        return chain
 
     def _read_blocks(self, load: Callable[[str], Arrays | None]) -> None:
         """Read what is there, in its order; the set aside last, since it is of blocks."""

@@ -121,9 +121,9 @@ def _draw_time(panel: Axes, time: FloatArray, white: FloatArray) -> None:
     count = min(40, max(white.size // 20, 1))
     gaps = np.flatnonzero(np.diff(time) > 0.02 * np.ptp(time)) + 1
     for rows in np.split(np.arange(white.size), gaps):
-        parts = np.array_split(rows, max(round(count * rows.size / white.size), 1))
-        centers = [np.mean(time[part]) for part in parts]
-        size = [np.sqrt(np.mean(white[part] ** 2)) for part in parts]
+        segments = np.array_split(rows, max(round(count * rows.size / white.size), 1))
+        centers = [np.mean(time[segment]) for segment in segments]
+        size = [np.sqrt(np.mean(white[segment] ** 2)) for segment in segments]
         label = "_nolegend_" if rows[0] else "root mean square: 1 is right"
         panel.plot(centers, size, color=style.Color.MEAN, lw=1.5, label=label)
     panel.axhline(1, color=style.Color.MEAN, lw=0.8, ls=":")
