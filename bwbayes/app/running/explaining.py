@@ -99,8 +99,8 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     if worth[best] < worth[default] + TIED:
         best = default
     against = [
-        f"{worth[best] - nats:+.3g} nats against {noise}"
-        for noise, nats in worth.items()
+        f"{lead:+.3g} nats against {noise}" if lead > TIED else f"a tie with {noise}"
+        for noise, lead in ((noise, worth[best] - nats) for noise, nats in worth.items())
         if noise != best
     ]
     if p >= colored:
