@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 import scipy
@@ -159,22 +158,21 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
     """Return where the innovations depart from what the noise model assumes."""
     if series.white.size < 100:  # these show nothing
         return ()
-    sides = [_one_sided(series, quantity) for quantity in ("rate", "voltage", "direction")]
-    return tuple(chain(_colored(series), *sides))
-
-
-def _colored(series: Innovations) -> Iterator[Finding]:
-    """Find the octave whose power is least that of white innovations, by a fifth at least."""
+    findings = []
+    # The octave whose power is least that of white innovations, by a fifth at least.
     frequency, power, p = series.octaves()
     octave = int(np.argmax(np.diff(frequency) * (power - 1 - np.log(power))))
     if p < ALARM and not 0.8 < power[octave] < 1.25:
         low, high = frequency[octave : octave + 2]
-        yield Finding(
-            "noise model",
+        text = (
             f"between {low:.3g} and {high:.3g} Hz the innovations have {power[octave]:.2g} times "
-            "the power that white ones have",
-            "check whether the sensor filters; else try what explains it: bwbayes run --improve",
+            "the power that white ones have"
         )
+        fix = "check whether the sensor filters; else try what explains it: bwbayes run --improve"
+        findings.append(Finding("noise model", text, fix))
+    for quantity in ("rate", "voltage", "direction"):
+        findings += _one_sided(series, quantity)
+    return tuple(findings)
 
 
 def _one_sided(series: Innovations, quantity: str) -> Iterator[Finding]:

@@ -115,17 +115,12 @@ def made[Part](
             f"{kind.__module__}.{kind.__name__}; derive it from that"
         )
     if isinstance(component, Operator):
-        _check_parameters(where, name, component)
+        names = [declared.name for declared in component.parameters]
+        if len(set(names)) < len(names):
+            raise InputError(f"{where}: {name!r} declares a parameter twice: {', '.join(names)}")
+        if names[-1:] != ["initial"] or component.parameters[-1].scope != "record":
+            raise InputError(
+                f'{where}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
+                'scope = "record": the state before a record'
+            )
     return component
-
-
-def _check_parameters(where: str, name: str, operator: Operator) -> None:
-    """Refuse an operator from outside whose state before a record has no place."""
-    names = [declared.name for declared in operator.parameters]
-    if len(set(names)) < len(names):
-        raise InputError(f"{where}: {name!r} declares a parameter twice: {', '.join(names)}")
-    if names[-1:] != ["initial"] or operator.parameters[-1].scope != "record":
-        raise InputError(
-            f'{where}: {name!r} declares {", ".join(names)}; the last must be "initial", with '
-            'scope = "record": the state before a record'
-        )
