@@ -7,7 +7,9 @@ other way to write one.
 
 from __future__ import annotations
 
+import importlib
 import json
+import pickle
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -223,6 +225,23 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)
     assert np.max(np.abs(one - other) / (posterior.only.voltage.size + np.abs(one))) < 1e-10
+
+
+def test_what_is_compiled_for_an_operator_is_looked_up_without_its_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of another folder: the index names what all operators have compiled."""
+    typeof = pytest.importorskip("numba").typeof
+    pytest.importorskip("bwbayes.model.compiled")  # knows the type
+    (tmp_path / "of_another_folder.py").write_text(
+        f"from {HERE} import TanhLoop\nclass Own(TanhLoop):\n    pass\n"
+    )
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        known = typeof(importlib.import_module("of_another_folder").Own())
+    kept = pickle.dumps(known)
+    del sys.modules["of_another_folder"]
+    assert pickle.loads(kept) == known
 
 
 def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) -> None:

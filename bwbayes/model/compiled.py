@@ -54,16 +54,20 @@ WHOLE = 1.5 * 2.0**52
 class FormulaType(types.Type):
     """The type of what brings a formula, by its class and a digest of the formula's sources.
 
-    A step brings its ``move``, an operator that remembers extrema its ``everett``.
+    A step brings its ``move``, an operator that remembers extrema its ``everett``. What is kept on
+    disk knows the ``kind``, the class, by its name alone: one of a module of the user's own need
+    not be there when others are looked up beside it.
     """
 
-    def __init__(self, kind: type, digest: str) -> None:
-        super().__init__(name=f"{kind.__module__}:{kind.__qualname__}@{digest}")
-        self.kind = kind
+    kind: Any
+
+    def __init__(self, name: str, *_: object) -> None:
+        # What an earlier version kept has the class, and a digest: found again by nobody.
+        super().__init__(name=str(name))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let what is kept on disk be found again by the class's name."""
-        return FormulaType, (self.kind, self.name.rsplit("@", 1)[1])
+        return FormulaType, (self.name,)
 
 
 @typeof_impl.register(HysteresisStep)
@@ -76,7 +80,9 @@ def _type_of(formula: HysteresisStep | RemembersExtrema, _: Any) -> FormulaType:
         files = sorted({inspect.getfile(inner) for inner in _functions(function)})
         # Which knows the cells of a notebook too.
         lines = (line for file in files for line in linecache.getlines(file))
-        kind._numba_type_ = FormulaType(kind, sha256("".join(lines).encode()).hexdigest()[:16])
+        digest = sha256("".join(lines).encode()).hexdigest()[:16]
+        kind._numba_type_ = FormulaType(f"{kind.__module__}:{kind.__qualname__}@{digest}")
+        kind._numba_type_.kind = kind
     return cast("FormulaType", kind._numba_type_)
 
 
