@@ -47,7 +47,6 @@ from bwbayes.sampling.diagnostics import (
     check,
     nested_rhat,
     pareto_k,
-    stuck,
     times,
 )
 from bwbayes.sampling.ensemble import advance, start
@@ -270,13 +269,12 @@ class _Judgment:
     def blocks_needed(self, fraction: float) -> float:
         """Return how many blocks make a ``fraction`` of the autocorrelation times that are needed.
 
-        Mostly the last thing that is missing, and cheap to see. More than these if a walker is
-        stuck in them; none if the proposal does not cover them, because more would not help.
+        Mostly the last thing that is missing, and cheap to see. None if the proposal does not cover
+        the draws, because more would not help.
         """
         if self.pareto_k is not None and not self.pareto_k < LARGEST_PARETO_K:
             return 0.0
-        more = self.blocks + 1.0 if stuck(self.accepted, self.block, self.times) else 0.0
-        return max(more, fraction * LENGTH * float(np.max(self.times)) / self.block)
+        return fraction * LENGTH * float(np.max(self.times)) / self.block
 
     def check(self) -> Check:
         """Judge everything, which costs as much as many steps."""
