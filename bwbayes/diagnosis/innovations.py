@@ -76,8 +76,7 @@ class Innovations:
         """Return the edges (octaves + 1,) of octaves, Hz, the innovations' power, and a p value.
 
         The power (octaves,) is over what white innovations of the same variance have. The p value
-        is that of Bartlett's test: how likely chance makes powers so unequal. The logarithm of its
-        likelihood ratio is about what another noise model could gain, nats.
+        is that of Bartlett's test: how likely chance makes powers so unequal; 1 of few readings.
         """
         count = self.white.size
         amplitude = np.fft.rfft(self.white - np.mean(self.white))[1 : (count + 1) // 2]
@@ -159,7 +158,7 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
     if series.white.size < 100:  # these show nothing
         return ()
     findings = []
-    # The octave whose power is least that of white innovations, by a fifth at least.
+    # The octave that tells most against white innovations, if its power is off by a fifth.
     frequency, power, p = series.octaves()
     octave = int(np.argmax(np.diff(frequency) * (power - 1 - np.log(power))))
     if p < ALARM and not 0.8 < power[octave] < 1.25:
