@@ -345,8 +345,9 @@ def _remarks(chain: Chain) -> tuple[str, ...]:
         steps = sum(len(block.log_density) for block in flat) // len(chain.starts)
         followed = "one that was fitted to them made the draws that count"
         remarks.append(
-            f"the proposal covered the posterior badly in the first {steps} steps (Pareto k "
-            f"{shape:.2f}): they are set aside, and {followed if chain.refit else alone}"
+            f"the proposal served badly in the first {steps} steps (Pareto k {shape:.2f}), which "
+            f"gave too few effective draws: they are set aside, and "
+            f"{followed if chain.refit else alone}"
         )
     thin = thinning(chain.draws("sampling"))
     if thin > 1:
