@@ -55,17 +55,24 @@ def explain(
     """Fit explanations, and rank them, the best first.
 
     Unless ``thorough``, only the first of them, and all if any of these leads by :data:`TIED`: of
-    few readings, which refuse nothing, an addition is worth next to nothing either way.
-    ``watch`` is called with the share that is done.
+    few readings, which refuse nothing, an addition is worth next to nothing either way. Where the
+    discrepancy is smooth, they are fitted beside a rough one first, then those beside the smooth
+    one that gained anything; each counts as the better fit. ``watch`` is called with the share that
+    is done.
     """
-    explanations: list[Explanation] = []
+    best: dict[str, Explanation] = {}
+    rough = scene.with_rough_noise()
     kinds = ADDITIONS + CHANGES
     for number, kind in enumerate(kinds):
-        if number == len(ADDITIONS) and not thorough and all(e.nats <= TIED for e in explanations):
+        if number == len(ADDITIONS) and not thorough and all(e.nats <= TIED for e in best.values()):
             break
-        explanations += kind(scene)
+        found = [] if rough is None else list(kind(rough))
+        if rough is None or any(explanation.nats + rough.lead > 0 for explanation in found):
+            found += kind(scene)
+        for explanation in sorted(found, key=lambda explanation: explanation.nats):
+            best[explanation.kind] = explanation
         watch((number + 1) / len(kinds))
-    return tuple(sorted(explanations, key=lambda explanation: -explanation.nats))
+    return tuple(sorted(best.values(), key=lambda explanation: -explanation.nats))
 
 
 def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:

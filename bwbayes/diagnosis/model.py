@@ -82,7 +82,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
 
 def smooth(scene: Scene) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
-    if isinstance(scene.posterior.only.noise, DiscrepancyNoise):
+    if isinstance(scene.posterior.only.noise, DiscrepancyNoise) and scene.before is None:
         yield from _changed(scene, "a smooth discrepancy", {"noise": "smooth"})
 
 
@@ -119,9 +119,9 @@ def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     """Try innovations of a Student t distribution, of whatever scale."""
     white = scene.innovations
     text = f"outliers ({int(np.sum(np.abs(white) > 5))} of {white.size} innovations beyond 5 SD)"
-    rmse = scene.fit.rmse, scene.fit.rmse
+    rmse = scene.without[0], scene.fit.rmse
     fix = "set outliers = true in [model]"
-    yield Explanation("heavy tails", text, fix, nats=tail_nats(white), rmse=rmse)
+    yield Explanation("heavy tails", text, fix, nats=tail_nats(white) - scene.lead, rmse=rmse)
 
 
 def tail_nats(white: FloatArray) -> float:
@@ -153,9 +153,9 @@ def growing_noise(scene: Scene) -> Iterator[Explanation]:
         nats, slope = _grown(white, growth)
         text = f"noise that {'grows' if slope > 0 else 'falls'} with the voltage"
         text += "'s speed" if kind == "speed" else "'s distance from its center"
-        rmse = scene.fit.rmse, scene.fit.rmse
+        rmse = scene.without[0], scene.fit.rmse
         fix = "train on a record driven as the plans are: the bands' width is the mean one"
-        yield Explanation(f"noise by {kind}", text, fix, nats=nats, rmse=rmse)
+        yield Explanation(f"noise by {kind}", text, fix, nats=nats - scene.lead, rmse=rmse)
 
 
 def _grown(white: FloatArray, growth: FloatArray) -> tuple[float, float]:

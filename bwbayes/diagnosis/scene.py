@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -16,6 +16,7 @@ from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
+from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.record.io.grid import clock
@@ -92,6 +93,8 @@ class Scene:
         Time of the record's first sample, s.
     reconfigure
         Builds other models of the same record, if these are asked.
+    before
+        What explanations are compared with, if it is another fit.
     """
 
     fit: LocalFit
@@ -100,6 +103,7 @@ class Scene:
     held_out: tuple[slice, ...] = ()
     begin: float = 0.0
     reconfigure: Reconfigure | None = None
+    before: LocalFit | None = None
 
     @classmethod
     def of(
@@ -138,6 +142,30 @@ class Scene:
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
         return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
+
+    def with_rough_noise(self) -> Scene | None:
+        """Return the same with a rough discrepancy, if it has a smooth one; else none.
+
+        A smooth discrepancy takes up what an explanation is to explain, and no climb leads from
+        there to where it leaves that to the explanation.
+        """
+        rough: Mapping[str, object] = {"noise": "discrepancy"}
+        if not isinstance(self.posterior.only.noise, SmoothNoise):
+            return None
+        posterior = self.rebuilt(rough)
+        if self.reconfigure is None or posterior is None:
+            return None
+        rows = [self.posterior.names.index(name) for name in posterior.names]
+        fit = climb(posterior, self.places[:, rows])
+
+        def reconfigure(
+            changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
+        ) -> Posterior:
+            assert self.reconfigure is not None
+            return self.reconfigure({**rough, **changes}, parameters)
+
+        places = map_estimate.distinct([fit.coordinates, *self.places[:, rows]], fit.covariance)
+        return replace(self, fit=fit, places=places, reconfigure=reconfigure, before=self.fit)
 
     @property
     def posterior(self) -> Posterior:
@@ -188,10 +216,16 @@ class Scene:
         """Innovations of the fit (readings,), in sds."""
         return innovations(self.posterior, self.fit.free).white
 
+    @property
+    def lead(self) -> float:
+        """By how many nats of log evidence what explanations are compared with leads the fit."""
+        return self.before.log_evidence - self.fit.log_evidence if self.before else 0.0
+
     @cached_property
-    def held_out_error(self) -> float:
-        """Root mean square of what the fit misses of the readings held out, um; nan of none."""
-        return self.fit.error(self.held_out)
+    def without(self) -> tuple[float, float]:
+        """RMSE and error of the readings held out, um, of what explanations are compared with."""
+        before = self.before or self.fit
+        return before.rmse, before.error(self.held_out)
 
     def clock(self, time: float) -> str:
         """Write a time since the first reading as one of the record, s."""
@@ -252,9 +286,9 @@ class Scene:
             kind,
             text,
             fix,
-            nats=fit.log_evidence - self.fit.log_evidence - cost,
-            rmse=(self.fit.rmse, fit.rmse),
-            held_out=(self.held_out_error, fit.error(self.held_out)),
+            nats=fit.log_evidence - self.fit.log_evidence - self.lead - cost,
+            rmse=(self.without[0], fit.rmse),
+            held_out=(self.without[1], fit.error(self.held_out)),
             shift=shift,
             **facts,
         )

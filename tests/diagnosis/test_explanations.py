@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from bwbayes.diagnosis import effects, model
+from bwbayes.diagnosis import effects, explanations, model
 from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
@@ -98,6 +98,19 @@ def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     found = explain(scene(kind, 1, tmp_path, 5.0), thorough=kind != "good")
     causes = {cause.kind for cause in likely_causes(found)}
     assert causes & CAUSES[kind] if kind != "good" else not causes
+
+
+def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The twin: from the smooth one alone a fit of the cause does not lead."""
+    monkeypatch.setattr(explanations, "ADDITIONS", (effects.drift,))
+    monkeypatch.setattr(explanations, "CHANGES", (effects.slew_limit,))
+    slow = scene("slew limit", 1, tmp_path, 5.0)
+    assert all(found.nats < 0 for found in effects.slew_limit(slow))
+    found = explain(slow, thorough=True)
+    assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
+    assert {each.rmse[0] for each in found} == {slow.fit.rmse}
 
 
 def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:
