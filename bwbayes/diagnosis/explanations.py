@@ -54,17 +54,20 @@ def explain(
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
-    Unless ``thorough``, only the first of them, and all if any of these leads by :data:`TIED`: of
-    few readings, which refuse nothing, an addition is worth next to nothing either way. Where the
-    discrepancy is smooth, they are fitted beside a rough one first, then those beside the smooth
-    one that gained anything; each counts as the better fit. ``watch`` is called with the share that
-    is done.
+    Unless ``thorough``, only the first of them, and all if any of these is worth more than
+    :data:`LIMIT`, so that all compete where a cause is named. Where the discrepancy is smooth, they
+    are fitted beside a rough one first, then those beside the smooth one that gained anything; each
+    counts as the better fit. ``watch`` is called with the share that is done.
     """
     best: dict[str, Explanation] = {}
     rough = scene.with_rough_noise()
     kinds = ADDITIONS + CHANGES
     for number, kind in enumerate(kinds):
-        if number == len(ADDITIONS) and not thorough and all(e.nats <= TIED for e in best.values()):
+        if (
+            number == len(ADDITIONS)
+            and not thorough
+            and all(e.nats <= LIMIT for e in best.values())
+        ):
             break
         found = [] if rough is None else list(kind(rough))
         if rough is None or any(explanation.nats + rough.lead > 0 for explanation in found):
