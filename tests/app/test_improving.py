@@ -140,6 +140,24 @@ def test_the_noise_is_chosen_by_evidence(
     assert ("innovations are white" in why) == (expected != {"smooth"})
 
 
+def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
+    """As of one, from what each has alone; a parameter of one record's own stays its own."""
+    for name, record in zip("ab", records(2), strict=True):
+        write_record(thinned(record), tmp_path / f"{name}.h5")
+    text = "".join(f'[record.{n}]\nfile = "{n}.h5"\nfrom_rest = true\n' for n in "ab")
+    text += "[parameters]\n'offset[b]' = { fixed = 0.5 }\n"
+    problem = resolve(parse(f'{text}[model]\nper_record = ["sensor_sd"]\n', "config"), tmp_path)
+    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+    noise, why = chosen_noise(problem, point)
+    assert noise == "smooth"
+    assert why.count("nats against") == 2
+    chosen = resolve(problem.with_noise(noise), tmp_path, problem.records).posterior
+    new = ["discrepancy_quality"]
+    assert sorted(chosen.names) == sorted([*problem.posterior.names, *new])
+    assert {"sensor_sd[a]", "offset[a]"} < set(chosen.names)
+    assert "offset[b]" not in chosen.names
+
+
 def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
     write_record(thinned(records(2)[0]), tmp_path / "record.h5")
     report = check(parse(CONFIG, "config"), tmp_path, tmp_path / "out")

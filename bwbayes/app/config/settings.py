@@ -175,7 +175,7 @@ class ModelConfig(ActuatorConfig):
     a command (auto).
     """
     noise: str = key("auto", example='"smooth"')
-    """The model of the residual; auto: the one that a single record has evidence for."""
+    """The model of the residual; auto: the one that the records have evidence for."""
     per_record: Texts = key([], example='["sensor_sd"]')
     """Parameters that each of several records has of its own, besides initial and offset."""
     shared: Texts = key([], example='["offset"]')

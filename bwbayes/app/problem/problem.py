@@ -171,7 +171,7 @@ class Problem:
     def reconfigured(
         self, changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
     ) -> Posterior:
-        """Return the posterior of the record with other values of keys of [model]."""
+        """Return the posterior of the records with other values of keys of [model]."""
         training = {dataset.name: dataset.training for dataset in self.posterior.datasets}
         config = self.changed(self.config, changes, parameters)
         return _posterior(config, self.records, training)[0]
@@ -191,8 +191,9 @@ class Problem:
         model = config.model.model_copy(update={**options, **changes})
         actuator = actuator_of(model, self.record, list(self.records.values()))
         noise = noise_model(model.noise_until_chosen, actuator.interval)
-        table = ParameterTable(actuator, noise)
-        units = {declared.name: declared.unit for declared in table.declarations}
+        scopes = tuple(model.per_record), tuple(model.shared)
+        table = ParameterTable(actuator, noise, tuple(self.records), *scopes)
+        units = {column.name: column.declaration.unit for column in table.layout}
         added = {name: ParameterConfig(**stated) for name, stated in parameters.items()}
         stated = {**added, **config.parameters}
         shared = {n: p for n, p in stated.items() if n in units and p.unit in (None, units[n])}

@@ -1,9 +1,9 @@
 """What explains a problem's readings better than its model does, how that is shown, and used.
 
-:func:`chosen_noise` takes the noise that a record has evidence for: each is fitted from the mode of
-the rough one, and taken if its evidence leads by odds of twenty to one: the rough discrepancy
-claims least, because it has white noise as a limit, and corners that a smooth one has not. What
-another noise could gain shows in the rough one's innovations, which are cheap to look at.
+:func:`chosen_noise` takes the noise that the records have evidence for: each is fitted from the
+mode of the rough one, and taken if its evidence leads by odds of twenty to one: the rough
+discrepancy claims least, because it has white noise as a limit, and corners that a smooth one has
+not. What another noise could gain shows in the rough one's innovations, which are cheap to look at.
 
 :func:`improve_model` gives a model the parts for which its record has evidence. Each round fits the
 model, explains its readings better in every way there is, and takes the part of the model that
@@ -76,25 +76,34 @@ def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
 def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
-    Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy; of several
-    records that stays. White noise is always compared; any other has nothing to gain where the
-    innovations are white already.
+    Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
+    always compared; any other has nothing to gain where the innovations are white already. The
+    evidence of several records is the sum of what each has alone.
     """
-    default = "discrepancy"
-    if len(problem.records) > 1:
-        return default, f"noise: {default}, which is not chosen by evidence for several records"
-    posterior = problem.posterior
-    rough = climb(posterior, point.optima)
-    worth = {default: rough.log_evidence}
+    default, posterior = "discrepancy", problem.posterior
+    rough = {
+        name: climb(posterior.alone(name), posterior.select_draws(point.optima, name))
+        for name in problem.records
+    }
+    worth = {default: sum(fit.log_evidence for fit in rough.values())}
     # Innovations less likely than this by chance may be explained by another noise.
-    p, colored = innovations(posterior, rough.free).octaves()[2], 0.05
+    chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
+    p, colored = min(1.0, len(chances) * min(chances)), 0.05
     for noise in [n for n in NOISES if n not in worth and (n == "white" or p < colored)]:
-        other = problem.reconfigured({"noise": noise}, {})
-        named = dict(zip(posterior.names, point.optima.T, strict=True))
+        try:
+            other = problem.reconfigured({"noise": noise}, {})
+        except InputError:
+            continue  # it has not what [model] says of its parameters
         # What only the other noise has starts at its prior's median.
+        named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
-        worth[noise] = climb(other, places, least=rough.log_density).log_evidence
+        worth[noise] = sum(
+            climb(
+                other.alone(name), other.select_draws(places, name), least=fit.log_density
+            ).log_evidence
+            for name, fit in rough.items()
+        )
     best = max(worth, key=lambda noise: worth[noise])
     if worth[best] < worth[default] + TIED:
         best = default
