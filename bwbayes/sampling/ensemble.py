@@ -108,7 +108,11 @@ class _Path:
 
     def __init__(self, state: EnsembleState, steps: int, kinds: int) -> None:
         self.here, self.density = state.coordinates.copy(), state.log_density.copy()
-        self.random = _generator(state.random_state)
+        # The state is as `_words` lays it out.
+        words = state.random_state
+        normal = float(np.ascontiguousarray(words[626:628]).view(np.float64)[0])
+        self.random = np.random.RandomState(np.random.MT19937(0))
+        self.random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
         walkers, free = self.here.shape
         self.coordinates = np.empty((steps, walkers, free))
         self.log_density = np.empty((steps, walkers))
@@ -219,11 +223,3 @@ def _words(random: np.random.RandomState) -> NDArray[np.uint32]:
     _, words, position, has_normal, normal = random.get_state()
     position_and_flag = np.array([position, has_normal], dtype=np.uint32)
     return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
-
-
-def _generator(words: NDArray[np.uint32]) -> np.random.RandomState:
-    """Return the generator in that state."""
-    normal = float(np.ascontiguousarray(words[626:628]).view(np.float64)[0])
-    random = np.random.RandomState(np.random.MT19937(0))
-    random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
-    return random

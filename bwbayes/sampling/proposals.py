@@ -96,7 +96,15 @@ class StudentMixture:
             mixture = mixture._fitted_on(sample)
         if log_density is not None:
             draws = draws[:count]
-            mixture = mixture._with_worst(draws, log_density - mixture.log_density(draws))
+            log_ratio = log_density - mixture.log_density(draws)
+            # The 2 % of draws with the largest log p − log q.
+            worst = log_ratio >= np.quantile(log_ratio, 0.98)
+            added = _of_shares(draws, np.stack([worst, ~worst]))
+            mixture = StudentMixture(
+                np.append(0.9 * mixture.weights, 0.1),
+                np.concatenate([mixture.centers, added.centers[:1]]),
+                np.concatenate([mixture.factors, added.factors[:1]]),
+            )
         return replace(mixture, bend=bend)
 
     @classmethod
@@ -214,16 +222,6 @@ class StudentMixture:
         logs = logs[:, np.newaxis] - 0.5 * self.squares(draws)
         density = np.exp(logs - np.max(logs, axis=0))
         return _of_shares(draws, density / np.sum(density, axis=0))
-
-    def _with_worst(self, draws: FloatArray, log_ratio: FloatArray) -> StudentMixture:
-        """Add the component of the 2 % of draws with the largest log p − log q (count,)."""
-        worst = log_ratio >= np.quantile(log_ratio, 0.98)
-        added = _of_shares(draws, np.stack([worst, ~worst]))
-        return StudentMixture(
-            np.append(0.9 * self.weights, 0.1),
-            np.concatenate([self.centers, added.centers[:1]]),
-            np.concatenate([self.factors, added.factors[:1]]),
-        )
 
 
 def _require_spread(draws: FloatArray) -> None:

@@ -27,7 +27,7 @@ that was interrupted goes on: it comes to the same end.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -128,8 +128,16 @@ class _Sampling:
         if not chain.history("sampling"):
             self._tune()
         while (outcome := self._sampled()) is None:
-            blocks = len(chain.history("sampling"))
-            chain.fall_back(blocks, _refit(chain) if self._is_early else None)
+            history, proposal = chain.history("sampling"), None
+            if self._is_early:
+                # To all blocks of the sampling, whether they count or not.
+                fitted_to = Chain(chain.starts)
+                fitted_to.freeze("pilot", chain.proposals["pilot"])
+                for blocks in history:
+                    fitted_to.append("sampling", blocks)
+                thin = thinning(fitted_to.draws("sampling"))
+                proposal = _fitted(fitted_to, "sampling", slice(None), thin)
+            chain.fall_back(len(history), proposal)
         return replace(outcome, remarks=_remarks(chain))
 
     @property
@@ -185,6 +193,7 @@ class _Sampling:
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
+        independent = MOVES.index("mixture")
         begin, end, rate = 0, 1, 0.0
         while rate < 0.5 and end <= 4:
             if chain.blocks("tuning") < end:
@@ -192,7 +201,11 @@ class _Sampling:
             while chain.blocks("tuning") < end:
                 self._extend("tuning")
             proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
-            rate = _taken(chain.history("tuning")[begin:end])
+            # Which part of the places that the proposal proposed was taken; 1 without one.
+            blocks = chain.history("tuning")[begin:end]
+            counts = [block.moves[independent:][:1] for ensembles in blocks for block in ensembles]
+            proposed, accepted = np.sum(np.concatenate(counts), axis=0)
+            rate = float(accepted / proposed) if proposed else 1.0
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
 
@@ -303,14 +316,6 @@ def _agree(draws: FloatArray) -> bool:
     return bool((nested_rhat(draws) < 1.1).all())
 
 
-def _taken(blocks: Sequence[Sequence[Block]]) -> float:
-    """Return which part of the places that the proposal proposed was taken; 1 without one."""
-    independent = MOVES.index("mixture")
-    counts = [block.moves[independent:][:1] for ensembles in blocks for block in ensembles]
-    proposed, accepted = np.sum(np.concatenate(counts), axis=0)
-    return float(accepted / proposed) if proposed else 1.0
-
-
 def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentMixture | None:
     """Fit a proposal to the draws of these steps of a phase, if they span the space."""
     draws = chain.coordinates(phase, thin)[steps]
@@ -320,15 +325,6 @@ def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentM
         return StudentMixture.fitted(flat, log_density.ravel(), guess)
     except np.linalg.LinAlgError:
         return None
-
-
-def _refit(chain: Chain) -> StudentMixture | None:
-    """Fit a proposal to all blocks of the sampling, whether they count or not."""
-    fitted_to = Chain(chain.starts)
-    fitted_to.freeze("pilot", chain.proposals["pilot"])
-    for blocks in chain.history("sampling"):
-        fitted_to.append("sampling", blocks)
-    return _fitted(fitted_to, "sampling", slice(None), thinning(fitted_to.draws("sampling")))
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:

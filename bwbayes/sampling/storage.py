@@ -209,7 +209,18 @@ class ChainFile(Chain):
             for number in count():
                 if (arrays := load(_block_name(phase, number))) is None:
                     break
-                Chain.append(self, phase, _blocks_of(arrays))
+                coordinates, log_density = arrays["coordinates"], arrays["log_density"]
+                blocks = [
+                    Block(
+                        coordinates[:, e],
+                        log_density[:, e],
+                        arrays["accepted"][e],
+                        arrays["moves"][e],
+                        EnsembleState(coordinates[-1, e], log_density[-1, e], state),
+                    )
+                    for e, state in enumerate(arrays["random_state"])
+                ]
+                Chain.append(self, phase, blocks)
         aside = load("set-aside")
         # Blocks are lost from the end: then all that are left count again.
         if aside is not None and aside["blocks"] <= len(self.history("sampling")):
@@ -264,21 +275,6 @@ def _create_folder(path: Path, files: Mapping[str, Arrays]) -> None:
 
 def _block_name(phase: Phase, number: int) -> str:
     return f"{phase}-{number:04d}"
-
-
-def _blocks_of(arrays: Arrays) -> list[Block]:
-    """Return one block of every ensemble."""
-    coordinates, log_density = arrays["coordinates"], arrays["log_density"]
-    return [
-        Block(
-            coordinates[:, e],
-            log_density[:, e],
-            arrays["accepted"][e],
-            arrays["moves"][e],
-            EnsembleState(coordinates[-1, e], log_density[-1, e], state),
-        )
-        for e, state in enumerate(arrays["random_state"])
-    ]
 
 
 def _arrays_of(proposal: StudentMixture | None) -> dict[str, Any]:
