@@ -127,7 +127,17 @@ def _uniform_interval(
 ) -> float | None:
     """Return the interval, s, of a grid on which samples are at these positions, if they are."""
     interval = float(elapsed[-1] / positions[-1])
-    tolerance = _tolerance(stamps, interval, rounding)
+    # A time may be off the grid by 1 % of the interval, or by what printing rounds off, which moves
+    # a time and the grid's ends by half a unit of the last decimal each. A whole unit is already an
+    # uneven sample, and 0.4 intervals keep a missing sample apart from rounding.
+    printed = 0.0
+    for digits in range(3):
+        unit = 10.0 ** (math.floor(math.log10(interval)) - digits)
+        counts = stamps / unit
+        if np.all(np.abs(counts - np.rint(counts)) <= 1e-6 + 1e-15 * np.abs(counts)):
+            printed = 0.999 * unit
+            break
+    tolerance = max(0.01 * interval, min(max(printed, rounding), 0.4 * interval))
     if (np.abs(elapsed - interval * positions) > tolerance).any():
         return None
     return _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
@@ -202,22 +212,6 @@ def _with_gaps(table: ColumnTable, steps: FloatArray) -> IntArray:
         problem = f"gap of {steps[sample]:.6g} s makes the record too long; cut it there"
         raise table.error(problem, "time", sample + 1)
     return np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
-
-
-def _tolerance(stamps: FloatArray, interval: float, rounding: float) -> float:
-    """Return how far a time may be off the grid: 1 % of the interval, or what printing rounds off.
-
-    Rounding moves a time and the grid's ends by half a unit of the last decimal each. A whole
-    unit is already an uneven sample, and 0.4 intervals keep a missing sample apart from rounding.
-    """
-    printed = 0.0
-    for digits in range(3):
-        unit = 10.0 ** (math.floor(math.log10(interval)) - digits)
-        counts = stamps / unit
-        if np.all(np.abs(counts - np.rint(counts)) <= 1e-6 + 1e-15 * np.abs(counts)):
-            printed = 0.999 * unit
-            break
-    return max(0.01 * interval, min(max(printed, rounding), 0.4 * interval))
 
 
 def _exact_interval(

@@ -26,7 +26,17 @@ from bwbayes.record.record import Record
 
 def read_hdf5(path: Path) -> Source:
     """Return the series of numbers in an HDF5 file, whatever error it raises if it is damaged."""
-    _check_lists(path)
+    # HDF5 2.0 would follow two kinds of damaged lists for ever: the free blocks of a heap of names,
+    # which may run in a circle and take all memory, and the texts in a collection, of which one may
+    # have no length.
+    with path.open("rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        base = data.find(b"\x89HDF\r\n\x1a\n")
+        for mark, is_endless in ((b"HEAP", _is_circle), (b"GCOL\1\0\0\0", _stands_still)):
+            at = data.find(mark)
+            while 0 <= at <= len(data) - 32:
+                if is_endless(data, base, at):
+                    raise ValueError("a list in it has no end")
+                at = data.find(mark, at + 1)
     notes: dict[str, dict[str, str]] = {}
     with h5py.File(path, "r") as file:
         series = tuple(_series(path, file, notes, set()))
@@ -108,22 +118,6 @@ def _note(attributes: Any, name: str) -> str:
 def _loaded(path: Path, name: str) -> Any:
     with h5py.File(path, "r") as file:
         return file[name][()]
-
-
-def _check_lists(path: Path) -> None:
-    """Raise a ValueError if HDF5 2.0 would follow a damaged list in the file for ever.
-
-    There are two kinds: the free blocks of a heap of names, which may run in a circle and take all
-    memory, and the texts in a collection, of which one may have no length.
-    """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        base = data.find(b"\x89HDF\r\n\x1a\n")
-        for mark, is_endless in ((b"HEAP", _is_circle), (b"GCOL\1\0\0\0", _stands_still)):
-            at = data.find(mark)
-            while 0 <= at <= len(data) - 32:
-                if is_endless(data, base, at):
-                    raise ValueError("a list in it has no end")
-                at = data.find(mark, at + 1)
 
 
 def _is_circle(data: mmap.mmap, base: int, heap: int) -> bool:
