@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import warnings
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -169,8 +170,15 @@ def test_a_config_is_run_with_each_model_and_gone_on_with(
     assert 0 == bwbayes("compare", "c.toml", *options).status
     after = ChainFile.read(tmp_path / "out/bouc-wen/chain").coordinates("sampling")
     np.testing.assert_array_equal(before, after)
-    (tmp_path / "c.toml").write_text(config.replace("seed = 3", "seed = 4"), encoding="utf-8")
+    # A corrected reading leaves the config as it is: the runs are of another record all the same.
+    record = measured()
+    assert record.displacement is not None
+    corrected = record.displacement + np.where(np.arange(record.samples) == 60, 1.0, 0.0)
+    bw.write_record(replace(record, displacement=corrected), tmp_path / "record.csv")
     (tmp_path / "out/comparison.json").unlink()
+    bwbayes("compare", "c.toml", *options).assert_refused("out/linear: holds another run")
+    bw.write_record(record, tmp_path / "record.csv")
+    (tmp_path / "c.toml").write_text(config.replace("seed = 3", "seed = 4"), encoding="utf-8")
     said = bwbayes("compare", "c.toml", *options)
     assert 2 == said.status
     assert "holds another run" in said.err
