@@ -53,8 +53,7 @@ def with_creep(
     """
     if any(dataset.actuator.creep for dataset in posterior.datasets):
         return posterior, draws
-    creep = _creep(posterior, duration)
-    extended = _extended(posterior, creep)
+    extended, creep = _extended(posterior, duration)
     columns = dict(zip(posterior.names, draws.T, strict=True))
     columns |= {name: np.zeros(len(draws)) for name in creep.names}
     places = extended.prior.unconstrain(np.stack([columns[n] for n in extended.names], axis=1))
@@ -82,8 +81,11 @@ def with_creep(
     return extended, extended.prior.constrain(places)[0]
 
 
-def _creep(posterior: Posterior, duration: float) -> Creep:
-    """Return creep from what is as fast as the drives that were fitted to a plan's length."""
+def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:
+    """Return the posterior of the same records with creep, and the creep.
+
+    It goes from what is as fast as the drives that were fitted to a plan's length.
+    """
     turns = [
         time_between_turns(dataset.voltage, dataset.actuator.interval, dataset.training)
         for dataset in posterior.datasets
@@ -97,11 +99,7 @@ def _creep(posterior: Posterior, duration: float) -> Creep:
     )
     spans = [dataset.span for dataset in posterior.datasets]
     span = Span(min(span.low for span in spans), max(span.high for span in spans))
-    return Creep(tuple(creep_times(interval, max(duration, longest))), reference=span)
-
-
-def _extended(posterior: Posterior, creep: Creep) -> Posterior:
-    """Return the posterior of the same records with creep."""
+    creep = Creep(tuple(creep_times(interval, max(duration, longest))), reference=span)
     datasets = tuple(
         replace(dataset, actuator=replace(dataset.actuator, creep=creep))
         for dataset in posterior.datasets
@@ -113,7 +111,7 @@ def _extended(posterior: Posterior, creep: Creep) -> Posterior:
     }
     joint = replace(posterior.table, actuator_part=datasets[0].actuator)
     prior = JointPrior((declared[name] for name in joint.names), posterior.prior.constraint)
-    return Posterior(datasets, prior, posterior.engine, joint)
+    return Posterior(datasets, prior, posterior.engine, joint), creep
 
 
 def _score(posterior: Posterior, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
