@@ -80,21 +80,19 @@ else:
         for module, names in HOMES.items():
             if name in names:
                 return getattr(import_module(f"{__name__}.{module}"), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{_room(name)}")
+        missing = f"module {__name__!r} has no attribute {name!r}"
+        if not name.startswith("_"):
+            # Its room may have it.
+            root = Path(__file__).parent
+            defined = rf"^(?:(?:class|def) {re.escape(name)}\b|{re.escape(name)}(?::| =))"
+            for path in sorted(root.rglob("*.py")):
+                if re.search(defined, path.read_text("utf-8"), re.MULTILINE):
+                    module = ".".join(path.relative_to(root.parent).with_suffix("").parts)
+                    missing += f"; it is imported from its room: from {module} import {name}"
+                    break
+        raise AttributeError(missing)
 
 
 def __dir__() -> list[str]:
     """List the public names, loaded or not."""
     return sorted(__all__)
-
-
-def _room(name: str) -> str:
-    """Say where a name is imported from, if a module of the package defines it."""
-    if not name.startswith("_"):
-        root = Path(__file__).parent
-        for path in sorted(root.rglob("*.py")):
-            defined = rf"^(?:(?:class|def) {re.escape(name)}\b|{re.escape(name)}(?::| =))"
-            if re.search(defined, path.read_text("utf-8"), re.MULTILINE):
-                module = ".".join(path.relative_to(root.parent).with_suffix("").parts)
-                return f"; it is imported from its room: from {module} import {name}"
-    return ""
