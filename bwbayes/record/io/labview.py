@@ -42,7 +42,16 @@ def plain_lvm(path: Path, text: str) -> tuple[str, float | None]:
         rows = segment.partition("\nChannels")[0].split("\n")[1:]
         names, *samples = [row for row in rows if row.strip(f" {separator}")]
         if number == 0:
-            lines += ["", separator.join(_with_units(names.split(separator), keys, x_columns))]
+            stride = 2 if x_columns == "Multi" else 1
+            units = {1 + stride * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
+            if keys.get("X_Dimension", ["Time"])[0] == "Time":
+                units[0] = "s"
+            columns = names.split(separator)
+            named = [f"{n} [{units[i]}]" if units.get(i) else n for i, n in enumerate(columns)]
+            # Of several columns of times the first one counts.
+            for i in range(2, len(named) - 1, 2) if x_columns == "Multi" else ():
+                named[i] += f" {i + 1}"
+            lines += ["", separator.join(named)]
         lines += samples
     step = None
     if x_columns == "No":  # the column of times is there, and empty
@@ -55,18 +64,6 @@ def _keys(header: str, separator: str) -> dict[str, list[str]]:
     """Return the values of a header's keys, one a channel."""
     rows = [line.split(separator) for line in header.split("\n")]
     return {row[0].strip(): [cell.strip() for cell in row[1:] if cell.strip()] for row in rows}
-
-
-def _with_units(names: list[str], keys: dict[str, list[str]], x_columns: str) -> list[str]:
-    """Return the names of columns with their channels' units."""
-    stride = 2 if x_columns == "Multi" else 1
-    units = {1 + stride * i: unit for i, unit in enumerate(keys.get("Y_Unit_Label", []))}
-    if keys.get("X_Dimension", ["Time"])[0] == "Time":
-        units[0] = "s"
-    named = [f"{name} [{units[i]}]" if units.get(i) else name for i, name in enumerate(names)]
-    # Of several columns of times the first one counts.
-    later = range(2, len(names) - 1, 2) if x_columns == "Multi" else ()
-    return [f"{name} {i + 1}" if i in later else name for i, name in enumerate(named)]
 
 
 def read_tdms(path: Path) -> Source:

@@ -88,9 +88,7 @@ def read_text(path: Path) -> Source:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     body = lines[layout.first :]
-    if not is_whole and _is_cut(body, layout.separator):
-        raise InputError(f"{path}:{len(lines)}: the last line is cut off; remove it")
-    _check_fields(path, body, layout, len(names))
+    _check_lines(path, body, layout, len(names), is_whole=is_whole)
     frame, decimal = _parsed(path, body, layout)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -237,9 +235,24 @@ def _split_header(line: str, layout: _Layout) -> list[str]:
     return []
 
 
-def _check_fields(path: Path, body: Sequence[str], layout: _Layout, names: int) -> None:
-    """Refuse a line that has fewer fields than the others, or more than the header."""
+def _check_lines(
+    path: Path, body: Sequence[str], layout: _Layout, names: int, *, is_whole: bool
+) -> None:
+    """Refuse a line that has fewer fields than the others, or more than the header.
+
+    Also a last line that is cut off, unless the text ``is_whole``: its last number is missing, or
+    has fewer decimals than all the numbers above it have alike.
+    """
     separator, fields = layout.separator, layout.fields
+    column = [line.rpartition(separator)[2].strip() for line in body[-50:]]
+    if not column[-1] or len(column) < 6 or any("e" in cell.lower() for cell in column):
+        is_cut = not column[-1] and all(column[:-1])
+    else:
+        decimals = [len(re.split("[.,]", cell)[-1]) for cell in column if cell]
+        is_cut = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
+    if is_cut and not is_whole:
+        line_number = layout.first + len(body)
+        raise InputError(f"{path}:{line_number}: the last line is cut off; remove it")
     for index, line in enumerate(body):
         if (len(line.split()) if separator == " " else line.count(separator) + 1) == fields:
             continue
@@ -330,12 +343,3 @@ def _numbers(
         warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
         return np.asarray(numbers, dtype=np.float64)
     raise InputError(f"{where} is not a number; write it like 1.5, or nothing where it is missing")
-
-
-def _is_cut(body: Sequence[str], separator: str) -> bool:
-    """Tell whether the last number has fewer decimals than all the numbers above it have alike."""
-    cells = [line.rpartition(separator)[2].strip() for line in body[-50:]]
-    if not cells[-1] or len(cells) < 6 or any("e" in cell.lower() for cell in cells):
-        return not cells[-1] and all(cells[:-1])
-    decimals = [len(re.split("[.,]", cell)[-1]) for cell in cells if cell]
-    return len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
