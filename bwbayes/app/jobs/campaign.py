@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, checked, dump, load, parse, read_toml
+from bwbayes.app.config.config import checked, dump, load, parse, read_toml
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
@@ -150,8 +150,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
         warnings.simplefilter("ignore", InputWarning)
         try:
             record = digest(file)
-            problem = resolve(_config_of(file, campaign), Path(origin.where))
-            folder = _run_folder(run, problem)
+            folder = _run_folder(file, campaign)
             fit = resume_run(folder, Console(quiet=True), workers=1, files=origin.pictures)
             if not origin.pictures:
                 write_summary(folder.summary, fit.numbers)
@@ -169,26 +168,25 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
             return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
 
 
-def _config_of(file: Path, campaign: CampaignFolder) -> Config:
+def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
+    """Return a record's run as it stands, if it is of this record and config; a new one if not."""
+    where = Path(campaign.origin().where)
     if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = propose(file, Path(campaign.origin().where))
+        proposal = propose(file, where)
         if proposal.pointless is not None:
             raise InputError(f"{file}: {proposal.pointless.error}")
         config = proposal.config
-    return config.model_copy(update={"name": file.stem})
-
-
-def _run_folder(path: Path, problem: Problem) -> RunFolder:
-    """Return the run's folder as it stands, if it is of this problem; a new one if not."""
+    problem = resolve(config.model_copy(update={"name": file.stem}), where)
+    path = campaign.run(file.stem)
     if path.exists():
         try:
             existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            config = load(existing.config)
-            expected = problem.with_noise(config.model.noise)
-            same_posterior = fingerprint(config) == fingerprint(expected)
+            written = load(existing.config)
+            expected = problem.with_noise(written.model.noise)
+            same_posterior = fingerprint(written) == fingerprint(expected)
             if same_posterior and existing.problem().record.sha256 == problem.record.sha256:
                 return existing
         except (InputError, OSError):
