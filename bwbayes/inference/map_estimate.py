@@ -206,9 +206,13 @@ def _mode(
     """
     surface = _Surface(posterior, start, _units(posterior, start, np.sqrt(np.diag(spread))))
     position, curvature = start, None
+    path = np.linspace(0.0, 1.0, 33)[:, np.newaxis]
     for _ in range(4):
-        if any(_leads_to(posterior, position, mode) for mode in modes):
-            return None
+        for mode in modes:
+            # It leads there if the density rises all the way, but for dips of half a nat.
+            density = posterior.log_density(position + path * (mode.position - position))
+            if np.all(density > np.maximum.accumulate(density) - 0.5):
+                return None
         # Each round measures in the units of the last curvature: finite differences need them.
         solution = scipy.optimize.minimize(
             surface.value,
@@ -227,13 +231,6 @@ def _mode(
     return _Mode(
         position, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(position)))
     )
-
-
-def _leads_to(posterior: Posterior, position: FloatArray, mode: _Mode) -> bool:
-    """Tell whether the density rises from a place (free,) to a mode, but for dips of half a nat."""
-    path = np.linspace(0.0, 1.0, 33)[:, np.newaxis]
-    density = posterior.log_density(position + path * (mode.position - position))
-    return bool(np.all(density > np.maximum.accumulate(density) - 0.5))
 
 
 def _units(posterior: Posterior, position: FloatArray, spread: FloatArray) -> FloatArray:
