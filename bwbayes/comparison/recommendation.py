@@ -4,9 +4,10 @@ One rule. What a model is worth is the joint log density of the later readings, 
 ones (:mod:`~bwbayes.comparison.leave_future_out`), summed over the later half of the training
 readings and all that was held out. A part worth fewer than five independent readings has no vote.
 Models tie if their sums differ by less than four nats, or than the 95 % limit of blocks longer than
-the correlation time. Of those that tie, the log evidence leaves out what is less probable by odds
-of twenty to one; of what is then left the plainest is recommended, and the tie is said. Where no
-part has a vote, the log evidence decides alone.
+the correlation time. Of those that tie, the one of most log evidence is recommended, which weighs
+what a model says against how much it leaves open; others stay tied unless they are less probable by
+odds of twenty to one, and the tie is said. Where no part has a vote, the log evidence decides
+alone, and where its Monte Carlo error leaves it open, the plainest is recommended.
 """
 
 from __future__ import annotations
@@ -60,17 +61,17 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     ordered = sorted(counted, key=lambda candidate: -value(candidate))
     differences = {candidate.name: below(candidate, ordered[0]) for candidate in ordered}
     near = [candidate for candidate in ordered if not differences[candidate.name].worse]
-    tied = near
-    if voting and all(_is_known(candidate) for candidate in near):
-        top = max(near, key=lambda candidate: candidate.log_evidence)
-        tied = [candidate for candidate in near if not _less_probable(candidate, top).worse]
-    recommended = min(tied, key=lambda candidate: (candidate.free, -value(candidate)))
+    if all(_is_known(candidate) for candidate in near):
+        chosen = min(near, key=lambda candidate: (-candidate.log_evidence, candidate.free))
+        tied = [candidate for candidate in near if not _less_probable(candidate, chosen).worse]
+    else:
+        chosen, tied = min(near, key=lambda candidate: (candidate.free, -value(candidate))), near
     comparison = Comparison(
         (*ordered, *unusable),
         voting,
         differences,
-        recommended.name,
-        tuple(candidate.name for candidate in tied if candidate is not recommended),
+        chosen.name,
+        tuple(candidate.name for candidate in tied if candidate is not chosen),
         facts=facts,
     )
     without_vote = [
@@ -146,7 +147,9 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
     screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
     if tied:
         names = _listed([recommended.name, *tied])
-        yield f"{names} are indistinguishable; {recommended.name} is the simplest"
+        known = all(_is_known(comparison[name]) for name in (recommended.name, *tied))
+        why = "most probable" if known else "simplest"
+        yield f"{names} are indistinguishable; {recommended.name} is the {why}"
     elif len(comparison.differences) > 1 or screened:
         yield f"{recommended.name} is recommended"
     else:

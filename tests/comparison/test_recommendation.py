@@ -56,6 +56,16 @@ def test_scores_that_tie_are_told_apart_by_the_evidence_if_it_is_sure() -> None:
     assert (comparison.recommended, comparison.tied) == ("rich", ())
     assert any("log evidence is lower by 10.0" in line for line in comparison.lines)
     comparison = recommend([model("plain", COMMON), model("rich", near, 2.0, 9)])
+    assert (comparison.recommended, comparison.tied) == ("rich", ("plain",))
+    expected = "rich and plain are indistinguishable; rich is the most probable"
+    assert comparison.lines[0] == expected
+
+
+def test_of_scores_that_tie_the_plainest_is_taken_where_the_evidence_is_not_sure() -> None:
+    near = model("rich", COMMON + 0.1 * noise(2), 2.0, 9)
+    assert near.evidence is not None
+    unsure = replace(near, evidence=replace(near.evidence, error=0.6))
+    comparison = recommend([model("plain", COMMON), unsure])
     assert (comparison.recommended, comparison.tied) == ("plain", ("rich",))
     expected = "plain and rich are indistinguishable; plain is the simplest"
     assert comparison.lines[0] == expected
@@ -120,8 +130,8 @@ def test_without_hysteresis_it_says_so() -> None:
     comparison = recommend([linear, rich])
     assert comparison.recommended == "linear"
     assert comparison.lines[1].startswith("the record shows no hysteresis")
-    # One that is alike, but not the plainest, leaves it open.
-    comparison = recommend([replace(linear, free=9), rich])
+    # One that is alike, but less probable, leaves it open.
+    comparison = recommend([model("linear", COMMON, -2.0, 3, hysteresis=False), rich])
     assert "whether there is any hysteresis cannot be told" in comparison.lines
 
 
