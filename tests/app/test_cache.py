@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
@@ -56,7 +57,7 @@ def test_to_open_a_run_is_to_read_files(run: Path) -> None:
     assert not slow & set(opened.stdout.decode().split())
 
 
-@pytest.mark.parametrize("damage", ["cut", "missing", "config"])
+@pytest.mark.parametrize("damage", ["cut", "missing", "config", "record"])
 def test_what_is_damaged_or_of_another_state_is_worked_out_again(
     run: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -67,6 +68,11 @@ def test_what_is_damaged_or_of_another_state_is_worked_out_again(
         (folder / "result.npz").write_bytes(content[: len(content) // 2])
     elif damage == "missing":
         (folder / "result.npz").unlink()
+    elif damage == "record":
+        file = folder / "records/sine.h5"  # predicted, not fitted
+        record = bw.read_record(file)
+        assert record.displacement is not None
+        bw.write_record(replace(record, displacement=record.displacement + 1.0), file)
     else:
         config = (folder / "config.toml").read_text(encoding="utf-8")
         (folder / "config.toml").write_text(f'name = "other"\n{config.partition(chr(10))[2]}')

@@ -292,15 +292,9 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
     if path.exists() and not overwrite:
         folder = RunFolder.open(path)
         expected = problem.with_noise(load(folder.config).model.noise)
-        is_same = folder.config.read_text(encoding="utf-8") == dump(expected)
-        if is_same:
-            # A config has no more of its records than their ranges and names.
-            before, now = (
-                {name: record.sha256 for name, record in {**p.records, **p.others}.items()}
-                for p in (folder.problem(), problem)
-            )
-            is_same = before == now
-        if not is_same:
+        same_config = folder.config.read_text(encoding="utf-8") == dump(expected)
+        # A config has no more of its records than their ranges and names.
+        if not same_config or folder.problem().digests != problem.digests:
             raise InputError(
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )

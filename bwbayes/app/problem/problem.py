@@ -130,6 +130,11 @@ class Problem:
         return sha256(json.dumps(digests).encode()).hexdigest()
 
     @property
+    def digests(self) -> dict[str, str]:
+        """The digest of each record by name, of those that are fitted and those predicted."""
+        return {name: record.sha256 for name, record in {**self.records, **self.others}.items()}
+
+    @property
     def facts(self) -> dict[str, str]:
         """What is fitted, for people: one line each, by subject."""
         facts = {}

@@ -29,7 +29,7 @@ def state_of(problem: Problem, chain: ChainFile) -> str:
     """Return a digest of all that a result depends on."""
     depends = (
         dump(problem.config),
-        problem.sha256,
+        problem.digests,
         versions(problem.posterior.engine),
         chain.attributes(),
         chain.steps("sampling"),
