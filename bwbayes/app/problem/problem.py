@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
@@ -216,6 +217,12 @@ class Problem:
             named = model.model_copy(update={"noise": chosen})
             return self.config.model_copy(update={"model": named})
         return self.changed(self.config, {"noise": chosen}, {})
+
+    def saying(self, config: Config) -> Problem:
+        """Return the same problem under a config that says the same, with all that is known."""
+        other = copy(self)
+        object.__setattr__(other, "config", config)
+        return other
 
     def windows(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record by the names of their bands, fitted ones first.

@@ -184,9 +184,12 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
     if config.model.noise == "auto":
         noise, why = chosen_noise(problem, point)
         console.print(why, highlight=False, soft_wrap=True)
-        _rewrite(folder, problem.with_noise(noise))
-        problem = folder.problem()
-        if noise != config.model.noise_until_chosen:
+        named = problem.with_noise(noise)
+        _rewrite(folder, named)
+        if noise == config.model.noise_until_chosen:
+            problem = problem.saying(named)
+        else:
+            problem = folder.problem()
             point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
     posterior, config = problem.posterior, problem.config
     attributes: dict[str, str | int] = {
