@@ -24,7 +24,7 @@ from bwbayes.app.config.config import Config, dump, load
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
-from bwbayes.app.problem.parameters import actuator_of, in_words
+from bwbayes.app.problem.parameters import in_words, with_model
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, training_records
 from bwbayes.app.running.folder import RunFolder
@@ -40,8 +40,6 @@ from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
 from bwbayes.comparison.recommendation import recommend
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.noise import noise_model
-from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.prediction.scores import score
 from bwbayes.record import Record
@@ -133,7 +131,8 @@ def compare_models(
     _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
     folders: dict[str, RunFolder] = {}
     for name, model in models.items():
-        problem = resolve(_with_model(config, model, name, [*wholes.values()]), where, in_memory)
+        named = config.model_copy(update={"name": name})
+        problem = resolve(with_model(named, model, [*wholes.values()]), where, in_memory)
         folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
         folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
@@ -269,22 +268,6 @@ def _standing(folder: RunFolder, files: bool) -> Standing:
         # What is wrong with a model is among what speaks against it.
         warnings.simplefilter("ignore", InputWarning)
         return resume(folder, Console(quiet=True), workers=1, files=files).standing
-
-
-def _with_model(config: Config, model: ModelConfig, name: str, records: Sequence[Record]) -> Config:
-    """Return the config with another model, and of what it says of parameters what that has."""
-    noise = noise_model(model.noise_until_chosen, records[0].interval)
-    names = ParameterTable(actuator_of(model, records[0], records), noise).names
-    # A parameter of one record is called name[record].
-    applicable = {
-        key: {p: value for p, value in getattr(config, key).items() if p.partition("[")[0] in names}
-        for key in ("parameters", "truth")
-    }
-    scopes = {
-        key: [p for p in getattr(model, key) if p in names] for key in ("per_record", "shared")
-    }
-    changes = {"model": model.model_copy(update=scopes), "name": name, **applicable}
-    return config.model_copy(update=changes)
 
 
 def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:

@@ -18,7 +18,7 @@ from bwbayes.app.config.settings import ActuatorConfig, ModelConfig, ParameterCo
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.defaults import joined, ranges_of
-from bwbayes.inference.noise import NOISES
+from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.actuator import OFFSET, Actuator
@@ -209,6 +209,29 @@ def as_config(parameter: Parameter) -> ParameterConfig:
         label=parameter.label,
         description=parameter.description,
     )
+
+
+def with_model(config: Config, model: ModelConfig, records: Sequence[Record]) -> Config:
+    """Return a config with another model, and of what it says of parameters what that has too.
+
+    A parameter of another unit is another one, whatever its name.
+    """
+    actuator = actuator_of(model, records[0], records)
+    noise = noise_model(model.noise_until_chosen, actuator.interval)
+    units = {each.name: each.unit for each in ParameterTable(actuator, noise).declarations}
+    # A parameter of one record alone is called name[record].
+    parameters = {
+        name: stated
+        for name, stated in config.parameters.items()
+        if (plain := name.partition("[")[0]) in units and stated.unit in (None, units[plain])
+    }
+    truth = {n: value for n, value in config.truth.items() if n.partition("[")[0] in units}
+    scopes = {
+        key: [name for name in getattr(model, key) if name in units]
+        for key in ("per_record", "shared")
+    }
+    model = model.model_copy(update=scopes)
+    return config.model_copy(update={"model": model, "parameters": parameters, "truth": truth})
 
 
 def actuator_of(model: ActuatorConfig, record: Record, records: Sequence[Record]) -> Actuator:

@@ -31,6 +31,7 @@ from bwbayes.app.problem.parameters import (
     parameters_of,
     readings_of,
     recoverable,
+    with_model,
 )
 from bwbayes.app.problem.records import (
     Slices,
@@ -195,27 +196,17 @@ class Problem:
         """
         options = dict.fromkeys(OPTIONS if "hysteresis" in changes else ())
         model = config.model.model_copy(update={**options, **changes})
-        actuator = actuator_of(model, self.record, list(self.records.values()))
-        noise = noise_model(model.noise_until_chosen, actuator.interval)
-        scopes = tuple(model.per_record), tuple(model.shared)
-        table = ParameterTable(actuator, noise, tuple(self.records), *scopes)
-        units = {column.name: column.declaration.unit for column in table.layout}
         added = {name: ParameterConfig(**stated) for name, stated in parameters.items()}
-        stated = {**added, **config.parameters}
-        shared = {n: p for n, p in stated.items() if n in units and p.unit in (None, units[n])}
-        return config.model_copy(update={"model": model, "parameters": shared, "truth": {}})
+        stated = config.model_copy(update={"parameters": {**added, **config.parameters}})
+        return with_model(stated, model, list(self.records.values()))
 
     def with_noise(self, chosen: str) -> Config:
         """Return the config as a run writes it whose noise, ``auto``, came to this one.
 
         As it is, if it names a noise, or none is chosen yet.
         """
-        model = self.config.model
-        if model.noise != "auto" or chosen == "auto":
+        if self.config.model.noise != "auto" or chosen == "auto":
             return self.config
-        if chosen == model.noise_until_chosen:
-            named = model.model_copy(update={"noise": chosen})
-            return self.config.model_copy(update={"model": named})
         return self.changed(self.config, {"noise": chosen}, {})
 
     def saying(self, config: Config) -> Problem:

@@ -90,10 +90,7 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
     for noise in [n for n in NOISES if n not in worth and (n == "white" or p < colored)]:
-        try:
-            other = problem.reconfigured({"noise": noise}, {})
-        except InputError:
-            continue  # it has not what [model] says of its parameters
+        other = problem.reconfigured({"noise": noise}, {})
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
