@@ -259,3 +259,16 @@ def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Pat
 
     assert records(1) == records(1)
     assert not {*records(1)} & {*records(2), None}
+
+
+def test_with_another_noise_what_is_known_and_said_of_its_parameters_stays(tmp_path: Path) -> None:
+    """But for what the other noise has not; what only it has gets its default."""
+    before = resolve(small.config(), tmp_path)
+    discrepancy = {"discrepancy_sd", "discrepancy_time"}
+    for noise, gone in (("discrepancy", set()), ("smooth", set()), ("white", discrepancy)):
+        after = before.with_noise(noise)
+        assert noise == after.model.noise
+        for key in ("truth", "parameters"):
+            stated = getattr(before.config, key).items()
+            assert getattr(after, key) == {n: value for n, value in stated if n not in gone}
+    assert before.config.truth
