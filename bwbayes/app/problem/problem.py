@@ -209,7 +209,7 @@ class Problem:
             return self.config
         return self.changed(self.config, {"noise": chosen}, {})
 
-    def saying(self, config: Config) -> Problem:
+    def with_config(self, config: Config) -> Problem:
         """Return the same problem under a config that says the same, with all that is known."""
         other = copy(self)
         object.__setattr__(other, "config", config)

@@ -187,7 +187,7 @@ def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Probl
         named = problem.with_noise(noise)
         _rewrite(folder, named)
         if noise == config.model.noise_until_chosen:
-            problem = problem.saying(named)
+            problem = problem.with_config(named)
         else:
             problem = folder.problem()
             point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
