@@ -121,7 +121,8 @@ def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     text = f"outliers ({int(np.sum(np.abs(white) > 5))} of {white.size} innovations beyond 5 SD)"
     rmse = scene.without[0], scene.fit.rmse
     fix = "set outliers = true in [model]"
-    yield Explanation("heavy tails", text, fix, nats=tail_nats(white) - scene.lead, rmse=rmse)
+    nats = tail_nats(white) - scene.lead
+    yield Explanation("heavy tails", text, fix, nats=nats, rmse=rmse, foreign=True)
 
 
 def tail_nats(white: FloatArray) -> float:

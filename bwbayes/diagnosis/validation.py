@@ -10,7 +10,8 @@ fails when it misses more than a part of the displacement's range.
 A verdict that fails names the likely cause: on readings that were fitted the explanation with the
 best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
 residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
-the best explanation is a transient, a drift or a step without which a parameter is another one.
+the best explanation is something that the actuator has not done, as a transient, a drift or
+outliers: parameters that have followed it are others.
 
 What everything carries along that builds on a run is its :class:`Standing`: it goes first on every
 page, into every file of numbers, and decides the exit status of every command.

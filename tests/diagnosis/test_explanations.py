@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import effects, explanations, model
-from bwbayes.diagnosis.explanations import LIMIT, explain, likely_causes
+from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate as pointfit
@@ -79,9 +79,11 @@ FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
 def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     kind: str, tmp_path: Path
 ) -> None:
+    """What the actuator has not done keeps a fit from passing, whatever its bands cover."""
     best = max(FAMILIES[kind](scene(kind, 0, tmp_path, 5.0)), key=lambda found: found.nats)
     assert best.kind in CAUSES[kind]
     assert best.nats > LIMIT
+    assert bool(followed_causes([best])) is (kind in {"transient", "drift", "outliers"})
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
