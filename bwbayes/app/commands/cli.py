@@ -126,4 +126,6 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         line, status = _failure(error)
         click.echo(line, err=True)
+    # All that is left ends with the process: to look through it once more takes a second.
+    gc.freeze()
     sys.exit(status if isinstance(status, int) else 0)
