@@ -10,35 +10,38 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from markupsafe import Markup
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.report.product import Product
 from bwbayes.report.report import (
+    UNKNOWN,
     Banner,
     Facts,
     Report,
     Section,
     Table,
     TableColumn,
-    Target,
     kind_of,
     standing_banner,
 )
 from bwbayes.report.words import mark, with_error
 
-# The columns of the models' table: title, text with the numbers of a model, and where it is shown.
-COLUMNS: tuple[tuple[str, str, Target], ...] = (
-    ("Free", "{free}", "both"),
-    ("Log score", "{log_score:.1f}", "both"),
-    ("CRPS", "{held_out[crps_um]:.3g} µm", "page"),
-    ("NRMSE", "{held_out[nrmse]:.2%}", "both"),
-    ("95% covers", "{held_out[coverage]:.1%} ± {held_out[coverage_error]:.1%}", "both"),
-    ("95% width", "{held_out[width_um]:.3g} µm", "page"),
-    ("Log evidence", "{log_evidence:.2f} ± {log_evidence_error:.2f}", "both"),
-    ("Priors' share", "{prior_share:.1f}", "both"),
-    ("AIC", "{aic:.1f}", "page"),
-    ("BIC", "{bic:.1f}", "page"),
+# The columns of the models' table.
+COLUMNS = (
+    TableColumn("Model", text="{name}"),
+    TableColumn("Validation", text=Markup("{status}")),
+    TableColumn("Free", text="{free}"),
+    TableColumn("Log score", text="{log_score:.1f}"),
+    TableColumn("CRPS", on="page", text="{held_out[crps_um]:.3g} µm"),
+    TableColumn("NRMSE", text="{held_out[nrmse]:.2%}"),
+    TableColumn("95% covers", text="{held_out[coverage]:.1%} ± {held_out[coverage_error]:.1%}"),
+    TableColumn("95% width", on="page", text="{held_out[width_um]:.3g} µm"),
+    TableColumn("Log evidence", text="{evidence}"),
+    TableColumn("Priors' share", text="{prior_share:.1f}"),
+    TableColumn("AIC", on="page", text="{aic:.1f}"),
+    TableColumn("BIC", on="page", text="{bic:.1f}"),
 )
 
 
@@ -165,21 +168,23 @@ class Comparison(Product):
     def _models_table(self) -> Table:
         rows = []
         for model in self.candidates:
-            status = "–" if model.standing is None else mark(model.standing.status)
+            row = {"name": model.name, **self._model_numbers(model)}
+            row["status"] = UNKNOWN if model.standing is None else mark(model.standing.status)
             if not model.converged:
-                status = "only screened" if model.screened else "not converged"
-            numbers = self._model_numbers(model)
+                row["status"] = "only screened" if model.screened else "not converged"
             if self.voting and model.converged:
-                numbers["log_score"] = model.log_score(self.voting)
-            texts = [_text(text, numbers) for _, text, _ in COLUMNS]
-            if model.screened and model.evidence is not None:
-                texts[6] = f"about {model.evidence.log_evidence:.0f}"
-            rows.append((model.name, status, *texts))
-        return Table(
+                row["log_score"] = model.log_score(self.voting)
+            if model.evidence is not None:
+                text = "about {log_evidence:.0f}"
+                if not model.screened:
+                    text = "{log_evidence:.2f} ± {log_evidence_error:.2f}"
+                row["evidence"] = text.format_map(row)
+            rows.append(row)
+        return Table.of(
             "models",
             "Models",
-            ("Model", "Validation", *(TableColumn(title, on=on) for title, _, on in COLUMNS)),
             rows,
+            COLUMNS,
             records=self.to_pandas().reset_index().to_dict("records"),
             note="Log score: joint log density of the later readings, each given all before it, "
             "summed over the parts that vote; nats. CRPS, NRMSE, coverage and width on what was "
@@ -197,12 +202,13 @@ class Comparison(Product):
             model, best = self[name], self[str(self.best)]
             texts = [f"{'+' * (apart.value > 0)}{with_error(apart.value, apart.error)}"]
             for part in parts:
-                scored = part in model.parts
-                gain = model.log_score([part]) - best.log_score([part]) if scored else None
-                text = "{gain:+.3g}" if part in self.voting else "({gain:+.3g})"
-                texts.append(_text(text, {"gain": gain}))
+                if part not in model.parts:
+                    texts.append(UNKNOWN)
+                    continue
+                gain = f"{model.log_score([part]) - best.log_score([part]):+.3g}"
+                texts.append(gain if part in self.voting else f"({gain})")
             advantage = model.log_evidence - best.log_evidence
-            texts.append(f"{advantage:+.3g}" if np.isfinite(advantage) else "–")
+            texts.append(f"{advantage:+.3g}" if np.isfinite(advantage) else UNKNOWN)
             rows.append((name, *texts))
         return Table(
             "differences",
@@ -215,11 +221,3 @@ class Comparison(Product):
             "95% limit of the error, does not tell models apart.",
             on="both",
         )
-
-
-def _text(text: str, numbers: Mapping[str, Any]) -> str:
-    """Fill in numbers; a dash where they are not known."""
-    try:
-        return text.format_map(numbers)
-    except (KeyError, TypeError):
-        return "–"
