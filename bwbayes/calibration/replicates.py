@@ -11,10 +11,10 @@ made; :mod:`bwbayes.calibration.evaluation` judges many of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, repeat
 from typing import TypedDict
 
 import numpy as np
@@ -66,9 +66,9 @@ class Experiment:
         used.
     plan
         How to sample.
-    held_out, belongs
+    held_out
         Windows (slices of a record's voltage) for which bands are predicted and held against the
-        simulated record, by name; and the record that each is of, by default the first.
+        simulated record, by the record's name.
     others
         Other records, by name: simulated with the same truth, but with a start and an offset of
         their own, and predicted with the parameters from the posterior.
@@ -81,10 +81,9 @@ class Experiment:
 
     posterior: Posterior
     plan: SamplingPlan
-    held_out: Mapping[str, slice] = field(default_factory=dict)
+    held_out: Mapping[str, Sequence[slice]] = field(default_factory=dict)
     others: Mapping[str, OtherRecord] = field(default_factory=dict)
     source: Posterior | None = None
-    belongs: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def truth(self) -> Posterior:
@@ -280,26 +279,19 @@ def _predictions(
 
     Each prediction comes with what it is of, and with the samples of it that count.
     """
-    held_out: list[tuple[Bands, Simulated, slice]] = []
-    first = posterior.table.records[0]
+    predictions: dict[str, list[tuple[Bands, Simulated, slice]]] = {}
     for name, single, record_draws in posterior.each(draws):
-        windows = {
-            window: samples
-            for window, samples in experiment.held_out.items()
-            if experiment.belongs.get(window, first) == name
-        }
-        if windows:
+        if name in experiment.held_out:
+            windows = {str(window): window for window in experiment.held_out[name]}
             record = simulated[name].record
             bands = predict_windows(single, record_draws, record, windows, predicting)
-            held_out += [
-                (b, simulated[name], w) for b, w in zip(bands, windows.values(), strict=True)
-            ]
-    predictions = {"": held_out} if held_out else {}
+            held_out = zip(bands, repeat(simulated[name]), windows.values())
+            predictions.setdefault("", []).extend(held_out)
     readings = {dataset.name: dataset.displacement for dataset in posterior.datasets}
     source = experiment.truth.with_readings(readings)
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     for name, other in experiment.others.items():
-        like = other.like or first
+        like = other.like or posterior.table.records[0]
         another = other.simulated(source.alone(like), source.table.of(true, like), others)
         single, record_draws = posterior.alone(like), posterior.select_draws(draws, like)
         predictions[name] = [other.predicted(single, record_draws, another, others)]

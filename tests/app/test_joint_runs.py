@@ -145,7 +145,7 @@ def test_any_other_record_is_predicted(finished: RunFolder) -> None:
 def test_replicates_make_all_records_anew() -> None:
     """Each with its own readings."""
     common = experiment(problem(("ess = 150", "ess = 100")))
-    assert {"later": "loops"} == common.belongs
+    assert ["loops"] == [*common.held_out]
     entry = replicate(common, 1, 0).entry
     assert entry["converged"]
     assert {"offset[loops]", "offset[step]", "loop_area", "d"} <= entry["truth"].keys()

@@ -39,7 +39,7 @@ PLAN = SamplingPlan(ess=100, walkers=12, block=10, most_pilot_steps=30, most_ste
 def small(**changes: object) -> Experiment:
     """Return an experiment of 80 samples, of which 20 are held out."""
     posterior = short_posterior("white", 80, fixed=FIXED, priors=PRIORS, training=(slice(0, 60),))
-    return replace(Experiment(posterior, PLAN, {"end": slice(60, 80)}), **changes)  # type: ignore[arg-type]
+    return replace(Experiment(posterior, PLAN, {"record": [slice(60, 80)]}), **changes)  # type: ignore[arg-type]
 
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:

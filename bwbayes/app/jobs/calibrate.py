@@ -15,6 +15,7 @@ import shutil
 from concurrent.futures import Executor
 from dataclasses import replace
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +72,16 @@ def experiment(problem: Problem) -> Experiment:
     # Refused is a prior of which no draw is possible.
     problem.posterior.prior.draw(np.random.default_rng(0), 64)
     windows = {
-        f"{name} {i}" if i else name: window
-        for name, v in problem.validations.items()
-        for i, window in enumerate(v.windows)
+        record: [*chain(*held_out.values())]
+        for record in problem.records
+        if (held_out := problem.held_out(record))
     }
     others = {
         name: OtherRecord(v.record, v.start, v.judged, v.of)
         for name, v in problem.validations.items()
         if v.record is not None
     }
-    belongs = {name: problem.validations[name.partition(" ")[0]].of for name in windows}
-    return Experiment(problem.posterior, problem.plan, windows, others, belongs=belongs)
+    return Experiment(problem.posterior, problem.plan, windows, others)
 
 
 def resume(
