@@ -17,7 +17,6 @@ from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     Stuck,
     clipped,
-    find_gross_outliers,
     held,
     repeated,
     scatter,
@@ -127,20 +126,25 @@ def _plausibility(record: Record) -> Iterator[Finding]:
 def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     """Return the samples whose readings are isolated outliers; none if they are more than 5 %.
 
-    With `ends` also a first or last reading that may as well belong to a transient.
+    Ranges are measured anew without those that are found, until none is. With `ends` also a first
+    or last reading that may as well belong to a transient: one that is no more than twice the range
+    of all others away from their middle.
     """
-    rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
-    gross = find_gross_outliers(displacement, record.voltage[rows])
-    others = np.delete(np.arange(rows.size), gross)
-    displacement, voltage = displacement[others], record.voltage[rows[others]]
-    extent = _extent(displacement)
-    levels = np.unique(displacement)
-    resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
-    drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-    threshold = max(0.01 * extent, 6 * resolution)
-    near = spikes(displacement, drive, threshold, ends=ends)
-    isolated = np.union1d(gross, others[near])
-    return rows[isolated] if isolated.size <= 0.05 * rows.size else rows[:0]
+    rows = retained = np.flatnonzero(record.has_reading)
+    while retained.size >= 0.95 * rows.size:
+        displacement, voltage = _readings(record)[np.isin(rows, retained)], record.voltage[retained]
+        extent, levels = _extent(displacement), np.unique(displacement)
+        resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
+        drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
+        near = spikes(displacement, drive, max(0.01 * extent, 6 * resolution))
+        if not ends:
+            others = np.delete(displacement, near)
+            far = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
+            near = near[far | ((near > 0) & (near < retained.size - 1))]
+        if not near.size:
+            return np.setdiff1d(rows, retained)
+        retained = np.delete(retained, near)
+    return rows[:0]
 
 
 def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:

@@ -7,7 +7,7 @@ then jumps by what it has missed.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -31,33 +31,25 @@ def scatter(values: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def spikes(
-    values: FloatArray,
-    drive: FloatArray | None = None,
-    least: float = 0.0,
-    *,
-    ends: bool = False,
-) -> IntArray:
+def spikes(values: FloatArray, drive: FloatArray, least: float) -> IntArray:
     """Return the samples of isolated outliers in values (samples,).
 
     A spike is one or two samples that lie off the median of their neighborhood by eight times what
     is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
-    unit, has a spike of its own nearby, the values may have one of twice its size. With `ends` the
-    first and the last value may be spikes too, though a fast transient begins like one.
+    unit, has a spike of its own nearby, the values may have one of twice its size.
     """
-    off = _off_median(values, ends)
-    allowed = np.zeros_like(values)
-    if drive is not None:
-        allowed = 2 * scipy.ndimage.maximum_filter1d(
-            np.abs(_off_median(drive, ends)), 2 * NEIGHBORS + 1
-        )
+    off, own = (
+        series - scipy.ndimage.median_filter(series, NEIGHBORS, mode="mirror")
+        for series in (values, drive)
+    )
+    allowed = 2 * scipy.ndimage.maximum_filter1d(np.abs(own), 2 * NEIGHBORS + 1)
     spread = scatter(off[off != 0]) if np.any(off) else 0.0
     limit = max(8 * spread, least) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
     # A spike moves its neighbors' medians too. The largest comes first, and a straight line takes
     # its place before the next is judged.
     half = NEIGHBORS // 2
-    rest = np.pad(values, half, mode="reflect" if ends else "edge")
+    rest = np.pad(values, half, mode="reflect")
     isolated = np.zeros(rest.size, dtype=np.bool_)
     for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
         middle = np.sort(rest[at - half : at + half + 1])[half]
@@ -70,38 +62,6 @@ def spikes(
                 after += 1
             rest[before : after + 1] = np.linspace(rest[before], rest[after], after - before + 1)
     return np.flatnonzero(isolated[half:])
-
-
-def find_gross_outliers(values: FloatArray, drive: FloatArray) -> IntArray:
-    """Return the samples of isolated values (samples,) that are far off the range of all others.
-
-    They lie off the line of least absolute deviations through `values` over `drive` (samples,),
-    which a minority does not move, by more than twice the range of that line and of the central
-    80% of the residuals: no actuator's hysteresis, lag, creep or ringing does. Ranges and fits are
-    to be taken without them.
-    """
-    line = np.stack([np.ones_like(drive), drive - drive.mean()])
-    weights = np.ones_like(values)
-    for _ in range(30):
-        # Sums, without the threads of a linear algebra library.
-        products = np.einsum("in,n,jn->ij", line, weights, line)
-        pulls = np.einsum("in,n,n->i", line, weights, values)
-        coefficients = np.linalg.lstsq(products, pulls)[0]
-        off = np.abs(values - coefficients @ line)
-        weights = 1 / np.maximum(off, 1e-6 * max(float(np.median(off)), 1e-300))
-        weights /= weights.max()
-    low, high = np.quantile(values - coefficients @ line, (0.1, 0.9))
-    far = off > 2 * (abs(coefficients[1]) * np.ptp(drive) + high - low)
-    first, length = runs(far)
-    short = length <= NEIGHBORS // 2
-    gross: IntArray = np.union1d(first[short], (first + length - 1)[short])
-    return gross
-
-
-def _off_median(values: FloatArray, ends: bool) -> FloatArray:
-    mode: Literal["mirror", "nearest"] = "mirror" if ends else "nearest"
-    off: FloatArray = values - scipy.ndimage.median_filter(values, NEIGHBORS, mode=mode)
-    return off
 
 
 class Stuck(NamedTuple):
