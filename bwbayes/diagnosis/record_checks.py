@@ -194,19 +194,12 @@ def _leads(record: Record) -> bool | None:
     if turns.size < 3:
         return None
     # From one turn to the next but one, twice the area between loop and chord.
-    steps_v, steps_d = np.diff(voltage), np.diff(displacement)
-    middle_v, middle_d = voltage[:-1] + steps_v / 2, displacement[:-1] + steps_d / 2
-    sums = [
-        np.concatenate([[0.0], np.cumsum(values)])
-        for values in (middle_v * steps_d - middle_d * steps_v, steps_v, steps_d)
-    ]
-    first, last = turns[:-2], turns[2:]
-    area = sums[0][last] - sums[0][first]
-    area -= voltage[first] * (displacement[last] - displacement[first])
-    area += displacement[first] * (voltage[last] - voltage[first])
-    swing = np.abs(voltage[turns[1:-1]] - voltage[first])
-    size = 2 * swing * float(np.ptp(displacement) / np.ptp(voltage)) * swing
-    opening = area / size
+    area = []
+    for first, last in zip(turns[:-2], turns[2:] + 1, strict=True):
+        u, x = voltage[first:last], displacement[first:last]
+        area.append(u @ np.roll(x, -1) - x @ np.roll(u, -1))
+    swing = np.abs(voltage[turns[1:-1]] - voltage[turns[:-2]])
+    opening = area / (2 * swing**2 * np.ptp(displacement) / np.ptp(voltage))
     typical = float(np.median(opening))
     error = scatter(opening) / np.sqrt(opening.size)
     if abs(typical) < max(0.004, 4 * error):
