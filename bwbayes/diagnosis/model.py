@@ -151,23 +151,18 @@ def growing_noise(scene: Scene) -> Iterator[Explanation]:
         if not np.std(growth) > 0:
             continue
         growth = (growth - np.mean(growth)) / np.std(growth)
-        nats, slope = _grown(white, growth)
+
+        def cost(coordinates: FloatArray, growth: FloatArray = growth) -> float:
+            level, slope = coordinates
+            logs = level + slope * growth
+            return float(np.sum(logs + 0.5 * white**2 * np.exp(-2 * logs)) + 0.5 * slope**2)
+
+        # The nats that b adds, with b ~ N(0, 1); the level is as well known with it as without.
+        optimum = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
+        level, slope = np.log(np.sqrt(np.mean(white**2))), optimum.x[1]
+        nats = cost(np.array([level, 0.0])) - optimum.fun - 0.5 * np.log(1 + 2 * white.size)
         text = f"noise that {'grows' if slope > 0 else 'falls'} with the voltage"
         text += "'s speed" if kind == "speed" else "'s distance from its center"
         rmse = scene.without[0], scene.fit.rmse
         fix = "train on a record driven as the plans are: the bands' width is the mean one"
-        yield Explanation(f"noise by {kind}", text, fix, nats=nats - scene.lead, rmse=rmse)
-
-
-def _grown(white: FloatArray, growth: FloatArray) -> tuple[float, float]:
-    """Return the nats that b adds, with b ~ N(0, 1), and b."""
-
-    def cost(coordinates: FloatArray) -> float:
-        level, slope = coordinates
-        logs = level + slope * growth
-        return float(np.sum(logs + 0.5 * white**2 * np.exp(-2 * logs)) + 0.5 * slope**2)
-
-    optimum = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
-    level = np.log(np.sqrt(np.mean(white**2)))
-    gained = cost(np.array([level, 0.0])) - float(optimum.fun)
-    return gained - 0.5 * float(np.log(1 + 2 * white.size)), float(optimum.x[1])
+        yield Explanation(f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse)
