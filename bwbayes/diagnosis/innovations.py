@@ -9,7 +9,6 @@ and large enough to matter; of records that the model describes fewer than one i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -169,26 +168,18 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
         )
         fix = "check whether the sensor filters; else try what explains it: bwbayes run --improve"
         findings.append(Finding("noise model", text, fix))
-    for quantity in ("rate", "voltage", "direction"):
-        findings += _one_sided(series, quantity)
+    for quantity, subject in (("rate", "drive"), ("voltage", "voltage"), ("direction", "voltage")):
+        groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
+        if len(groups) < 2:
+            continue
+        # The group with the surest mean, if it is large enough.
+        means = [float(np.mean(white)) for _, white in groups]
+        errors = [max(float(np.std(w)), 1e-300) / np.sqrt(w.size) for _, w in groups]
+        scores = np.abs(np.divide(means, errors))
+        surest = int(np.argmax(scores))
+        if scores[surest] > scipy.stats.norm.isf(ALARM / 6) and abs(means[surest]) > 0.15:
+            where = f"where the {subject} is {groups[surest][0]}"
+            text = f"the innovations average {means[surest]:+.2f} SD {where}"
+            fix = "try what explains it: bwbayes run --improve"
+            findings.append(Finding("noise model", text, fix))
     return tuple(findings)
-
-
-def _one_sided(series: Innovations, quantity: str) -> Iterator[Finding]:
-    """Find the group with the surest mean, if it is beyond chance and at least 0.15 SD."""
-    groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
-    if len(groups) < 2:
-        return
-    scores = [
-        float(np.mean(white)) * np.sqrt(white.size) / max(float(np.std(white)), 1e-300)
-        for _, white in groups
-    ]
-    name, white = groups[int(np.argmax(np.abs(scores)))]
-    mean = float(np.mean(white))
-    if np.max(np.abs(scores)) > scipy.stats.norm.isf(ALARM / 6) and abs(mean) > 0.15:
-        subject = "drive" if quantity == "rate" else "voltage"
-        yield Finding(
-            "noise model",
-            f"the innovations average {mean:+.2f} SD where the {subject} is {name}",
-            "try what explains it: bwbayes run --improve",
-        )
