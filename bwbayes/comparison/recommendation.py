@@ -12,7 +12,7 @@ alone, and where its Monte Carlo error leaves it open, the plainest is recommend
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +57,15 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     def below(candidate: Candidate, best: Candidate) -> Difference:
         return difference(candidate, best, voting) if voting else _less_probable(candidate, best)
 
-    counted = [_count_independent(candidate, worth) for candidate in usable]
+    # Readings that were scored one by one count as independent ones do.
+    counted = []
+    for candidate in usable:
+        parts = {
+            name: replace(part, log_scores=part.log_scores * worth[name] / part.readings)
+            for name, part in candidate.parts.items()
+            if name in worth and not part.joint
+        }
+        counted.append(replace(candidate, parts={**candidate.parts, **parts}))
     ordered = sorted(counted, key=lambda candidate: -value(candidate))
     differences = {candidate.name: below(candidate, ordered[0]) for candidate in ordered}
     near = [candidate for candidate in ordered if not differences[candidate.name].worse]
@@ -108,17 +116,6 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
             freedom += blocks - 1
     error = float(np.sqrt(variance))
     return Difference(total, error, max(4.0, float(scipy.stats.t.ppf(0.975, freedom)) * error))
-
-
-def _count_independent(candidate: Candidate, worth: Mapping[str, float]) -> Candidate:
-    """Let readings that were scored one by one count as independent ones do."""
-    parts = {
-        name: section
-        if section.joint or name not in worth
-        else replace(section, log_scores=section.log_scores * worth[name] / section.readings)
-        for name, section in candidate.parts.items()
-    }
-    return replace(candidate, parts=parts)
 
 
 def _less_probable(candidate: Candidate, best: Candidate) -> Difference:
