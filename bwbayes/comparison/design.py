@@ -103,6 +103,7 @@ def promises(
         above, below = np.split(values, 2)
         return np.asarray((above - below) / (2 * steps[:, np.newaxis]))
 
+    factor = np.linalg.cholesky(covariance)
     gradients = [derivatives(position, target) for position in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
     offset_sd = next(
@@ -124,8 +125,14 @@ def promises(
         for position, sd, gradient in zip(chosen, noise, gradients, strict=True):
             series = np.concatenate([derivatives(position, voltage), np.ones((1, voltage.size))])
             (white,), _ = dataset.noise.whiten(sd[np.newaxis], series[np.newaxis])
-            information = (white * once) @ white.T
-            after = _updated(covariance, information, offset_sd)
+            products = (white * once) @ white.T
+            # The last row is the offset's, which is integrated out.
+            information, offset = products[:-1, :-1], products[:-1, -1:]
+            if offset_sd:
+                information = information - offset @ offset.T / (products[-1, -1] + offset_sd**-2)
+            # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
+            inner = np.eye(len(factor)) + factor.T @ information @ factor
+            after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
             remaining.append(_mean_sd(gradient, after))
         shares = np.array(remaining) / before
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
@@ -137,14 +144,3 @@ def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:
     """Mean over columns g of √(gᵀ Σ g), for gradients (coordinates, targets)."""
     variances = np.einsum("it,ij,jt->t", gradient, covariance, gradient)
     return float(np.mean(np.sqrt(np.maximum(variances, 0))))
-
-
-def _updated(covariance: FloatArray, information: FloatArray, offset_sd: float) -> FloatArray:
-    """Return the covariance that would be left; the last row of the information is the offset's."""
-    products, offset = information[:-1, :-1], information[:-1, -1]
-    if offset_sd:
-        products = products - np.outer(offset, offset) / (information[-1, -1] + offset_sd**-2)
-    # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
-    factor = np.linalg.cholesky(covariance)
-    inner = np.eye(len(factor)) + factor.T @ products @ factor
-    return np.asarray(factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos"))
