@@ -75,6 +75,11 @@ class Exported:
         actuator = self.model.actuator
         means = {name: float(values[0]) for name, values in self.model.column.items()}
         linear = self.linear
+        gain: dict[str, float] | None = None
+        if actuator.gain is not None and actuator.gain.reference.half > 0:
+            terms = {f"{n}_um": means.get(n, 0.0) for n in ("quadratic", "cubic")}
+            reference = actuator.gain.reference
+            gain = {"middle_V": reference.middle, "half_V": reference.half, **terms}
         return {
             "name": self.name,
             "bwbayes": version("bwbayes"),
@@ -103,7 +108,7 @@ class Exported:
                 name: {"value": value, "unit": unit}
                 for name, (value, unit) in self.model.step.coefficients().items()
             },
-            "gain": self._gain,
+            "gain": gain,
             "creep_growth_per_V": float(self.model.curve[4, 0]),
             "zero": {
                 "value": float(self.model.zero[0]),
@@ -177,17 +182,6 @@ class Exported:
         kind = type(self.model.actuator.hysteresis)
         path = f"{kind.__module__}:{kind.__qualname__}"
         return next((name for name, operator in HYSTERESIS.items() if operator is kind), path)
-
-    @property
-    def _gain(self) -> dict[str, float] | None:
-        gain = self.model.actuator.gain
-        if gain is None or not gain.reference.half > 0:
-            return None
-        terms = {
-            f"{name}_um": float(self.model.column[name][0]) if name in gain.terms else 0.0
-            for name in ("quadratic", "cubic")
-        }
-        return {"middle_V": gain.reference.middle, "half_V": gain.reference.half, **terms}
 
 
 def exported(
