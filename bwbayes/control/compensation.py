@@ -21,7 +21,7 @@ with a jump, of 10 V for an offset of 7 um.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -123,7 +123,6 @@ def compensate(
     limits: Limits | None = None,
     nearest: bool = False,
     limit: float | None = None,
-    remarks: Sequence[str] = (),
 ) -> Compensation:
     """Return the command for a reference, and what is promised of it.
 
@@ -148,8 +147,6 @@ def compensate(
         zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
         Of the tracking error, um.
-    remarks
-        What else is to be said.
 
     Raises
     ------
@@ -211,10 +208,9 @@ def compensate(
             f"between samples the displacement leaves a straight line by up to {between:.3g} um, "
             "more than the rms error at them; choose a shorter sampling interval"
         )
-    remarks = (*remarks, *notes)
     straight = plan.played(linear)
     return Compensation(
-        reference, command, played, straight, hold, between, from_rest, limit, remarks
+        reference, command, played, straight, hold, between, from_rest, limit, tuple(notes)
     )
 
 
