@@ -81,7 +81,6 @@ def replicated(
     draws: FloatArray,
     generator: np.random.Generator,
     record: str | None = None,
-    records: int = 200,
 ) -> Replicated:
     """Check the training readings of a record against replicated ones.
 
@@ -90,16 +89,14 @@ def replicated(
     posterior
         The posterior that was sampled.
     draws
-        (draws, free), parameters in their own units; ``records`` of them are used.
+        (draws, free), parameters in their own units, of which 200 are used.
     generator
         Chooses draws, and draws their noise.
     record
         The record's name; may be left out of one alone.
-    records
-        Replicated ones; p-values come in steps of one over them.
     """
     dataset = posterior.only if record is None else posterior.alone(record).only
-    count = min(records, len(draws))
+    count = min(200, len(draws))  # p-values come in steps of one over them
     chosen = draws[generator.choice(len(draws), count, replace=False)]
     theta = posterior.prior.theta(chosen)
     rows = dataset.readings.rows
