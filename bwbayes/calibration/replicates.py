@@ -103,11 +103,11 @@ class Experiment:
         return (*(names if self.held_out else []), *others)
 
     def measures(self, posterior: Posterior, theta: FloatArray) -> FloatArray:
-        """Log likelihood and two measures of the displacement of models θ, (models, 3).
+        """Return what is ranked of models θ (models, parameters), (models, statistics).
 
-        The area of its loops, −∮ x du (um V), by trapezoids, positive where it lags behind the
-        voltage, summed over the records up to their last readings; and the largest range of any of
-        them (um).
+        Free parameters, log likelihood, and two measures of the displacement: the area of its
+        loops, −∮ x du (um V), by trapezoids, positive where it lags behind the voltage, summed over
+        the records up to their last readings; and the largest range of any of them (um).
         """
         area, extent = np.zeros((2, len(theta)))
         for data in posterior.datasets:
@@ -115,7 +115,8 @@ class Experiment:
             path = data.voltage[: data.training[-1].stop]
             area -= np.trapezoid(displacement, path, axis=1)
             extent = np.maximum(extent, np.ptp(displacement, axis=1))
-        return np.stack([posterior.log_likelihood(theta), area, extent], axis=1)
+        free = theta[:, [posterior.prior.names.index(name) for name in posterior.names]]
+        return np.column_stack([free, posterior.log_likelihood(theta), area, extent])
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +181,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     }
     posterior = experiment.posterior.with_readings(readings)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
-    names, truth = experiment.statistics, _statistics(experiment, posterior, true)[0]
+    names, truth = experiment.statistics, experiment.measures(posterior, true)[0]
     entry = Entry(
         number=number,
         converged=False,
@@ -206,7 +207,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     entry["steps"] = outcome.check.steps
     if len(free) < RANKED:
         return Replicate(entry, np.empty((0, len(names))))
-    drawn = _statistics(experiment, posterior, posterior.prior.theta(free))
+    drawn = experiment.measures(posterior, posterior.prior.theta(free))
     entry["ranks"] = dict(zip(names, np.sum(drawn < truth, axis=0).tolist(), strict=True))
     # Fewer draws than a run's, to save time.
     flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
@@ -242,12 +243,6 @@ def _simulated(
         noise = dataset.table.noise(record_theta)
         simulated[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
     return column, simulated
-
-
-def _statistics(experiment: Experiment, posterior: Posterior, theta: FloatArray) -> FloatArray:
-    """Free parameters and measures of models θ, (models, statistics)."""
-    free = [posterior.prior.names.index(name) for name in posterior.names]
-    return np.concatenate([theta[:, free], experiment.measures(posterior, theta)], axis=1)
 
 
 def _independent(

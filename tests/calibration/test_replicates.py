@@ -148,7 +148,7 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     experiment = Experiment(posterior, PLAN)
     known = {"d": d, "alpha": 1e-9, "beta": 0.02, "exponent": 1.0, "lag": lag, "sensor_sd": 1.0}
     theta = np.array([[known.get(name, 0.0) for name in posterior.prior.names]])
-    _, area, extent = experiment.measures(posterior, theta)[0]
+    *_, area, extent = experiment.measures(posterior, theta)[0]
     turn = 2 * np.pi * lag
     periods = samples * interval
     np.testing.assert_allclose(periods * np.pi * d * 100**2 * turn / (1 + turn**2), area, rtol=1e-2)
