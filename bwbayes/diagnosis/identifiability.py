@@ -18,7 +18,7 @@ and not with the likelihood is what was put in.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -190,21 +190,17 @@ class Taught:
 
 
 @dataclass(frozen=True)
-class Combination:
-    """Parameters that were determined together worst, in words, and the prior's sd left of it."""
-
-    text: str
-    left: float
-
-
-@dataclass(frozen=True)
 class Learned:
-    """What a record taught, by parameter, and the worst combinations, the worst first."""
+    """What a record taught, by parameter.
+
+    ``combinations`` are the parameters, in words, that were determined together worst, the worst
+    first, and the part of the prior's sd that is left of each.
+    """
 
     __repr__ = brief
 
     parameters: Mapping[str, Taught]
-    combinations: tuple[Combination, ...]
+    combinations: tuple[tuple[str, float], ...]
 
     @property
     def findings(self) -> list[Finding]:
@@ -219,8 +215,8 @@ class Learned:
             for name, taught in self.parameters.items()
             if taught.prior_decides
         ]
-        for combination in self.combinations[:1]:
-            text = f"{combination.text}: {percent(combination.left)} of the prior's SD remains"
+        for combination, left in self.combinations[:1]:
+            text = f"{combination}: {percent(left)} of the prior's SD remains"
             fix = "quote its members together, or add a record that tells them apart"
             findings.append(Finding("determined worst", text, fix))
         return findings
@@ -230,7 +226,7 @@ class Learned:
         """What ``summary.json`` has of it, as ``identifiability``."""
         return {
             "parameters": {name: taught.numbers for name, taught in self.parameters.items()},
-            "combinations": [asdict(combination) for combination in self.combinations],
+            "combinations": [{"text": text, "left": left} for text, left in self.combinations],
             "findings": [str(finding) for finding in self.findings],
         }
 
@@ -240,7 +236,6 @@ def learned(
     draws: FloatArray,
     log_density: FloatArray,
     generator: np.random.Generator,
-    count: int = 4000,
 ) -> Learned:
     """Hold the posterior against the prior.
 
@@ -254,14 +249,13 @@ def learned(
         (steps, ensembles, walkers), nats, as the chain has it: in its coordinates.
     generator
         Draws from the prior.
-    count
-        Draws of the prior, and of the posterior, that are looked at.
 
     Notes
     -----
     N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
+    count = 4000  # draws of the prior, and of the posterior, that are looked at
     step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
     log_likelihood = log_density.ravel()[::step] - prior.constrain(prior.unconstrain(thin))[1]
@@ -285,8 +279,7 @@ def learned(
         sd = float(np.sqrt(max(variances[i], 0.0)))
         if sd >= LEFT_OPEN:
             # How the scores move together along it, and not what picks it out.
-            text = combined(left @ directions[:, i], prior.free_names)
-            combinations.append(Combination(text, sd))
+            combinations.append((combined(left @ directions[:, i], prior.free_names), sd))
     return Learned(parameters, tuple(combinations))
 
 

@@ -142,10 +142,10 @@ def test_the_worst_combination_is_the_closed_forms(model: Linear) -> None:
     """Of the whitened posterior covariance the largest eigenvalue, and how it moves."""
     made = of(model.posterior, exact(model))
     values, vectors = np.linalg.eigh(model.exact.covariance / np.outer(model.sd, model.sd))
-    (worst, *_) = made.combinations
-    assert worst.left == pytest.approx(np.sqrt(values[-1]), abs=0.04)
-    assert worst.text.split()[0] == model.posterior.names[int(np.argmax(np.abs(vectors[:, -1])))]
-    assert str(made.findings[-1]).startswith(f"determined worst: {worst.text}")
+    worst, left_of_it = made.combinations[0]
+    assert left_of_it == pytest.approx(np.sqrt(values[-1]), abs=0.04)
+    assert worst.split()[0] == model.posterior.names[int(np.argmax(np.abs(vectors[:, -1])))]
+    assert str(made.findings[-1]).startswith(f"determined worst: {worst}")
 
 
 def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(model: Linear) -> None:
