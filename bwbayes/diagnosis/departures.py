@@ -67,8 +67,14 @@ class Standardized:
         p = min(float(np.mean(own**2)) / total, 1.0)
         q = min(float(np.mean(slow**2)) / total, 1.0) - p
         q = max(q, 0.0) if memory > 0 else 0.0
-        once, twice = _mean_correlations(rows, bands.interval, memory)
-        single = 1 / z.size
+        # Pairs of judged samples at each lag, those in either order.
+        present = rows.astype(np.float64)
+        pairs = np.rint(scipy.signal.correlate(present, present, method="fft")[present.size - 1 :])
+        pairs[1:] *= 2
+        lags, single = bands.interval * np.arange(pairs.size), 1 / z.size
+        decay = np.exp(-lags / memory) if memory > 0 else (lags == 0).astype(np.float64)
+        # Mean correlation, and mean squared one, of all of them.
+        once, twice = (float(pairs @ decay**power / pairs.sum()) for power in (1, 2))
         common = min(bands.common_sd**2 / total, p)
 
         def of_squares(p: float, q: float) -> float:
@@ -234,18 +240,6 @@ class Standardized:
         slow = np.sqrt(max(rms**2 - fast**2, 0.0))
         if slow > max(0.05 * extent, fast) and extent:
             yield f"NRMSE {percent(rms / extent)} on the training readings"
-
-
-def _mean_correlations(judged: BoolArray, interval: float, memory: float) -> tuple[float, float]:
-    """Mean correlation, and mean squared one, of all pairs of readings that forget by exp(-t/τ)."""
-    present = judged[slice(*np.flatnonzero(judged)[[0, -1]] + [0, 1])].astype(np.float64)
-    # Pairs of judged samples at each lag, those in either order.
-    pairs = np.rint(scipy.signal.correlate(present, present, method="fft")[present.size - 1 :])
-    pairs[1:] *= 2
-    if memory <= 0:
-        return float(pairs[0] / pairs.sum()), float(pairs[0] / pairs.sum())
-    decay = np.exp(-interval * np.arange(pairs.size) / memory)
-    return float(pairs @ decay / pairs.sum()), float(pairs @ decay**2 / pairs.sum())
 
 
 def percent(share: float) -> str:
