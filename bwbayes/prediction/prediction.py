@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,19 +33,6 @@ DRAWS = 1000
 # Samples that are simulated and summarized at once: few enough for a core's own cache. Not a power
 # of two: rows of draws that far apart would take each other's place in it.
 PIECE = 400
-
-
-@dataclass(frozen=True)
-class _Draws:
-    """The start of every draw's simulation, and the sds (draws,) of what is added to it, um.
-
-    ``scores`` (scores, draws) are what it is added with, the same along the whole record.
-    """
-
-    start: Started
-    discrepancy: FloatArray
-    sensor: FloatArray
-    scores: FloatArray
 
 
 def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
@@ -81,11 +68,12 @@ def predict_windows(
         Is called with a number of samples whenever so many more are done.
     """
     theta = posterior.prior.theta(draws)
-    mixed = _draws(posterior, theta, fitted(posterior, theta, generator))
+    start_states = fitted(posterior, theta, generator)
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(window.start, window.stop) for parts in several.values() for window in parts]
     first = min(start for start, _ in edges)
-    whole = _bands("", mixed, record, slice(first, max(stop for _, stop in edges)), watch)
+    window = slice(first, max(stop for _, stop in edges))
+    whole = _bands("", posterior, theta, start_states, record, window, watch)
     bands = []
     for name, parts in several.items():
         training = any(
@@ -128,7 +116,7 @@ def forecast(
     theta = posterior.prior.theta(draws)
     start_states = fitted(posterior, theta, generator)
     start_states = going_on(start_states, posterior.likelihood, theta, generator)
-    return _bands(name, _draws(posterior, theta, start_states), longer, after)
+    return _bands(name, posterior, theta, start_states, longer, after)
 
 
 def predict_record(
@@ -169,30 +157,28 @@ def predict_record(
     start_states = started(posterior, theta, record, start, generator)
     if predicted_window.stop <= start_states.judged_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, _draws(posterior, theta, start_states), record, predicted_window, watch)
+    bands = _bands(name, posterior, theta, start_states, record, predicted_window, watch)
     scored_from = max(start_states.judged_from - predicted_window.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
 
 
-def _draws(posterior: Posterior, theta: FloatArray, start: Started) -> _Draws:
-    # The same for all predictions: bands differ by what is predicted, not by chance.
-    generator = np.random.default_rng(len(theta))
-    scores = mixture.stratified_scores(len(theta), generator)
-    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta))
-    return _Draws(start, *sds, scores)
-
-
 def _bands(
     name: str,
-    mixed: _Draws,
+    posterior: Posterior,
+    theta: FloatArray,
+    start: Started,
     record: Record,
     window: slice,
     watch: Callable[[int], None] = lambda _: None,
 ) -> Bands:
-    """Walk through a record and summarize the mixture over a window."""
+    """Walk through a record from every draw's start, and summarize the mixture over a window."""
+    # The same for all predictions: bands differ by what is predicted, not by chance.
+    scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
+    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta))
+    variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
-    totals = np.zeros(len(mixed.start.model))
+    totals = np.zeros(len(theta))
     pending: deque[tuple[int, Future[dict[str, Floating]]]] = deque()
 
     def put() -> None:
@@ -203,12 +189,12 @@ def _bands(
 
     begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
     with ThreadPoolExecutor(threads) as executor:
-        for simulated in mixed.start.pieces(record.voltage[: window.stop], PIECE):
+        for simulated in start.pieces(record.voltage[: window.stop], PIECE):
             first, begin = max(begin, window.start), begin + simulated.shape[1]
             if begin <= first:
                 continue
             inside = simulated[:, first - begin :]
-            work = executor.submit(_summarized, mixed, record, first, inside)
+            work = executor.submit(_summarized, start, variances, scores, record, first, inside)
             pending.append((first - window.start, work))
             totals += inside.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
@@ -217,7 +203,7 @@ def _bands(
         while pending:
             put()
     means = totals / samples
-    common = float(np.var(means) + np.mean(mixed.start.offset_sd**2))
+    common = float(np.var(means) + np.mean(start.offset_sd**2))
     return Bands(
         name=name,
         time=record.time[window],
@@ -237,10 +223,19 @@ def _bands(
 
 
 def _summarized(
-    mixed: _Draws, record: Record, first: int, simulated: FloatArray
+    start: Started,
+    variances: Sequence[FloatArray],
+    scores: FloatArray,
+    record: Record,
+    first: int,
+    simulated: FloatArray,
 ) -> dict[str, Floating]:
-    """Mean, band edges, and the judgment of the readings, each (samples,)."""
-    samples, start, unknown = simulated.shape[1], mixed.start, np.ones(1)
+    """Mean, band edges, and the judgment of the readings, each (samples,).
+
+    ``variances`` (draws, 1), um², of offset, discrepancy and sensor are added to the draws with
+    ``scores`` (scores, draws), the same along the whole record.
+    """
+    samples, unknown = simulated.shape[1], np.ones(1)
     expected = simulated
     if start.carried is not None:
         remembered, explained = start.carried.after(first, samples)
@@ -248,11 +243,9 @@ def _summarized(
     mean = np.mean(expected, axis=0)
     summarized: dict[str, Floating] = {"mean": mean}
     # About their mean, so that a single precision is one of the band's width.
-    scores = mixed.scores.astype(np.float32)
+    scores = scores.astype(np.float32)
     away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
-    offset, slow, white = (
-        sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, mixed.discrepancy, mixed.sensor)
-    )
+    offset, slow, white = variances
     variance = np.zeros(1)
     for kind, added in zip(KINDS, (offset, slow * unknown, white), strict=True):
         means = apart if kind == "parameter" else away
