@@ -109,14 +109,14 @@ class OtherRecord:
         simulated: Simulated,
         generator: np.random.Generator,
     ) -> tuple[Bands, Simulated, slice]:
-        """Predict it, once it is simulated; return that too, and the samples that are judged."""
+        """Predict it, once it is simulated; return that too, and the samples that are predicted."""
         record, window = simulated.record, slice(0, simulated.model.size)
         if self.record.displacement is None:
             record = replace(record, displacement=None)
         if self.window is not None:
             window = record.window_slice(*self.window)
         bands = predict_record(posterior, draws, record, self.start, generator, window=self.window)
-        return bands, simulated, slice(window.start + bands.scored_from, window.stop)
+        return bands, simulated, window
 
 
 def covered(
@@ -124,13 +124,12 @@ def covered(
 ) -> Iterator[tuple[Kind, int, float]]:
     """Yield the part of simulated records' samples that lie inside each kind and level of band.
 
-    The last samples of the bands are those of the slice of the record that they come with. Samples
-    without a reading do not count for the sensor band.
+    The samples of the bands are those of the slice of the record that they come with. Those of a
+    lead-in do not count, and those without a reading not for the sensor band.
     """
     for kind, level in product(KINDS, LEVELS):
         inside = []
         for bands, simulated, window in predictions:
             values = simulated.target(kind)[window]
-            low, high = (edge[kind, level][-values.size :] for edge in (bands.lower, bands.upper))
-            inside.append(((low <= values) & (values <= high))[np.isfinite(values)])
+            inside.append(bands.covers(kind, level, values)[bands.scored(values)])
         yield kind, level, float(np.mean(np.concatenate(inside)))

@@ -17,7 +17,7 @@ from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import Part
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.scores import Scores, judged
+from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
 
 
@@ -97,7 +97,7 @@ class Candidate:
         um, ``nrmse`` over the range of the readings; ``coverage`` of the 95 % sensor band with its
         error.
         """
-        counts = np.array([np.sum(judged(b, b.measured)) for b in self.held_out], dtype=np.float64)
+        counts = np.array([np.sum(b.scored(b.measured)) for b in self.held_out], dtype=np.float64)
         if not counts.sum():
             return None
         shares, scores = counts / counts.sum(), [self.scores[b.name] for b in self.held_out]

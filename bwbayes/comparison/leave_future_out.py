@@ -22,7 +22,6 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import thinned
-from bwbayes.prediction.scores import judged
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
@@ -153,7 +152,7 @@ def bands_part(bands: Bands) -> Part | None:
     density would be that of the luckiest draw: their own densities stand, and count as independent
     ones do.
     """
-    rows = judged(bands, bands.log_score)
+    rows = bands.scored(bands.log_score)
     if bands.measured is None or bands.log_score is None or not rows.any():
         return None
     residual = (bands.measured - bands.mean)[rows]

@@ -20,7 +20,6 @@ from bwbayes.diagnosis.model import tail_nats
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
-from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 
 # A lead-in whose test says less than this does not fit.
@@ -81,7 +80,7 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
         In what the drive leaves training.
     """
     ranked = sorted(
-        _explanations(bands, np.flatnonzero(judged(bands, bands.measured)), memory),
+        _explanations(bands, np.flatnonzero(bands.scored(bands.measured)), memory),
         key=lambda finding: -finding.nats,
     )
     likely = joined(likely_causes(ranked)) or Finding(

@@ -17,7 +17,6 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
-from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 
 # False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
@@ -30,7 +29,7 @@ ODDS = 1.5
 
 @dataclass(frozen=True)
 class Standardized:
-    """Judged readings against their bands, and how many independent ones they are worth.
+    """Scored readings against their bands, and how many independent ones they are worth.
 
     ``z`` (readings,) are residuals over the sensor band's sd; ``mean_size`` and ``square_size`` are
     how many independent readings the record is worth to the mean of z and to that of z².
@@ -40,7 +39,7 @@ class Standardized:
     """
 
     bands: Bands
-    judged: BoolArray
+    scored: BoolArray
     z: FloatArray
     mean_size: float
     square_size: float
@@ -59,7 +58,7 @@ class Standardized:
         """
         assert bands.measured is not None
 
-        rows = judged(bands, bands.measured)
+        rows = bands.scored(bands.measured)
         own, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
         sensor = np.maximum(sensor, np.finfo(float).tiny)
         z = (bands.measured - bands.mean)[rows] / sensor
@@ -67,7 +66,7 @@ class Standardized:
         p = min(float(np.mean(own**2)) / total, 1.0)
         q = min(float(np.mean(slow**2)) / total, 1.0) - p
         q = max(q, 0.0) if memory > 0 else 0.0
-        # Pairs of judged samples at each lag, those in either order.
+        # Pairs of scored samples at each lag, those in either order.
         present = rows.astype(np.float64)
         pairs = np.rint(scipy.signal.correlate(present, present, method="fft")[present.size - 1 :])
         pairs[1:] *= 2
@@ -148,7 +147,7 @@ class Standardized:
         # well be larger here.
         rows = np.flatnonzero(np.abs(self.z) > 6 * np.exp(2 * self.noise_log_sd))
         if rows.size >= 5:
-            first = clock(self.bands.time[self.judged][rows[0]], self.bands.interval)
+            first = clock(self.bands.time[self.scored][rows[0]], self.bands.interval)
             reasons.append(
                 f"{rows.size} readings lie more than 6 SDs off the mean, first at {first} s, the "
                 f"farthest {np.max(np.abs(self.z)):.2g} SDs"
@@ -170,7 +169,7 @@ class Standardized:
             return ""
         # The variance of a mean of correlated readings falls with their time.
         length = (lead.stop - lead.start) * self.common / small
-        half_duration = float(np.ptp(self.bands.time[self.judged])) / 2
+        half_duration = float(np.ptp(self.bands.time[self.scored])) / 2
         longer = (
             f"lead_in = {length:.2g}"
             if length < half_duration
@@ -184,7 +183,7 @@ class Standardized:
     @property
     def _residual(self) -> FloatArray:
         assert self.bands.measured is not None
-        residual: FloatArray = (self.bands.measured - self.bands.mean)[self.judged]
+        residual: FloatArray = (self.bands.measured - self.bands.mean)[self.scored]
         return residual
 
     def _coverage(self) -> Iterator[tuple[str, float]]:
@@ -193,7 +192,7 @@ class Standardized:
         # Factors on the noise's sd, evenly probable, that the fit allows.
         scales = np.empty(0)
         for level in reversed(LEVELS):
-            hits = self.bands.covers("sensor", level, self.bands.measured)[self.judged]
+            hits = self.bands.covers("sensor", level, self.bands.measured)[self.scored]
             covered, nominal = float(np.mean(hits)), level / 100
             odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
             if odds >= 1 / ODDS:
@@ -213,13 +212,13 @@ class Standardized:
 
         A lag of many seconds and a gain beyond all reason can follow even these.
         """
-        bands, judged = self.bands, self.judged
+        bands, scored = self.bands, self.scored
         assert bands.measured is not None
-        change = rate(bands.voltage, bands.interval)[judged] * bands.interval
+        change = rate(bands.voltage, bands.interval)[scored] * bands.interval
         travel = min(float(np.sum(np.maximum(sign * change, 0))) for sign in (1, -1))
-        if travel < (span[1] - span[0]) / 2 or not np.ptp(bands.measured[judged]):
+        if travel < (span[1] - span[0]) / 2 or not np.ptp(bands.measured[scored]):
             return
-        correlation = float(np.corrcoef(bands.voltage[judged], bands.measured[judged])[0, 1])
+        correlation = float(np.corrcoef(bands.voltage[scored], bands.measured[scored])[0, 1])
         if correlation < -0.5:
             yield f"the readings fall where the voltage rises (correlation {correlation:.2f})"
 
@@ -231,7 +230,7 @@ class Standardized:
         """
         assert self.bands.measured is not None
         residual = self._residual
-        extent = max(extent, float(np.ptp(self.bands.measured[self.judged])))
+        extent = max(extent, float(np.ptp(self.bands.measured[self.scored])))
         steps = np.diff(residual)
         # The median of a χ² variable of one degree of freedom is 0.4549.
         fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0

@@ -70,12 +70,12 @@ def fit_loop(record: Record) -> LoopFit:
     """Fit loops to a record's readings."""
     assert record.displacement is not None
     rows = _rows(record.voltage, np.flatnonzero(record.has_reading))
-    judged = record.has_reading[rows]
-    displacement = record.displacement[rows[judged]]
+    has_reading = record.has_reading[rows]
+    displacement = record.displacement[rows[has_reading]]
     time = record.time[rows]
     centered = displacement - displacement.mean()
 
-    elapsed = time[judged] - time[judged][0]
+    elapsed = time[has_reading] - time[has_reading][0]
     trend_shape = elapsed / elapsed[-1] - 0.5
     times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, 20)
     decays = np.exp(-elapsed[:, np.newaxis] / times)
@@ -88,7 +88,7 @@ def fit_loop(record: Record) -> LoopFit:
     lagging = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
     lags = np.concatenate([[0.0], lagging])
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
-    for lag, loops in zip(lags, _bases(np.array(lagged_voltages), judged), strict=True):
+    for lag, loops in zip(lags, _bases(np.array(lagged_voltages), has_reading), strict=True):
         basis = np.column_stack([loops, trend_shape])
         remainder, which = _best_decay(basis, decays, centered)
         if best is None or remainder < best[0]:
@@ -108,7 +108,7 @@ def fit_loop(record: Record) -> LoopFit:
 
     def curved(samples: float) -> float:
         """Return the sum of squares that a curve leaves behind a lag, and no loops."""
-        u = _lagged(record.voltage, samples)[rows[judged]]
+        u = _lagged(record.voltage, samples)[rows[has_reading]]
         u = (u - u.mean()) / max(float(np.ptp(u)), 1e-300)
         columns = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
         return _best_decay(columns, decays, centered)[0]
@@ -118,13 +118,13 @@ def fit_loop(record: Record) -> LoopFit:
     nearest = int(np.argmin([curved(lag) for lag in samples]))
     between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
     optimum = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
-    (loops,) = _bases(_lagged(record.voltage, optimum.x)[np.newaxis, rows], judged)
+    (loops,) = _bases(_lagged(record.voltage, optimum.x)[np.newaxis, rows], has_reading)
     behind_lag = _best_decay(np.column_stack([loops, trend_shape]), decays, centered)[0]
     remainder = min(remainder, behind_lag)
     added, degrees = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
     ratio = (optimum.fun - remainder) / added / max(remainder / degrees, 1e-300)
     return LoopFit(
-        rows[judged],
+        rows[has_reading],
         residual,
         float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
         lag,
@@ -160,8 +160,8 @@ def _lagged(voltage: FloatArray, samples: float) -> FloatArray:
     return np.asarray(voltage[0] + follow)
 
 
-def _bases(voltages: FloatArray, judged: BoolArray) -> Iterator[FloatArray]:
-    """Yield columns that span the loops of each of some voltages (lags, rows), where judged."""
+def _bases(voltages: FloatArray, has_reading: BoolArray) -> Iterator[FloatArray]:
+    """Yield columns that span the loops of each of some voltages (lags, rows), at readings."""
     low, high = voltages.min(axis=1), voltages.max(axis=1)
     half = np.maximum((high - low) / 2, 1e-300)
     scaled = (voltages - ((low + high) / 2)[:, np.newaxis]) / half[:, np.newaxis]
@@ -177,7 +177,7 @@ def _bases(voltages: FloatArray, judged: BoolArray) -> Iterator[FloatArray]:
         # What another state at the start would change, until the drive has wiped it out.
         unknown = outputs[:, WIDTHS.size :] - outputs[:, : WIDTHS.size][:, FREE_STARTS]
         shown = size * outputs[:, : WIDTHS.size]
-        yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[judged]
+        yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[has_reading]
 
 
 def _best_decay(basis: FloatArray, decays: FloatArray, values: FloatArray) -> tuple[float, int]:

@@ -34,7 +34,6 @@ from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import ExitStatus
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, titled
-from bwbayes.prediction.scores import judged
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief
 
@@ -233,7 +232,7 @@ def assess(
     beyond
         In what the record's drive leaves the one that was fitted.
     """
-    if not judged(bands, bands.measured).any():
+    if not bands.scored(bands.measured).any():
         return None
     standard = Standardized.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)

@@ -98,6 +98,12 @@ class Bands:
         width: FloatArray = self.upper[kind, 90] - self.lower[kind, 90]
         return width / float(2 * scipy.special.ndtri(0.95))
 
+    def scored(self, values: FloatArray | None) -> BoolArray:
+        """Tell which samples count: those after a lead-in where values (samples,) are known."""
+        counts = np.isfinite(np.full(self.time.size, np.nan) if values is None else values)
+        counts[: self.scored_from] = False
+        return counts
+
     def covers(self, kind: Kind, level: int, values: FloatArray) -> BoolArray:
         """Tell which values (samples,), um, a band covers; its edges belong to it."""
         covered: BoolArray = (self.lower[kind, level] <= values) & (

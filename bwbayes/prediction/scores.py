@@ -82,13 +82,6 @@ class Scores:
         }
 
 
-def judged(bands: Bands, values: FloatArray | None) -> BoolArray:
-    """Tell which samples count: those after a lead-in where values (samples,) are known."""
-    counts = np.isfinite(np.full(bands.time.size, np.nan) if values is None else values)
-    counts[: bands.scored_from] = False
-    return counts
-
-
 def score(bands: Bands, full: float = 0.0) -> Scores:
     """Judge bands against what was measured, and against the truth where it is known.
 
@@ -104,7 +97,7 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
             f"{bands.name}: nothing was measured, so the bands cannot be scored; "
             "give a record with a displacement"
         )
-    rows = judged(bands, bands.measured)
+    rows = bands.scored(bands.measured)
     if not rows.any():
         raise InputError(f"{bands.name}: all readings are missing; judge another window")
     measured = bands.measured[rows]
@@ -119,7 +112,7 @@ def score(bands: Bands, full: float = 0.0) -> Scores:
     for kind, values in targets.items():
         coverage[kind] = error[kind] = None
         if values is not None:
-            counts = judged(bands, values)
+            counts = bands.scored(values)
             hits = {level: bands.covers(kind, level, values)[counts] for level in LEVELS}
             coverage[kind] = {level: float(hit.mean()) for level, hit in hits.items()}
             error[kind] = _coverage_errors(hits, (values - bands.mean)[counts])
@@ -193,7 +186,7 @@ def _coverage_errors(hits: dict[int, BoolArray], residual: FloatArray) -> dict[i
     return errors
 
 
-def _worst_second(hits: BoolArray, judged: BoolArray, interval: float) -> float:
+def _worst_second(hits: BoolArray, scored: BoolArray, interval: float) -> float:
     """Lowest coverage of the readings in a second, in all of them if they last less.
 
     A second that holds fewer than half as many readings as the fullest one says little, and is
@@ -201,7 +194,7 @@ def _worst_second(hits: BoolArray, judged: BoolArray, interval: float) -> float:
     """
     block = max(1, min(round(1 / interval), hits.size))
     covered, readings = (
-        np.concatenate([[0], np.cumsum(flags)]) for flags in (hits & judged, judged)
+        np.concatenate([[0], np.cumsum(flags)]) for flags in (hits & scored, scored)
     )
     counts = readings[block:] - readings[:-block]
     full = 2 * counts >= counts.max()
