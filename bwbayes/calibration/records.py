@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import Start, started
+from bwbayes.prediction.initial_state import Start, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record, Window
 
@@ -89,7 +89,7 @@ class OtherRecord:
         voltage and offset.
         """
         planned = replace(self.record, displacement=None, truth=None)
-        start_states = started(posterior, theta, planned, self.start, generator)
+        start_states = estimate_initial_states(posterior, theta, planned, self.start, generator)
         model = start_states.displacement(planned.voltage)[0]
         if self.start.own_offset and self.record.displacement is not None:
             model = model + posterior.only.extent * generator.standard_normal()

@@ -36,7 +36,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inverse import inverse
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
-from bwbayes.prediction.initial_state import Start, Started, started
+from bwbayes.prediction.initial_state import InitialStates, Start, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 
@@ -65,10 +65,12 @@ class _Plan:
         """Return a command as a record."""
         return planned(voltage, self.reference, self.hold, self.reference.name)
 
-    def initial_states(self, voltage: FloatArray) -> Started:
+    def initial_states(self, voltage: FloatArray) -> InitialStates:
         """Return the initial states of all draws."""
         theta = self.posterior.prior.theta(self.draws)
-        return started(self.posterior, theta, self.record(voltage), self.start, self.rng())
+        return estimate_initial_states(
+            self.posterior, theta, self.record(voltage), self.start, self.rng()
+        )
 
     def displacements(self, voltage: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
         """Yield some draws at a time, and their displacement (draws, samples), um."""

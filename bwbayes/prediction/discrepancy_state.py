@@ -22,7 +22,7 @@ from bwbayes.inference.state_space import Noise
 
 
 @dataclass(frozen=True)
-class Carried:
+class DiscrepancyState:
     """What readings leave of the discrepancy, for each draw.
 
     ``last`` is the sample of the last reading; ``mean`` (draws, 2), um, that of the state there,
@@ -50,7 +50,9 @@ class Carried:
         return np.einsum("dtj,dj->dt", row, self.mean), np.minimum(share, 1.0)
 
 
-def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) -> Carried:
+def filter_discrepancy(
+    likelihood: Likelihood, theta: FloatArray, simulated: FloatArray
+) -> DiscrepancyState:
     """Return what the readings of a record leave at θ (draws, parameters).
 
     ``simulated`` (draws, readings), um, is the model's displacement at the readings.
@@ -62,4 +64,4 @@ def carried(likelihood: Likelihood, theta: FloatArray, simulated: FloatArray) ->
     always = noise.marginal_sd(parameters)[0][:, np.newaxis, np.newaxis] ** 2 * np.eye(2)
     mean, gained = filtered.mean[:, 0], always - filtered.covariance
     last = int(readings.rows[-1])
-    return Carried(last, mean, gained, likelihood.noise, parameters)
+    return DiscrepancyState(last, mean, gained, likelihood.noise, parameters)

@@ -23,7 +23,7 @@ from bwbayes.inference.readings import Readings
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
-from bwbayes.prediction.discrepancy_state import Carried, carried
+from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
 from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
@@ -108,14 +108,14 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Started:
+class InitialStates:
     """What every draw takes for a record's start.
 
     ``histories`` with the record's interval and hold, and which of them each draw has; ``model``
     (draws, parameters of the actuator) with initial state and offset; ``unrest`` (draws, unknowns)
     of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of the offset still; ``lead_in``
-    says how that went, if there is one, and ``judged_from`` is the first sample after it;
-    ``carried`` is what its readings leave of the discrepancy, for a forecast.
+    says how that went, if there is one, and ``scored_from`` is the first sample after it;
+    ``discrepancy`` is what its readings leave of the discrepancy, for a forecast.
     """
 
     __repr__ = brief
@@ -125,8 +125,8 @@ class Started:
     unrest: FloatArray
     offset_sd: FloatArray
     lead_in: LeadIn | None = None
-    judged_from: int = 0
-    carried: Carried | None = None
+    scored_from: int = 0
+    discrepancy: DiscrepancyState | None = None
 
     def displacement(self, voltage: FloatArray) -> FloatArray:
         """Displacement (draws, samples) along a voltage, um."""
@@ -150,13 +150,13 @@ class Started:
             yield simulated
 
 
-def started(
+def estimate_initial_states(
     posterior: Posterior,
     theta: FloatArray,
     record: Record,
     start: Start,
     generator: np.random.Generator,
-) -> Started:
+) -> InitialStates:
     """Give every draw θ (draws, parameters) a start of another record.
 
     Raises
@@ -202,7 +202,7 @@ def started(
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator)
     informed = _informed(histories, start_theta, record, window, generator)
-    return going_on(informed, whole, theta, generator) if start.after else informed
+    return continue_discrepancy(informed, whole, theta, generator) if start.after else informed
 
 
 def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
@@ -217,9 +217,9 @@ def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.diff(np.mean(paths, axis=1)) ** 2)) / 2)
 
 
-def going_on(
-    start: Started, likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator
-) -> Started:
+def continue_discrepancy(
+    start: InitialStates, likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator
+) -> InitialStates:
     """Let the discrepancy go on from where the readings of a likelihood leave it.
 
     What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
@@ -231,10 +231,12 @@ def going_on(
     matched = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
     simulated = matched.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
-    return replace(matched, carried=carried(likelihood, theta, simulated))
+    return replace(matched, discrepancy=filter_discrepancy(likelihood, theta, simulated))
 
 
-def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generator) -> Started:
+def training_initial_states(
+    posterior: Posterior, theta: FloatArray, generator: np.random.Generator
+) -> InitialStates:
     """Give every draw θ (draws, parameters) the start that the training record tells."""
     likelihood = posterior.likelihood
     unrest = np.empty((len(theta), 0))
@@ -242,7 +244,7 @@ def fitted(posterior: Posterior, theta: FloatArray, generator: np.random.Generat
         start = likelihood.start(theta)
         unrest = _normal(start.mean, start.covariance, generator)
     histories = Histories((likelihood,), np.zeros(len(theta), dtype=np.int64))
-    return Started(histories, likelihood.table.actuator(theta), unrest, np.zeros(len(theta)))
+    return InitialStates(histories, likelihood.table.actuator(theta), unrest, np.zeros(len(theta)))
 
 
 def _unseen(
@@ -251,7 +253,7 @@ def _unseen(
     generator: np.random.Generator,
     *,
     settled: bool,
-) -> Started:
+) -> InitialStates:
     """Draw the start from what is known of it beforehand: all histories are equally probable."""
     draws, first = len(theta), likelihoods[0]
     which = np.zeros(draws, dtype=np.int64)
@@ -264,7 +266,7 @@ def _unseen(
     unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
     start_theta = histories.with_states(theta, uniform(generator, draws))
     model = first.table.actuator(start_theta)
-    start = Started(histories, model, unrest, np.zeros(draws))
+    start = InitialStates(histories, model, unrest, np.zeros(draws))
     if settled:
         offset = first.actuator.parameters.index("offset")
         model[:, offset] -= start.displacement(first.voltage[:1])[:, 0]
@@ -277,7 +279,7 @@ def _informed(
     record: Record,
     window: slice,
     generator: np.random.Generator,
-) -> Started:
+) -> InitialStates:
     """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
     likelihood = histories.likelihoods[0]
     posterior = LinearStart(*histories.each(theta, Likelihood.start))
@@ -300,7 +302,7 @@ def _informed(
         _p_value(histories, theta, posterior.squares),
     )
     model = likelihood.table.actuator(start_theta)
-    return Started(histories, model, unrest, sd, lead_in, window.stop)
+    return InitialStates(histories, model, unrest, sd, lead_in, window.stop)
 
 
 def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:

@@ -24,7 +24,13 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
-from bwbayes.prediction.initial_state import Start, Started, fitted, going_on, started
+from bwbayes.prediction.initial_state import (
+    InitialStates,
+    Start,
+    continue_discrepancy,
+    estimate_initial_states,
+    training_initial_states,
+)
 from bwbayes.record.record import Record, Window
 
 # Posterior draws in the mixture.
@@ -68,7 +74,7 @@ def predict_windows(
         Is called with a number of samples whenever so many more are done.
     """
     theta = posterior.prior.theta(draws)
-    start_states = fitted(posterior, theta, generator)
+    start_states = training_initial_states(posterior, theta, generator)
     several = {n: (parts,) if isinstance(parts, slice) else parts for n, parts in windows.items()}
     edges = [(window.start, window.stop) for parts in several.values() for window in parts]
     first = min(start for start, _ in edges)
@@ -114,8 +120,8 @@ def forecast(
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
-    start_states = fitted(posterior, theta, generator)
-    start_states = going_on(start_states, posterior.likelihood, theta, generator)
+    start_states = training_initial_states(posterior, theta, generator)
+    start_states = continue_discrepancy(start_states, posterior.likelihood, theta, generator)
     return _bands(name, posterior, theta, start_states, longer, after)
 
 
@@ -154,11 +160,11 @@ def predict_record(
     """
     predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
-    start_states = started(posterior, theta, record, start, generator)
-    if predicted_window.stop <= start_states.judged_from:
+    start_states = estimate_initial_states(posterior, theta, record, start, generator)
+    if predicted_window.stop <= start_states.scored_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
     bands = _bands(name, posterior, theta, start_states, record, predicted_window, watch)
-    scored_from = max(start_states.judged_from - predicted_window.start, 0)
+    scored_from = max(start_states.scored_from - predicted_window.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
 
 
@@ -166,7 +172,7 @@ def _bands(
     name: str,
     posterior: Posterior,
     theta: FloatArray,
-    start: Started,
+    start: InitialStates,
     record: Record,
     window: slice,
     watch: Callable[[int], None] = lambda _: None,
@@ -223,7 +229,7 @@ def _bands(
 
 
 def _summarized(
-    start: Started,
+    start: InitialStates,
     variances: Sequence[FloatArray],
     scores: FloatArray,
     record: Record,
@@ -237,8 +243,8 @@ def _summarized(
     """
     samples, unknown = simulated.shape[1], np.ones(1)
     expected = simulated
-    if start.carried is not None:
-        remembered, explained = start.carried.after(first, samples)
+    if start.discrepancy is not None:
+        remembered, explained = start.discrepancy.after(first, samples)
         expected, unknown = simulated + remembered, 1 - explained
     mean = np.mean(expected, axis=0)
     summarized: dict[str, Floating] = {"mean": mean}

@@ -23,7 +23,7 @@ from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
-from bwbayes.prediction.discrepancy_state import carried
+from bwbayes.prediction.discrepancy_state import filter_discrepancy
 from tests.inference.problems import INTERVAL, short_posterior
 
 QUALITIES = st.one_of(st.floats(0.02, 5.0), st.sampled_from([0.5, 0.5 + 1e-9, 0.5 - 1e-9]))
@@ -184,7 +184,7 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
     rows = posterior.only.readings.rows
     simulated = posterior.simulate(theta, rows)
-    left = carried(posterior.likelihood, theta, simulated)
+    left = filter_discrepancy(posterior.likelihood, theta, simulated)
     noise = posterior.only.table.noise(theta)[0]
     later = rows[-1] + np.array([0, 3, 50])
     across = covariance(noise, INTERVAL * np.abs(np.subtract.outer(later, rows)))

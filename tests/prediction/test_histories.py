@@ -14,7 +14,7 @@ import pytest
 from bwbayes.model.operator import Span
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import choose_histories
-from bwbayes.prediction.initial_state import Start, started
+from bwbayes.prediction.initial_state import Start, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests.prediction.moving import RATE, Case, posterior_of_case
@@ -39,7 +39,7 @@ def record_after(reach: float) -> Record:
 def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: float) -> None:
     record = record_after(reach)
     start = Start(lead_in=1.0)
-    begun = started(POSTERIOR, DRAWS, record, start, np.random.default_rng(2))
+    begun = estimate_initial_states(POSTERIOR, DRAWS, record, start, np.random.default_rng(2))
     spans = [likelihood.actuator.span for likelihood in begun.histories.likelihoods]
     drawn = np.array([spans[k] for k in begun.histories.which])
     # To the next of the ranges that are told apart: 6 V down, a quarter up.
@@ -51,7 +51,7 @@ def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: floa
 def test_a_planned_voltage_has_any_history() -> None:
     planned = replace(record_after(30.0), displacement=None)
     draws = POSTERIOR.prior.theta(np.empty((500, 0)))
-    begun = started(POSTERIOR, draws, planned, Start(), np.random.default_rng(2))
+    begun = estimate_initial_states(POSTERIOR, draws, planned, Start(), np.random.default_rng(2))
     histories = begun.histories
     counts = np.bincount(histories.which, minlength=len(histories.likelihoods))
     assert np.max(np.abs(counts - 500 / len(counts))) < 2
@@ -60,7 +60,7 @@ def test_a_planned_voltage_has_any_history() -> None:
 def test_every_draw_is_simulated_with_its_own_history() -> None:
     """In pieces as at once, and as one draw alone."""
     planned = replace(record_after(30.0), displacement=None)
-    begun = started(POSTERIOR, DRAWS, planned, Start(), np.random.default_rng(3))
+    begun = estimate_initial_states(POSTERIOR, DRAWS, planned, Start(), np.random.default_rng(3))
     whole = begun.displacement(planned.voltage)
     pieces = np.hstack([*begun.pieces(planned.voltage, 77)])
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
@@ -158,5 +158,5 @@ def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
     voltage = 60 * np.sin(2 * np.pi * np.arange(int(4 * RATE)) / RATE)
     start = Start(own_offset=False, lead_in=0.6)
     record = Record(voltage, 0.5 * voltage, 1 / RATE)
-    begun = started(posterior, theta, record, start, np.random.default_rng(1))
+    begun = estimate_initial_states(posterior, theta, record, start, np.random.default_rng(1))
     assert (begun.offset_sd > 0).all()
