@@ -200,11 +200,15 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     except ValueError as error:
         entry["stop_reason"] = one_line(str(error))
         return Replicate(entry, np.empty((0, len(names))))
-    chained = draws(posterior, chain)
-    time = float(np.max(outcome.check.autocorrelation))
-    entry["spacing"], free = _independent(chained, time, choosing)
+    # As good as independent are draws that lie the longest autocorrelation time apart, if anything
+    # moves and enough are left. As two of a chain are correlated by 1/ESS on average, that much of
+    # the ranks' evenness is lost, and no more.
+    chained, time = draws(posterior, chain), float(np.max(outcome.check.autocorrelation))
+    longest = chained[..., 0].size // RANKED
+    spacing = max(min(math.ceil(time) if math.isfinite(time) else 1, longest), 1)
+    free = thinned(chained[::-spacing].reshape(-1, chained.shape[-1]), choosing, RANKED)
     entry["converged"], entry["stop_reason"] = outcome.converged, outcome.stop_reason
-    entry["steps"] = outcome.check.steps
+    entry["steps"], entry["spacing"] = outcome.check.steps, spacing
     if len(free) < RANKED:
         return Replicate(entry, np.empty((0, len(names))))
     drawn = experiment.measures(posterior, posterior.prior.theta(free))
@@ -243,22 +247,6 @@ def _simulated(
         noise = dataset.table.noise(record_theta)
         simulated[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
     return column, simulated
-
-
-def _independent(
-    chained: FloatArray, time: float, generator: np.random.Generator
-) -> tuple[int, FloatArray]:
-    """Choose ``RANKED`` draws, or all, as good as independent: spacing in steps, (RANKED, free).
-
-    Every walker keeps one step in as many as the longest autocorrelation time has; of what is left
-    of all walkers some are chosen at random. As two draws of a chain are correlated by 1/ESS on
-    average, that much of the ranks' evenness is lost, and no more.
-    """
-    steps, ensembles, walkers, free = chained.shape
-    # Nothing is known of the time where nothing moves; a short chain must leave enough draws.
-    longest = steps * ensembles * walkers // RANKED
-    spacing = max(min(math.ceil(time) if math.isfinite(time) else 1, longest), 1)
-    return spacing, thinned(chained[::-spacing].reshape(-1, free), generator, RANKED)
 
 
 def _predictions(

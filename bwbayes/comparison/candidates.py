@@ -116,10 +116,7 @@ class Candidate:
 
     def numbers(self, voting: Collection[str]) -> dict[str, Any]:
         """Return what ``comparison.json`` holds of it; ``voting`` are the parts that decide."""
-        evidence = self.evidence
-        keys = ("log_evidence", "error", "log_prior_mass", "prior_share")
-        values = [None if evidence is None else getattr(evidence, key) for key in keys]
-        names = ("log_evidence", "log_evidence_error", *keys[2:])
+        evidence = {} if self.evidence is None else vars(self.evidence)
         return {
             "model": self.model,
             "converged": self.converged,
@@ -134,13 +131,16 @@ class Candidate:
                 name: {
                     "log_score": float(np.sum(section.log_scores)),
                     "readings": section.readings,
-                    "independent": section.worth,
+                    "independent": section.independent,
                     "joint": section.joint,
                     "votes": name in voting,
                 }
                 for name, section in self.parts.items()
             },
-            **dict(zip(names, values, strict=True)),
+            "log_evidence": evidence.get("log_evidence"),
+            "log_evidence_error": evidence.get("error"),
+            "log_prior_mass": evidence.get("log_prior_mass"),
+            "prior_share": evidence.get("prior_share"),
             "log_likelihood": self.log_likelihood,
             "aic": self.criterion(2.0),
             "bic": self.criterion(float(np.log(self.readings))),

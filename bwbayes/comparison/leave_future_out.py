@@ -48,18 +48,18 @@ class Part:
         another record the sum of its readings' own log densities.
     readings
         Their number.
-    worth
+    independent
         Independent readings that the residuals are worth: their number over their integrated
         autocorrelation time.
     joint
-        Whether the densities are joint ones. If not, what they count is ``worth``.
+        Whether the densities are joint ones. If not, what they count is ``independent``.
     effective
         Effective draws behind the scores: their Monte Carlo variance is one over this.
     """
 
     log_scores: FloatArray
     readings: int
-    worth: float
+    independent: float
     joint: bool = True
     effective: float = np.inf
 
@@ -217,15 +217,14 @@ def _scored(
     counts = {number: len(flat) for number, flat in chosen.items()}
     log_z, effective = log_ratios(log_likelihood, counts)
     likeliest = theta[np.argmax(log_likelihood[-1]), np.newaxis]
-    worth = 0.0
+    size = 0.0
     for dataset in path[-1].datasets:
         if dataset.name in rows:
-            name = dataset.name if len(path[-1].datasets) > 1 else None
-            simulated = path[-1].simulate(likeliest, rows[dataset.name], name)[0]
+            simulated = path[-1].simulate(likeliest, rows[dataset.name], dataset.name)[0]
             residual = dataset.displacement[rows[dataset.name]] - simulated
-            worth += residual.size / _correlation_time(residual)
+            size += residual.size / _correlation_time(residual)
     readings = sum(record_rows.size for record_rows in rows.values())
-    return Part(np.diff(log_z), readings, worth, effective=float(np.min(effective)))
+    return Part(np.diff(log_z), readings, size, effective=float(np.min(effective)))
 
 
 def _fitted(

@@ -23,7 +23,7 @@ from bwbayes.comparison.compared import Comparison, Difference
 from bwbayes.report.words import with_error
 
 # Independent readings that a part must be worth to have a vote: as many blocks tell its error.
-MIN_WORTH = 5
+MIN_INDEPENDENT = 5
 
 
 def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] = ()) -> Comparison:
@@ -44,12 +44,12 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     if not usable:
         none = ("no model has converged, so none is recommended",)
         return Comparison(tuple(unusable), lines=none, caveats=tuple(unconverged), facts=facts)
-    worth = {
-        name: max(candidate.parts[name].worth for candidate in usable)
+    sizes = {
+        name: max(candidate.parts[name].independent for candidate in usable)
         for name in usable[0].parts
         if all(name in candidate.parts for candidate in usable)
     }
-    voting = tuple(name for name, independent in worth.items() if independent >= MIN_WORTH)
+    voting = tuple(name for name, independent in sizes.items() if independent >= MIN_INDEPENDENT)
 
     def value(candidate: Candidate) -> float:
         return candidate.log_score(voting) if voting else candidate.log_evidence
@@ -61,9 +61,9 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     counted = []
     for candidate in usable:
         parts = {
-            name: replace(part, log_scores=part.log_scores * worth[name] / part.readings)
+            name: replace(part, log_scores=part.log_scores * sizes[name] / part.readings)
             for name, part in candidate.parts.items()
-            if name in worth and not part.joint
+            if name in sizes and not part.joint
         }
         counted.append(replace(candidate, parts={**candidate.parts, **parts}))
     ordered = sorted(counted, key=lambda candidate: -value(candidate))
@@ -84,7 +84,7 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     )
     without_vote = [
         f"{name} is worth {independent:.1f} independent readings only and has no vote"
-        for name, independent in worth.items()
+        for name, independent in sizes.items()
         if name not in voting
     ]
     return replace(
@@ -108,7 +108,8 @@ def difference(candidate: Candidate, best: Candidate, voting: Sequence[str]) -> 
     with np.errstate(invalid="ignore"):  # both may hold a reading for impossible
         for first, second in ((candidate.parts[name], best.parts[name]) for name in voting):
             gains = first.log_scores - second.log_scores
-            blocks = gains.size if min(first.worth, second.worth) >= gains.size else MIN_WORTH
+            is_enough = min(first.independent, second.independent) >= gains.size
+            blocks = gains.size if is_enough else MIN_INDEPENDENT
             sums = gains.reshape(blocks, -1).sum(axis=1)
             total += float(np.sum(sums))
             variance += blocks * float(np.var(sums, ddof=1))

@@ -44,7 +44,7 @@ class LoopFit:
         would change.
     trend : float, um
         How far the displacement goes from the first reading to the last at equal voltages.
-    trend_told : float
+    trend_share : float
         Part of a trend that loops do not imitate, at most 1; with little of it `trend` means none.
     explained : float
         Part of the displacement's variance that the voltage explains, at most 1.
@@ -61,7 +61,7 @@ class LoopFit:
     decay_time: float
     start: float
     trend: float
-    trend_told: float
+    trend_share: float
     explained: float
     without_loops: float
 
@@ -80,21 +80,18 @@ def fit_loop(record: Record) -> LoopFit:
     times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, 20)
     decays = np.exp(-elapsed[:, np.newaxis] / times)
 
-    best: tuple[float, FloatArray, float, int] | None = None
     # None, and from half an interval to a part of a half turn.
     turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
     edges = np.concatenate([[0], turns, [record.samples - 1]])
     slowest = 0.3 * record.interval * float(np.median(np.diff(edges)))
     lagging = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
     lags = np.concatenate([[0.0], lagging])
+    fits = []
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), has_reading), strict=True):
         basis = np.column_stack([loops, trend_shape])
-        remainder, which = _best_decay(basis, decays, centered)
-        if best is None or remainder < best[0]:
-            best = remainder, basis, lag, which
-    assert best is not None
-    remainder, basis, lag, which = best
+        fits.append((*_best_decay(basis, decays, centered), basis, float(lag)))
+    remainder, which, basis, lag = min(fits, key=lambda fit: fit[0])
     design = np.column_stack([basis, decays[:, which]])
     products = _products(design, centered[:, np.newaxis])
     among = _products(design, design)

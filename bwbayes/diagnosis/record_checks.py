@@ -293,7 +293,7 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     size = loop.trend
     if loop.decay_time > LONG_DECAY * record.duration:
         size -= loop.decay * (1 - float(np.exp(-record.duration / loop.decay_time)))
-    share = max(loop.trend_told, 1e-12)
+    share = max(loop.trend_share, 1e-12)
     if share > 0.1 and abs(size) > max(7 * spread / np.sqrt(share), 0.05 * extent):
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"

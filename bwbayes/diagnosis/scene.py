@@ -150,22 +150,20 @@ class Scene:
         there to where it leaves that to the explanation.
         """
         rough: Mapping[str, object] = {"noise": "discrepancy"}
-        if not isinstance(self.posterior.only.noise, SmoothNoise):
-            return None
-        posterior = self.rebuilt(rough)
-        if self.reconfigure is None or posterior is None:
+        build, is_smooth = self.reconfigure, isinstance(self.posterior.only.noise, SmoothNoise)
+        posterior = self.rebuilt(rough) if is_smooth else None
+        if build is None or posterior is None:
             return None
         rows = [self.posterior.names.index(name) for name in posterior.names]
         fit = climb(posterior, self.places[:, rows])
-
-        def reconfigure(
-            changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
-        ) -> Posterior:
-            assert self.reconfigure is not None
-            return self.reconfigure({**rough, **changes}, parameters)
-
         places = map_estimate.distinct([fit.coordinates, *self.places[:, rows]], fit.covariance)
-        return replace(self, fit=fit, places=places, reconfigure=reconfigure, before=self.fit)
+        return replace(
+            self,
+            fit=fit,
+            places=places,
+            reconfigure=lambda changes, parameters: build({**rough, **changes}, parameters),
+            before=self.fit,
+        )
 
     @property
     def posterior(self) -> Posterior:
