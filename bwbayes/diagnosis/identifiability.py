@@ -6,10 +6,10 @@ way again: a hundred periods of one sine show one loop, not a hundred. So each d
 the voltage counts once, under a discrepancy of that percent. The posterior itself, which trusts the
 noise model, may look surer.
 
-After, by the draws (:func:`learned`). The contraction 1 − (posterior sd / prior sd)² is near one
-where the record decided and near zero where it told nothing. Scaling the power of the prior, or of
-the likelihood, by a little shows which of them a posterior hangs on: one that moves with the prior
-and not with the likelihood is what was put in.
+After, by the draws (:func:`information_gain`). The contraction 1 − (posterior sd / prior sd)² is
+near one where the record decided and near zero where it told nothing. Scaling the power of the
+prior, or of the likelihood, by a little shows which of them a posterior hangs on: one that moves
+with the prior and not with the likelihood is what was put in.
 """
 
 # mypy: allow-untyped-calls
@@ -160,7 +160,7 @@ def combined(direction: FloatArray, names: Sequence[str]) -> str:
 
 
 @dataclass(frozen=True)
-class Taught:
+class ParameterInformation:
     """What is known of one parameter after a record.
 
     ``contraction`` as above, in the normal scores of its prior, so that it is the same for a
@@ -190,7 +190,7 @@ class Taught:
 
 
 @dataclass(frozen=True)
-class Learned:
+class InformationGain:
     """What a record taught, by parameter.
 
     ``combinations`` are the parameters, in words, that were determined together worst, the worst
@@ -199,7 +199,7 @@ class Learned:
 
     __repr__ = brief
 
-    parameters: Mapping[str, Taught]
+    parameters: Mapping[str, ParameterInformation]
     combinations: tuple[tuple[str, float], ...]
 
     @property
@@ -231,12 +231,12 @@ class Learned:
         }
 
 
-def learned(
+def information_gain(
     prior: JointPrior,
     draws: FloatArray,
     log_density: FloatArray,
     generator: np.random.Generator,
-) -> Learned:
+) -> InformationGain:
     """Hold the posterior against the prior.
 
     Parameters
@@ -266,7 +266,7 @@ def learned(
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
     sensitivities = _sensitivities(prior, thin, log_likelihood)
     parameters = {
-        name: Taught(float(contraction[i]), *sensitivities[name])
+        name: ParameterInformation(float(contraction[i]), *sensitivities[name])
         for i, name in enumerate(prior.free_names)
     }
     # The three directions that keep most of their prior sd, in the prior's own normal scores, whose
@@ -280,7 +280,7 @@ def learned(
         if sd >= LEFT_OPEN:
             # How the scores move together along it, and not what picks it out.
             combinations.append((combined(left @ directions[:, i], prior.free_names), sd))
-    return Learned(parameters, tuple(combinations))
+    return InformationGain(parameters, tuple(combinations))
 
 
 def _sensitivities(

@@ -47,7 +47,7 @@ class Statistic:
     p: float
 
     @property
-    def odd(self) -> bool:
+    def extreme(self) -> bool:
         """Whether no more than one in a hundred replicated records has as much, or as little."""
         return min(self.p, 1 - self.p) < 0.005
 
@@ -55,11 +55,11 @@ class Statistic:
     def numbers(self) -> dict[str, float | bool]:
         """What ``summary.json`` has of it."""
         edges = {"lower_95": self.lower, "upper_95": self.upper}
-        return {"observed": self.observed} | edges | {"p": self.p, "odd": self.odd}
+        return {"observed": self.observed} | edges | {"p": self.p, "odd": self.extreme}
 
 
 @dataclass(frozen=True)
-class Replicated:
+class PredictiveChecks:
     """The statistics by name, and how many records were made."""
 
     __repr__ = brief
@@ -76,12 +76,12 @@ class Replicated:
         }
 
 
-def replicated(
+def check_predictions(
     posterior: Posterior,
     draws: FloatArray,
     generator: np.random.Generator,
     record: str | None = None,
-) -> Replicated:
+) -> PredictiveChecks:
     """Check the training readings of a record against replicated ones.
 
     Parameters
@@ -126,7 +126,7 @@ def replicated(
     lower, upper = np.quantile(replicates, [0.025, 0.975], axis=0)
     p = np.mean(replicates > observed, axis=0) + 0.5 * np.mean(replicates == observed, axis=0)
     values = np.stack([observed, lower, upper, p], axis=1).tolist()
-    return Replicated(
+    return PredictiveChecks(
         {name: Statistic(*row) for name, row in zip(STATISTICS, values, strict=True)}, count
     )
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.consistency import Agreement
-from bwbayes.diagnosis.identifiability import Learned
+from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.innovations import Innovations
-from bwbayes.diagnosis.predictive_checks import Replicated
+from bwbayes.diagnosis.predictive_checks import PredictiveChecks
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.validation import Standing, Verdict
 from bwbayes.inference.parameters import Parameter
@@ -78,8 +78,8 @@ class Result:
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
     agreement: Mapping[str, Agreement] = field(default_factory=dict)
     explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
-    learned: Learned | None = None
-    replicated: Mapping[str, Replicated] = field(default_factory=dict)
+    learned: InformationGain | None = None
+    replicated: Mapping[str, PredictiveChecks] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from bwbayes.diagnosis.conflict import effective
-from bwbayes.diagnosis.identifiability import Learned
+from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import JointPrior, Parameter
@@ -97,7 +97,7 @@ def moves_table(result: Result) -> Table:
     return Table.of("moves", "Moves", rows, columns, note=note)
 
 
-def learned_table(result: Result, learned: Learned) -> Table:
+def learned_table(result: Result, learned: InformationGain) -> Table:
     """Return how far the record narrowed each parameter, and what its posterior depends on."""
     rows = []
     for parameter in result.free:
@@ -137,7 +137,7 @@ def replicated_tables(result: Result) -> list[Table]:
         for kind, statistic in checked.statistics.items():
             words, unit = STATISTICS[kind]
             row = {"words": words, "unit": unit_text(unit), **vars(statistic)}
-            rows.append(row | {"extreme": "extreme" if statistic.odd else ""})
+            rows.append(row | {"extreme": "extreme" if statistic.extreme else ""})
         of = f" of {name}" if len(result.replicated) > 1 else ""
         caption = f"Posterior predictive checks{of}"
         tables.append(Table.of(f"replicated-{name}", caption, rows, columns))

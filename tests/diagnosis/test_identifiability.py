@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.identifiability import Learned, learned, spectrum, undetermined
+from bwbayes.diagnosis.identifiability import (
+    InformationGain,
+    information_gain,
+    spectrum,
+    undetermined,
+)
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
@@ -116,10 +121,10 @@ def exact(model: Linear, spread: float = 1.0) -> FloatArray:
     return flat.reshape(1000, 2, 3, -1)
 
 
-def of(posterior: Posterior, draws: FloatArray) -> Learned:
+def of(posterior: Posterior, draws: FloatArray) -> InformationGain:
     flat = draws.reshape(-1, draws.shape[-1])
     density = posterior.log_density(posterior.prior.unconstrain(flat)).reshape(draws.shape[:-1])
-    return learned(posterior.prior, draws, density, np.random.default_rng(2))
+    return information_gain(posterior.prior, draws, density, np.random.default_rng(2))
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +164,7 @@ def test_a_parameter_that_the_readings_do_not_touch_is_its_priors(model: Linear)
     fixed[:, 2] = model.exact.mean[2]
     density = posterior.log_likelihood(posterior.prior.theta(fixed))
     density += posterior.prior.constrain(posterior.prior.unconstrain(flat))[1]
-    made = learned(
+    made = information_gain(
         posterior.prior, draws, density.reshape(draws.shape[:-1]), np.random.default_rng(2)
     )
     offset = made.parameters["offset"]

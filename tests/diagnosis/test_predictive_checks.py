@@ -14,7 +14,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.innovations import Innovations, departures, innovations
-from bwbayes.diagnosis.predictive_checks import STATISTICS, Replicated, replicated
+from bwbayes.diagnosis.predictive_checks import STATISTICS, PredictiveChecks, check_predictions
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Posterior
 from tests.inference import problems
@@ -23,12 +23,12 @@ from tests.inference.problems import INTERVAL, TRUE_NOISE, short_posterior, trut
 SAMPLES = 400
 
 
-def looked_at(posterior: Posterior) -> Replicated:
+def looked_at(posterior: Posterior) -> PredictiveChecks:
     """Check against the truth's own replicates, its parameters hardly uncertain."""
     names = list(posterior.prior.names)
     free = [names.index(name) for name in posterior.names]
     draws = np.repeat(truth(posterior)[:, free], 200, axis=0)
-    return replicated(posterior, draws, np.random.default_rng(1))
+    return check_predictions(posterior, draws, np.random.default_rng(1))
 
 
 def changed(posterior: Posterior, added: FloatArray) -> Posterior:
@@ -41,7 +41,7 @@ def test_good_records_are_not_odd() -> None:
     for seed in range(10):
         made = looked_at(short_posterior(samples=SAMPLES, seed=seed))
         assert list(made.statistics) == list(STATISTICS)
-        odd += sum(one.odd for one in made.statistics.values())
+        odd += sum(one.extreme for one in made.statistics.values())
     assert odd < 4
 
 
@@ -66,7 +66,7 @@ def test_what_the_model_does_not_do_is_odd(kind: str, statistic: str) -> None:
         "wild": 6 * size * np.random.default_rng(2).normal(size=SAMPLES),
     }[kind]
     made = looked_at(changed(short_posterior(samples=SAMPLES), added))
-    assert made.statistics[statistic].odd
+    assert made.statistics[statistic].extreme
 
 
 def test_readings_that_are_missing_are_missing_in_all() -> None:
@@ -75,7 +75,7 @@ def test_readings_that_are_missing_are_missing_in_all() -> None:
     displacement[100:180] = np.nan
     made = looked_at(posterior.altered(displacement=displacement))
     assert all(np.isfinite(one.observed) for one in made.statistics.values())
-    assert not made.statistics["residual_sd_um"].odd
+    assert not made.statistics["residual_sd_um"].extreme
 
 
 # Innovations: silent on what the noise model describes, and a remark on each departure

@@ -22,8 +22,8 @@ from bwbayes.app.running.predictions import judged, predictions
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
-from bwbayes.diagnosis.identifiability import learned
-from bwbayes.diagnosis.predictive_checks import replicated
+from bwbayes.diagnosis.identifiability import information_gain
+from bwbayes.diagnosis.predictive_checks import check_predictions
 from bwbayes.diagnosis.validation import Background
 from bwbayes.prediction.loops import measure_loops
 from bwbayes.prediction.prediction import thinned
@@ -114,9 +114,9 @@ def assemble(
         result,
         verdicts=verdicts,
         explanations=explanations,
-        learned=learned(posterior.prior, result.draws, result.log_density, source),
+        learned=information_gain(posterior.prior, result.draws, result.log_density, source),
         replicated={
-            dataset.name: replicated(posterior, chosen, source, dataset.name)
+            dataset.name: check_predictions(posterior, chosen, source, dataset.name)
             for dataset in posterior.datasets
         },
         remarks=tuple(remarks),
