@@ -135,8 +135,10 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
         displacement, voltage = _readings(record)[np.isin(rows, retained)], record.voltage[retained]
         extent, levels = _extent(displacement), np.unique(displacement)
         resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
-        drive = voltage * (extent / max(float(np.ptp(voltage)), 1e-300))
-        near = spikes(displacement, drive, max(0.01 * extent, 6 * resolution))
+        gain, middle = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
+        if middle > 0:  # no outlier makes this one larger
+            gain = min(gain, scatter(displacement) / middle)
+        near = spikes(displacement, gain * voltage, max(0.01 * extent, 6 * resolution))
         if not ends:
             others = np.delete(displacement, near)
             far = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
