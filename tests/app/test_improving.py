@@ -151,7 +151,7 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
     noise, why = chosen_noise(problem, point)
     assert noise == "smooth"
     assert why.count("nats against") == 2
-    chosen = resolve(problem.with_noise(noise), tmp_path, problem.records).posterior
+    chosen = problem.with_noise(noise).posterior
     new = ["discrepancy_quality"]
     assert sorted(chosen.names) == sorted([*problem.posterior.names, *new])
     assert {"sensor_sd[a]", "offset[a]"} < set(chosen.names)

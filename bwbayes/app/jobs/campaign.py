@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from bwbayes.app.config.config import checked, dump, load, parse, read_toml
+from bwbayes.app.config.config import checked, dump, parse, read_toml
 from bwbayes.app.config.proposal import propose
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
@@ -184,10 +184,10 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
         try:
             existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            written = load(existing.config)
-            expected = problem.with_noise(written.model.noise)
-            same_posterior = fingerprint(written) == fingerprint(expected)
-            if same_posterior and existing.problem().record.sha256 == problem.record.sha256:
+            found = existing.problem()
+            expected = problem.with_noise(found.config.model.noise)
+            same_posterior = fingerprint(found.config) == fingerprint(expected.config)
+            if same_posterior and found.record.sha256 == problem.record.sha256:
                 return existing
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version

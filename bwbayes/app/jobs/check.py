@@ -14,9 +14,8 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import chosen_noise, explained, lines
+from bwbayes.app.running.explaining import explained, find_map, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.report.outputs import save
 from bwbayes.report.report import (
     Banner,
@@ -38,15 +37,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, seed, about = resolve(config, folder), config.seed, []
-    point = pointfit.fit(problem.posterior, generator(seed, "point fit"))
-    if config.model.noise == "auto":
-        noise, why = chosen_noise(problem, point)
-        about.append(why)
-        if noise != config.model.noise_until_chosen:
-            problem = resolve(problem.changed(config, {"noise": noise}, {}), folder)
-            point = pointfit.fit(problem.posterior, generator(seed, "point fit"))
-    posterior = problem.posterior
+    problem, point, why = find_map(resolve(config, folder))
+    posterior, seed = problem.posterior, config.seed
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
     # The findings are remarks too, but here they come with what to do.
@@ -65,8 +57,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     ]
     nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
     several = len(problem.records) > 1
-    facts = problem.facts.items()
-    about = [fact for subject, fact in facts if subject.startswith("record")] + about
+    about = [fact for subject, fact in problem.facts.items() if subject.startswith("record")]
+    about += [why] * bool(why)
     pictures: list[Picture] = []
     for name, record in problem.records.items():
         training, found = problem.posterior.alone(name).only.training, problem.findings[name]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, dump, load
+from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.continued import joined
@@ -29,7 +29,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
-from bwbayes.app.running.run import begin, draw, resume
+from bwbayes.app.running.run import begin, resume
 from bwbayes.app.running.workers import executor as executor_of
 from bwbayes.app.running.workers import one_thread, side_by_side
 from bwbayes.calibration.replicates import as_done
@@ -256,10 +256,12 @@ def _screened(name: str, folder: RunFolder) -> Candidate:
 
 def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     """Sample a model to its end, from wherever it stands, and say what it is worth."""
-    fit = finished(folder) if folder.summary.is_file() else draw(folder)
+    is_finished = folder.summary.is_file()
+    quiet = Console(quiet=True)
+    fit = finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
     with executor_of(1, fit.problem.posterior.engine) as pool:
         result = _candidate(name, fit, pool, future=future)
-    return replace(result, standing=folder.standing()) if folder.summary.is_file() else result
+    return replace(result, standing=folder.standing()) if is_finished else result
 
 
 def _standing(folder: RunFolder, files: bool) -> Standing:
@@ -274,10 +276,10 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
     """Make a model's folder, or take the one that is there, if it is the same run's."""
     if path.exists() and not overwrite:
         folder = RunFolder.open(path)
-        expected = problem.with_noise(load(folder.config).model.noise)
-        same_config = folder.config.read_text(encoding="utf-8") == dump(expected)
+        found = folder.problem()
+        expected = problem.with_noise(found.config.model.noise)
         # A config has no more of its records than their ranges and names.
-        if not same_config or folder.problem().digests != problem.digests:
+        if found.config != expected.config or found.digests != expected.digests:
             raise InputError(
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )

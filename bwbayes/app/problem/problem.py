@@ -200,20 +200,20 @@ class Problem:
         stated = config.model_copy(update={"parameters": {**added, **config.parameters}})
         return with_model(stated, model, list(self.records.values()))
 
-    def with_noise(self, chosen: str) -> Config:
-        """Return the config as a run writes it whose noise, ``auto``, came to this one.
+    def with_noise(self, chosen: str) -> Problem:
+        """Return the problem of a run whose noise, ``auto``, came to this one.
 
-        As it is, if it names a noise, or none is chosen yet.
+        As it is, if its config names a noise, or none is chosen yet.
         """
-        if self.config.model.noise != "auto" or chosen == "auto":
-            return self.config
-        return self.changed(self.config, {"noise": chosen}, {})
-
-    def with_config(self, config: Config) -> Problem:
-        """Return the same problem under a config that says the same, with all that is known."""
-        other = copy(self)
-        object.__setattr__(other, "config", config)
-        return other
+        model = self.config.model
+        if model.noise != "auto" or chosen == "auto":
+            return self
+        config = self.changed(self.config, {"noise": chosen}, {})
+        if chosen != model.noise_until_chosen:
+            return resolve(config, Path(), {**self.records, **self.others})
+        same = copy(self)  # with all that is known of it
+        object.__setattr__(same, "config", config)
+        return same
 
     def windows(self, record: str) -> dict[str, tuple[slice, ...]]:
         """Return the windows of a training record by the names of their bands, fitted ones first.

@@ -114,6 +114,24 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     return best, f"noise: {best} ({', '.join(against)})"
 
 
+def find_map(problem: Problem) -> tuple[Problem, PointFit, str]:
+    """Return a problem with the noise that it shows, its MAP estimate, and why it has that noise.
+
+    The problem as it is, and no reason, if its config names a noise.
+    """
+
+    def fitted(problem: Problem) -> PointFit:
+        return map_estimate.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+
+    point = fitted(problem)
+    if problem.config.model.noise != "auto":
+        return problem, point, ""
+    noise, why = chosen_noise(problem, point)
+    chosen = problem.with_noise(noise)
+    same = chosen.posterior is problem.posterior
+    return chosen, point if same else fitted(chosen), why
+
+
 def improve_model(
     config: Config, folder: Path, console: Console, records: Mapping[str, Record] | None = None
 ) -> Config:

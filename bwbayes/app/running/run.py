@@ -22,14 +22,13 @@ from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.assembling import assemble, save_result
-from bwbayes.app.running.explaining import chosen_noise
+from bwbayes.app.running.explaining import find_map
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.errors import InputError
-from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.report.outputs import write_bands, write_posterior, write_summary
@@ -53,17 +52,8 @@ def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem, chain = _chain(folder, folder.problem(), Console(quiet=True))
+        problem, chain = _open_chain(folder, folder.problem(), Console(quiet=True))
         return problem, chain.point
-
-
-def draw(folder: RunFolder) -> Fit:
-    """Sample a run to its end, from wherever it stands, and work nothing out of it yet.
-
-    Raises InputError: the folder's files do not fit together, or another process is writing them.
-    """
-    with folder.locked(), one_thread():
-        return _drawn(folder, folder.problem(), Console(quiet=True), workers=1)
 
 
 def resume(
@@ -74,6 +64,7 @@ def resume(
     ess: float | None = None,
     steps: int | None = None,
     engine: Engine | None = None,
+    predict: bool = True,
     files: bool = True,
     backend: str | Executor | None = None,
     artist: Artist | None = None,
@@ -84,10 +75,10 @@ def resume(
 
     ``workers`` and ``backend`` are as of :func:`~bwbayes.app.running.workers.executor`; the result
     does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or engine;
-    another engine has the same posterior, but from here on not the same bits. ``files`` are what a
-    run leaves besides its config, records and chain; the ``artist``, if any, draws them. ``show``
-    and ``answer`` are called with the problem before anything is done with it, and with the fit
-    before its files are written.
+    another engine has the same posterior, but from here on not the same bits. Unless it is to
+    ``predict``, it ends with the sampling. ``files`` are what a run leaves besides its config,
+    records and chain; the ``artist``, if any, draws them. ``show`` and ``answer`` are called with
+    the problem before anything is done with it, and with the fit before its files are written.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
@@ -104,10 +95,27 @@ def resume(
         if show is not None:
             show(problem)
         artist.rehearse(problem.posterior)
-        fit = _drawn(folder, problem, console, workers, engine, backend)
+        problem, chain = _open_chain(folder, problem, console, engine)
+        plan = problem.plan
+        with (
+            executor(workers, problem.posterior.engine, backend) as pool,
+            Progress(console, plan) as progress,
+        ):
+            # It is written last, as the sign that all is done; now there is more to do.
+            folder.summary.unlink(missing_ok=True)
+            outcome = sample(problem.posterior, plan, chain, pool, progress)
+        models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
+        ess = outcome.check.lowest_ess
+        console.print(
+            f"sampled {models} models, {models / ess:.1f} for each of {ess:.0f} effective draws",
+            highlight=False,
+        )
+        fit = Fit(chain, folder).knowing(problem=problem, outcome=outcome)
+        if not predict:
+            return fit
         console.print("computing predictions ...", highlight=False)
         with StepProgress(console) as watch:
-            result = assemble(fit.problem, fit.chain, fit.outcome, artist, watch)
+            result = assemble(problem, chain, outcome, artist, watch)
         fit = fit.knowing(
             result=result, standing=result.standing, seconds=time.monotonic() - start_time
         )
@@ -131,39 +139,12 @@ def redraw(folder: RunFolder) -> Fit:
     return fit
 
 
-def _drawn(
-    folder: RunFolder,
-    problem: Problem,
-    console: Console,
-    workers: int | None,
-    engine: Engine | None = None,
-    backend: str | Executor | None = None,
-) -> Fit:
-    """Sample a run to its end, from wherever it stands."""
-    problem, chain = _chain(folder, problem, console, engine)
-    plan = problem.plan
-    with (
-        executor(workers, problem.posterior.engine, backend) as pool,
-        Progress(console, plan) as progress,
-    ):
-        # It is written last, as the sign that all is done; now there is more to do.
-        folder.summary.unlink(missing_ok=True)
-        outcome = sample(problem.posterior, plan, chain, pool, progress)
-    models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
-    ess = outcome.check.lowest_ess
-    console.print(
-        f"sampled {models} models, {models / ess:.1f} for each of {ess:.0f} effective draws",
-        highlight=False,
-    )
-    return Fit(chain, folder).knowing(problem=problem, outcome=outcome)
-
-
-def _chain(
+def _open_chain(
     folder: RunFolder, problem: Problem, console: Console, requested: Engine | None = None
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
-        return _begun(folder, problem, console)
+        return _start_chain(folder, problem, console)
     chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))
     first_engine, now = chain.attributes()["engine"], problem.posterior.engine
     if first_engine != now:
@@ -176,22 +157,16 @@ def _chain(
     return problem, chain
 
 
-def _begun(folder: RunFolder, problem: Problem, console: Console) -> tuple[Problem, ChainFile]:
-    """Start a chain with a point fit, and with the noise that it shows."""
+def _start_chain(
+    folder: RunFolder, problem: Problem, console: Console
+) -> tuple[Problem, ChainFile]:
+    """Start a chain with the MAP estimate, and with the noise that it shows."""
     console.print("computing the MAP estimate ...", highlight=False)
-    config = problem.config
-    point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
-    if config.model.noise == "auto":
-        noise, why = chosen_noise(problem, point)
-        console.print(why, highlight=False, soft_wrap=True)
-        named = problem.with_noise(noise)
-        _rewrite(folder, named)
-        if noise == config.model.noise_until_chosen:
-            problem = problem.with_config(named)
-        else:
-            problem = folder.problem()
-            point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
+    problem, point, why = find_map(problem)
     posterior, config = problem.posterior, problem.config
+    if why:
+        console.print(why, highlight=False, soft_wrap=True)
+        _rewrite(folder, config)
     attributes: dict[str, str | int] = {
         "config": dump(config),
         "data_sha256": problem.sha256,
