@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 import bwbayes
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.ending import as_typed
+from bwbayes.app.commands.shared import as_typed
 from bwbayes.app.jobs.simulate import simulate
 from bwbayes.errors import InputError, one_line
 from tests.api_reference import every_module

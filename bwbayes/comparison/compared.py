@@ -14,11 +14,11 @@ from markupsafe import Markup
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.report.product import Product
 from bwbayes.report.report import (
     UNKNOWN,
     Banner,
     Facts,
+    Product,
     Report,
     Section,
     Table,

@@ -16,11 +16,11 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.model.limits import Limits
 from bwbayes.record.record import Record
-from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
     Picture,
+    Product,
     Report,
     Section,
     Table,

@@ -20,12 +20,12 @@ from bwbayes.diagnosis.validation import Standing
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.record.record import Record
-from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
     Figure,
     Picture,
+    Product,
     Report,
     Section,
     Table,

@@ -25,11 +25,11 @@ from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Facts,
     Picture,
+    Product,
     Report,
     Section,
     Table,

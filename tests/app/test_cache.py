@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import bwbayes as bw
 from bwbayes.app.running import assembling
-from bwbayes.app.running.cache import load, save
+from bwbayes.app.running.fingerprint import load, save
 from bwbayes.sampling import sampler
 
 

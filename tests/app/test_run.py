@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import xarray
 
-from bwbayes.app.commands.ending import finish
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder

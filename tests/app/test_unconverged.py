@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
-from bwbayes.app.commands.ending import finish
+from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume

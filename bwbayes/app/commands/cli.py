@@ -19,10 +19,9 @@ from concurrent.futures.process import BrokenProcessPool
 
 import click
 
-from bwbayes.app.commands.ending import as_typed
 from bwbayes.app.commands.fitting import check, init, report, resume, run
-from bwbayes.app.commands.options import WithParts
 from bwbayes.app.commands.products import compensate, design, export, predict, track
+from bwbayes.app.commands.shared import WithParts, as_typed
 from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
 from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
 

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.ending import finish, show_report
-from bwbayes.app.commands.options import (
+from bwbayes.app.commands.shared import (
     FILE,
+    finish,
     folder_argument,
     naming_options,
     options_of,
     quiet_option,
     seed_option,
+    show_report,
 )
 from bwbayes.app.running.figure_worker import artist_of
 from bwbayes.errors import ColumnsError, InputError, NoNumbersError

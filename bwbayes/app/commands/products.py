@@ -9,14 +9,15 @@ from typing import Any
 
 import click
 
-from bwbayes.app.commands.ending import present, show_report
-from bwbayes.app.commands.options import (
+from bwbayes.app.commands.shared import (
     FILE,
     folder_argument,
     naming_options,
     options_of,
     overwrite_option,
+    present,
     quiet_option,
+    show_report,
 )
 from bwbayes.errors import ColumnsError, InputError
 

@@ -8,13 +8,17 @@ from typing import Any
 import click
 from rich.console import Console
 
-from bwbayes.app.commands.ending import (
+from bwbayes.app.commands.shared import (
+    FILE,
+    WithParts,
+    options_of,
     present,
+    quiet_option,
     require_new_or_resumed,
     resumable,
+    seed_option,
     show_report,
 )
-from bwbayes.app.commands.options import FILE, WithParts, options_of, quiet_option, seed_option
 from bwbayes.app.config import USUAL_MODELS
 from bwbayes.errors import ExitStatus
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError, NotConvergedError
-from bwbayes.report.product import Shown
+from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.storage import ChainFile
 

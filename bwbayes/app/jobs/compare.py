@@ -23,10 +23,9 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
-from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.parameters import in_words, with_model
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.problem.records import generator, training_records
+from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.run import begin, resume

@@ -21,7 +21,6 @@ from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ParameterConfig, RecordConfig
-from bwbayes.app.problem.continued import joined
 from bwbayes.app.problem.parameters import (
     actuator_of,
     as_config,
@@ -38,6 +37,7 @@ from bwbayes.app.problem.records import (
     Validation,
     findings_of,
     generator,
+    joined,
     set_aside,
     training_records,
     unlike,

@@ -1,6 +1,7 @@
 """From a chain to a result: draws, remarks, predictions and what came of them.
 
-What is worked out is kept with the run (:mod:`bwbayes.app.running.cache`), and read from there.
+What is worked out is kept with the run, and read from there; see
+:mod:`bwbayes.app.running.fingerprint`.
 """
 
 from __future__ import annotations
@@ -14,10 +15,9 @@ import numpy as np
 
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.cache import load, save, state_of
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.app.running.figure_worker import Artist
-from bwbayes.app.running.fingerprint import version_remarks, versions
+from bwbayes.app.running.fingerprint import load, save, state_of, version_remarks, versions
 from bwbayes.app.running.predictions import judged, predictions
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement

@@ -32,13 +32,13 @@ from bwbayes.population.specimen import Specimen
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.report.figures import drawn
-from bwbayes.report.product import Product
 from bwbayes.report.report import (
     Banner,
     Block,
     Figure,
     Kind,
     Picture,
+    Product,
     Report,
     Section,
     Table,

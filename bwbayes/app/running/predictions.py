@@ -30,8 +30,7 @@ from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.report.figures import drawn
-from bwbayes.report.product import Shown
-from bwbayes.report.report import Figure, Report, remarks_banner, standing_banner
+from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
 
 
