@@ -10,7 +10,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from typing import Self
 
 import numpy as np
 from rich.console import Console
@@ -23,34 +22,24 @@ from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
 
 
-class _Line:
+class ProgressLine(Live):
     """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere."""
 
     def __init__(self, console: Console) -> None:
-        self.console = console
+        super().__init__(console=console, transient=True, auto_refresh=console.is_terminal)
         self.begun = self.printed = time.monotonic()
-        self.live = Live(console=console, transient=True) if console.is_terminal else None
-
-    def __enter__(self) -> Self:
-        if self.live:
-            self.live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.live:
-            self.live.stop()
 
     def show(self, line: str, *, printed: bool = True) -> None:
         """Show a line; without a terminal only if it may be ``printed`` and the time has come."""
         now = time.monotonic()
-        if self.live:
-            self.live.update(Text(line))
+        if self.console.is_terminal:
+            self.update(Text(line))
         elif printed and now - self.printed >= 10.0:
             self.printed = now
             self.console.print(line, highlight=False, soft_wrap=True)
 
 
-class StepProgress(_Line):
+class StepProgress(ProgressLine):
     """Watches steps, one after the other, of which the share that is done is known."""
 
     def __init__(self, console: Console) -> None:
@@ -67,7 +56,7 @@ class StepProgress(_Line):
         self.show(f"{step} {share:.0%}   ETA {remaining}")
 
 
-class Progress(_Line):
+class Progress(ProgressLine):
     """Watches a sampling; use it as a context manager and as the sampler's watcher."""
 
     def __init__(self, console: Console, plan: SamplingPlan) -> None:
@@ -141,7 +130,7 @@ def batch[T](
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
     short = dict(short)
-    with executor(count, backend=backend) as pool, _Line(console) as line:
+    with executor(count, backend=backend) as pool, ProgressLine(console) as line:
         together = side_by_side(pool, workers, len(arguments))
         for fresh, result in enumerate(as_done(pool, together, call, arguments), start=1):
             yield result
