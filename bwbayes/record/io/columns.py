@@ -152,7 +152,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     by_unit = _recognize(source, chosen, naming)
     has_rate = naming.fs is not None or source.interval is not None
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
-    units = {q: naming.units.get(q) or _stated(series, q) for q, series in chosen.items()}
+    units = {q: naming.units.get(q) or _unit_of(s.label, s.unit, q) for q, s in chosen.items()}
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
         raise _columns_error(source, naming, chosen, missing, unknown)
@@ -283,10 +283,6 @@ def _unit_of(label: str, unit: str, quantity: str) -> str | None:
     return unit if power_of(unit, quantity) is not None else unit_in(label, quantity)
 
 
-def _stated(series: Series, quantity: str) -> str | None:
-    return _unit_of(series.label, series.unit, quantity)
-
-
 def _columns_error(
     source: Source,
     naming: Naming,
@@ -321,12 +317,12 @@ def _columns_error(
     units = {q: _COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
-        pool = [s for s in pool if _stated(s, quantity)] or pool
+        pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or pool
         if not pool:
             continue
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
         candidates = [s for s in candidates if s is not pool[0]]
-        if _stated(pool[0], quantity) is None:
+        if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
             units.setdefault(quantity, _COMMON_UNITS[quantity][0])
     listing = _listed(source.series, ranges)
     lost = [q for q in missing if q not in columns]
