@@ -7,7 +7,8 @@ line and ends with status 2. Anything else is a defect of bwbayes and keeps its 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from enum import IntEnum
 from shlex import quote
@@ -91,6 +92,16 @@ class ColumnsError(InputError):
         ]
         options += [] if self.fs is None else [f"--fs {self.fs:g}"]
         return InputError(f"{self.problem}; copy and correct: {' '.join([command, *options])}")
+
+
+@contextmanager
+def refuse_unwritable(where: object, advice: str = "choose another place") -> Iterator[None]:
+    """Say in one line, as an :class:`InputError`, why a file or folder cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{where}: cannot be written ({reason}); {advice}") from None
 
 
 def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | None = None) -> str:

@@ -23,7 +23,8 @@ import bwbayes
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.run import resume, start
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
@@ -202,7 +203,7 @@ def test_an_operator_from_outside_goes_all_the_way(
     """
     kind = "TanhLoop"
     small.without_pictures(monkeypatch)
-    folder = start(config(tmp_path, kind), tmp_path, tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", resolve(config(tmp_path, kind), tmp_path))
     result = resume(folder, Console(quiet=True), workers=1)
     assert result.outcome.converged
     summary = json.loads(folder.summary.read_text(encoding="utf-8"))

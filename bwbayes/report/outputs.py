@@ -8,29 +8,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.prediction.bands import Bands
+from bwbayes.record.io.formats import draft_of
 from bwbayes.record.record import Record
 from bwbayes.report.figures import picture_of, save_pictures
 from bwbayes.report.page import render
 from bwbayes.report.report import Picture, Report
 from bwbayes.report.result import Result
-
-
-@contextmanager
-def _draft(path: Path) -> Iterator[Path]:
-    """Give another name to write to, which becomes the file's once it is whole."""
-    draft = path.with_suffix(".partial")
-    yield draft
-    draft.replace(path)
 
 
 def write_posterior(
@@ -39,7 +31,7 @@ def write_posterior(
     """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
     # From memory: HDF5 does not survive a disk that is full.
     whole = posterior_tree(result, log_likelihood, records).to_netcdf(engine="h5netcdf")
-    with _draft(path) as draft:
+    with draft_of(path) as draft:
         draft.write_bytes(whole)
 
 
@@ -101,7 +93,7 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
 
     Every column has seven digits of its range, however far from zero it lies.
     """
-    with _draft(path) as draft, draft.open("w", encoding="utf-8") as file:
+    with draft_of(path) as draft, draft.open("w", encoding="utf-8") as file:
         for number, predicted in enumerate(bands):
             names, columns = zip(*predicted.columns(), strict=True)
             if number == 0:
@@ -121,7 +113,7 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:
     """Write a summary as JSON; numbers that are not finite become null."""
-    with _draft(path) as draft:
+    with draft_of(path) as draft:
         draft.write_text(json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n")
 
 
@@ -144,7 +136,7 @@ def save(report: Report, folder: Path, name: str, *, pictures: str = "") -> list
     Raises InputError: the folder cannot be written.
     """
     numbers, table, page = (folder / f"{name}.{kind}" for kind in ("json", "csv", "html"))
-    try:
+    with refuse_unwritable(folder, "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         blocks = (block for block in report.all_blocks() if isinstance(block, Picture))
         drawn = {block.name: picture_of(block.draw) for block in blocks}
@@ -152,12 +144,10 @@ def save(report: Report, folder: Path, name: str, *, pictures: str = "") -> list
             save_pictures(drawn, folder / pictures)
         page.write_text(render(report, drawn), encoding="utf-8")
         if report.csv:
-            with _draft(table) as draft:
+            with draft_of(table) as draft:
                 draft.write_text(report.csv, encoding="utf-8", newline="")
         if report.numbers:
             write_summary(numbers, report.numbers)
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
     return [*[numbers] * bool(report.numbers), *[table] * bool(report.csv), page]
 
 

@@ -17,8 +17,8 @@ from filelock import FileLock
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, parse
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import start
 
 TEXT = """\
 seed = 3
@@ -59,7 +59,7 @@ def config(*changes: tuple[str, str], text: str = TEXT) -> Config:
 
 def begun(path: Path, *changes: tuple[str, str]) -> RunFolder:
     """Return the folder of a run before its first step."""
-    return start(config(*changes), path.parent, path)
+    return RunFolder.create(path, resolve(config(*changes), path.parent))
 
 
 def typed(command: click.Command, *words: object) -> int:

@@ -17,11 +17,11 @@ import bwbayes as bw
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.campaign import Campaign, Row
-from bwbayes.app.running.folder import CampaignFolder
+from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
-from bwbayes.app.running.run import start as begin
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.report.outputs import write_summary
 from bwbayes.report.result import summary
@@ -101,7 +101,7 @@ def test_a_records_run_is_what_the_run_command_makes(
     file = given / "records/s000.csv"
     text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
     alone = resume_run(
-        begin(parse(text, "alone"), given, tmp_path / "alone"),
+        RunFolder.create(tmp_path / "alone", resolve(parse(text, "alone"), given)),
         small.quiet(),
         workers=1,
         files=False,

@@ -21,7 +21,8 @@ from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
-from bwbayes.app.running.run import resume, start
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.run import resume
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference import map_estimate as pointfit
@@ -169,7 +170,7 @@ def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
 def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     write_record(thinned(records(2)[0]), tmp_path / "record.h5")
     config = parse(f'{CONFIG}[model]\nnoise = "auto"\n[sampling]\nsteps = 50\n', "config")
-    folder = start(config, tmp_path, tmp_path / "run")
+    folder = RunFolder.create(tmp_path / "run", resolve(config, tmp_path))
     console = Console(file=io.StringIO(), width=200)
     fit = resume(folder, console, workers=1, files=False)
     assert fit.problem.config.model.noise == "smooth"

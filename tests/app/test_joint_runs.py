@@ -16,7 +16,7 @@ from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.run import resume, start
+from bwbayes.app.running.run import resume
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, write_record
@@ -69,7 +69,7 @@ def problem(*changes: tuple[str, str]) -> Problem:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
-    folder = start(parse(TEXT, "joint.toml"), path.parent, path)
+    folder = RunFolder.create(path, resolve(parse(TEXT, "joint.toml"), path.parent))
     resume(folder, small.quiet(), workers=1)
     return folder
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.jobs.at_work import command_limits
+from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.control.compensation import compensate
@@ -146,4 +146,4 @@ def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> 
     voltage = 60 + 40 * np.sin(4 * np.pi * TIME)
     record = Record(voltage, 0.5 * voltage + np.sin(TIME), INTERVAL)
     config, records = config_of(record, {})
-    assert command_limits(resolve(config, Path(), records), None) == (0.0, 100.0)
+    assert limits_of(resolve(config, Path(), records), None, 0.0) == (0.0, 100.0)

@@ -20,7 +20,7 @@ from bwbayes.app.commands.shared import (
     show_report,
 )
 from bwbayes.app.running.figure_worker import artist_of
-from bwbayes.errors import ColumnsError, InputError, NoNumbersError
+from bwbayes.errors import ColumnsError, InputError, NoNumbersError, refuse_unwritable
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
@@ -41,10 +41,8 @@ def init(record: Path, out: Path | None, **naming: Any) -> int:
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
     proposal = _proposed(record, out.parent, naming, "init")
-    try:
+    with refuse_unwritable(out, "choose another place with --out"):
         out.write_text(proposal.text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{out}: {error.strerror}; choose another place with --out") from None
     _show(proposal, f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`")
     return 0
 
@@ -96,9 +94,9 @@ def run(
     """
     # First of all: it loads what draws while this process loads what samples.
     with artist_of(workers) as artist:
+        from bwbayes.app.problem.problem import resolve
         from bwbayes.app.running.explaining import improve_model
         from bwbayes.app.running.folder import RunFolder
-        from bwbayes.app.running.run import start
         from bwbayes.report.report import Report, remarks_banner
         from bwbayes.report.tables import priors_table
 
@@ -108,7 +106,7 @@ def run(
         if improve:
             RunFolder.require_free(path, overwrite)
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
-        folder = start(chosen, config.parent, path, overwrite=overwrite)
+        folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
 
         def show(problem: Problem) -> None:
             # Of a record alone the remarks are shown already.

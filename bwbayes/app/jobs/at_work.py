@@ -50,22 +50,16 @@ def at_work[**P, R](
     return method
 
 
-def limits_of(problem: Problem, limits: tuple[float, float] | None) -> Span:
-    """Return the voltages that may be used: those given, or those of all that was fitted, V.
+def limits_of(problem: Problem, limits: tuple[float, float] | None, *also: float) -> Span:
+    """Return the voltages that may be used: those given, or all that were fitted and ``also``, V.
 
     Raises InputError: they are not two voltages, the lower one first.
     """
-    ranges = [record.range_voltage for record in problem.records.values()]
-    low, high = limits or (min(low for low, _ in ranges), max(high for _, high in ranges))
+    fitted = [edge for record in problem.records.values() for edge in record.range_voltage]
+    low, high = limits or (min(*fitted, *also), max(*fitted, *also))
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
     return Span(low, high)
-
-
-def command_limits(problem: Problem, limits: tuple[float, float] | None) -> Span:
-    """Return the voltages of a command: those given, or zero and all fitted ones, V."""
-    low, high = limits_of(problem, limits)
-    return Span(low, high) if limits else Span(min(low, 0.0), max(high, 0.0))
 
 
 class Scratch:

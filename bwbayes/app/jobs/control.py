@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bwbayes.app.jobs.at_work import command_limits
+from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.exported import Exported, exported
@@ -29,7 +29,7 @@ from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.control.tracking import Tracking
 from bwbayes.control.tracking import track as tracked
 from bwbayes.diagnosis.extrapolation import beyond_training
-from bwbayes.errors import InputError, suggestion
+from bwbayes.errors import InputError, refuse_unwritable, suggestion
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
@@ -127,7 +127,7 @@ def compensate(
         A reference that was smoothed or led to, a command beyond what was fitted.
     """
     problem, seed = fit.problem, fit.problem.config.seed
-    span = command_limits(problem, voltage)
+    span = limits_of(problem, voltage, 0.0)
     limits = Limits(span.low, span.high, math.inf if slew is None else slew, current, capacitance)
     shape = {"amplitude": amplitude, "frequency": frequency, "middle": middle, "periods": periods}
     options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
@@ -237,16 +237,14 @@ def export(
     actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    model = exported(name, actuator, theta.mean(axis=0), command_limits(problem, voltage), sds)
+    model = exported(name, actuator, theta.mean(axis=0), limits_of(problem, voltage, 0.0), sds)
     model = replace(model, standing=fit.standing)
     numbers, code = (Path(folder) / name for name in FILES)
     refuse_existing([numbers, code], overwrite=overwrite)
-    try:
+    with refuse_unwritable(folder, "choose another folder"):
         numbers.parent.mkdir(parents=True, exist_ok=True)
         write_summary(numbers, model.numbers())
         code.write_text(model.c_code(), encoding="ascii")
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
     return model
 
 
@@ -318,7 +316,7 @@ def track(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
         LoopNoise(dataset.noise, parameters),
-        Stand(command_limits(problem, voltage), delay),
+        Stand(limits_of(problem, voltage, 0.0), delay),
         generator(seed, "track"),
         robustness=Robustness(gain_margin, phase_margin),
         frequencies=frequencies or None,

@@ -14,7 +14,7 @@ from bwbayes.app.running.predictions import (
     predict_another,
 )
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.errors import InputError, suggestion
+from bwbayes.errors import InputError, refuse_unwritable, suggestion
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
@@ -118,10 +118,8 @@ def write_prediction(prediction: Prediction, files: Sequence[Path], standing: St
     Raises InputError: they cannot be written.
     """
     table, numbers, picture = files
-    try:
+    with refuse_unwritable(table):
         table.parent.mkdir(parents=True, exist_ok=True)
         write_bands(table, [prediction])
         write_summary(numbers, prediction.numbers() | {"run_validation": standing.numbers})
         picture.write_bytes(picture_of(prediction.plot))
-    except OSError as error:
-        raise InputError(f"{table}: {error.strerror}; choose another place") from None

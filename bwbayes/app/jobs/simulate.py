@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from bwbayes.app.problem.records import generator
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform
@@ -72,8 +72,6 @@ def simulate(
     record = stand.run(waveform, generator(seed, "record"))
     record = replace(record, origin=f"{record.origin}, {signal} signal, seed {seed}")
     write_record(record, out)
-    try:
+    with refuse_unwritable(parameters):
         write_summary(parameters, stand.parameters())
-    except OSError as error:
-        raise InputError(f"{parameters}: {error.strerror}; choose another place") from None
     return [out, *([truth_file] if truth_file.exists() else []), parameters]

@@ -34,6 +34,7 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
+from bwbayes.record.io.formats import draft_of
 from bwbayes.sampling.storage import ChainFile
 
 
@@ -128,9 +129,8 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
     text = json.dumps({"state": state, "values": _text_of(values, arrays)})
     content = BytesIO()
     np.savez(content, allow_pickle=False, text=np.array(text), **arrays)
-    draft = path.with_suffix(".partial")
-    draft.write_bytes(sha256(content.getbuffer()).digest() + content.getbuffer())
-    draft.replace(path)
+    with draft_of(path) as draft:
+        draft.write_bytes(sha256(content.getbuffer()).digest() + content.getbuffer())
 
 
 def load(path: Path, state: str) -> dict[str, Any] | None:

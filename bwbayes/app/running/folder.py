@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from filelock import FileLock, Timeout
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, refuse_unwritable
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
@@ -31,9 +31,9 @@ class FileOf:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def __get__(self, folder: Folder | None, _: object = None) -> Path:
-        """Return its path in a folder; of the class, that relative to any."""
-        return Path(self.name) if folder is None else folder.path / self.name
+    def __get__(self, folder: Folder, _: object = None) -> Path:
+        """Return its path in a folder."""
+        return folder.path / self.name
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,10 @@ class Folder:
 
     path: Path
 
-    # What it holds, and what begins and resumes it.
+    # What it holds, patterns of what it has and has not in it, and what begins and resumes it.
     KIND: ClassVar[str]
+    HAS: ClassVar[tuple[str, ...]]
+    LACKS: ClassVar[tuple[str, ...]] = ()
     BEGIN: ClassVar[str]
     RESUME: ClassVar[str]
 
@@ -54,7 +56,11 @@ class Folder:
 
     def is_of_its_kind(self) -> bool:
         """Tell whether this is a folder that was made, and not another one."""
-        raise NotImplementedError
+
+        def has(pattern: str) -> bool:
+            return any(self.path.glob(pattern))
+
+        return all(map(has, self.HAS)) and not any(map(has, self.LACKS))
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -68,14 +74,9 @@ class Folder:
         where = f"{path}: no {cls.KIND} here"
         if path.is_file():
             raise InputError(f"{where}, but a file; give the folder that a {cls.KIND} has made")
-        if folder.has_records():
+        if any(kind(path).is_of_its_kind() for kind in (RunFolder, CalibrationFolder)):
             raise InputError(f"{where}, but something else's folder; give a {cls.KIND}'s folder")
         raise InputError(f"{where}; start one with `{cls.BEGIN.format(path=str(path))}`")
-
-    def has_records(self) -> bool:
-        """Tell a folder with records, as runs and calibrations have, from somebody's project."""
-        folder = RunFolder(self.path)
-        return folder.config.is_file() and any((self.path / "records").glob("*.h5"))
 
     @classmethod
     def require_free(cls, path: Path, overwrite: bool) -> None:
@@ -104,16 +105,14 @@ class Folder:
         """
         draft = self.path.absolute().with_name(f".{self.path.name}.partial")
         try:
-            shutil.rmtree(draft, ignore_errors=True)
-            (draft / "records").mkdir(parents=True)
-            yield type(self)(draft)
-            if self.path.exists():
-                with self.locked():
-                    shutil.rmtree(self.path)
-            draft.rename(self.path)
-        except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"{self.path}: {reason}; choose another folder") from None
+            with refuse_unwritable(self.path, "choose another folder"):
+                shutil.rmtree(draft, ignore_errors=True)
+                (draft / "records").mkdir(parents=True)
+                yield type(self)(draft)
+                if self.path.exists():
+                    with self.locked():
+                        shutil.rmtree(self.path)
+                draft.rename(self.path)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
@@ -143,6 +142,8 @@ class RunFolder(Folder):
     """The files of one run, by what they are."""
 
     KIND: ClassVar[str] = "run"
+    HAS: ClassVar[tuple[str, ...]] = ("config.toml", "records/*.h5")
+    LACKS: ClassVar[tuple[str, ...]] = ("replicates.jsonl",)
     BEGIN: ClassVar[str] = "bwbayes.fit(RECORD, folder={path!r})"
     RESUME: ClassVar[str] = "bwbayes.resume({path!r})"
 
@@ -153,7 +154,9 @@ class RunFolder(Folder):
     replicates = FileOf("replicates.jsonl")  # of a calibration alone
 
     @classmethod
-    def create(cls, path: Path, problem: Problem, overwrite: bool, mark: bytes = b"") -> Self:
+    def create(
+        cls, path: Path, problem: Problem, overwrite: bool = False, mark: bytes = b""
+    ) -> Self:
         """Make a new folder, whole or not at all; ``mark`` goes into a calibration's file.
 
         Raises InputError: it exists and ``overwrite`` is not given, it is not a run's, or cannot be
@@ -171,10 +174,6 @@ class RunFolder(Folder):
             if mark:
                 draft.replicates.write_bytes(mark)
         return folder
-
-    def is_of_its_kind(self) -> bool:
-        """Tell a run's folder from a calibration's, and from what is neither."""
-        return self.has_records() and not self.replicates.is_file()
 
     def problem(self) -> Problem:
         """Return what its config and records say."""
@@ -212,14 +211,12 @@ class CalibrationFolder(RunFolder):
     """
 
     KIND: ClassVar[str] = "calibration"
+    HAS: ClassVar[tuple[str, ...]] = (*RunFolder.HAS, *RunFolder.LACKS)
+    LACKS: ClassVar[tuple[str, ...]] = ()
     BEGIN: ClassVar[str] = "bwbayes calibrate CONFIG --out {path}"
     RESUME: ClassVar[str] = "bwbayes calibrate --resume {path}"
 
     summary = FileOf("calibration.json")
-
-    def is_of_its_kind(self) -> bool:
-        """Tell a calibration's folder from a run's."""
-        return self.has_records() and self.replicates.is_file()
 
 
 class Origin(NamedTuple):
@@ -244,6 +241,7 @@ class CampaignFolder(Folder):
     """
 
     KIND: ClassVar[str] = "campaign"
+    HAS: ClassVar[tuple[str, ...]] = ("origin.json", "campaign.toml")
     BEGIN: ClassVar[str] = "bwbayes campaign RECORDS --out {path}"
     RESUME: ClassVar[str] = "bwbayes campaign --resume {path}"
 
@@ -280,10 +278,6 @@ class CampaignFolder(Folder):
             draft.config.write_text(config, encoding="utf-8")
             draft.mark.write_text(json.dumps(origin._asdict()), encoding="utf-8")
         return folder
-
-    def is_of_its_kind(self) -> bool:
-        """Tell a campaign's folder from any other."""
-        return self.mark.is_file() and self.config.is_file()
 
     def origin(self) -> Origin:
         """Return where it began.

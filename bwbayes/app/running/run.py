@@ -1,8 +1,8 @@
 """A run, from a config or from where it was interrupted, to its last file.
 
-:func:`start` makes the run's folder; :func:`resume` does whatever is left to do in one: point
-fit, sampling, prediction, files. Each stage draws from a random stream of its own and stores what
-the next one needs, so it does not matter in how many pieces a run is done.
+:meth:`RunFolder.create` makes the run's folder; :func:`resume` does whatever is left to do in one:
+MAP estimate, sampling, prediction, files. Each stage draws from a random stream of its own and
+stores what the next one needs, so it does not matter in how many pieces a run is done.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
-from pathlib import Path
 
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit, finished
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.assembling import assemble, save_result
 from bwbayes.app.running.explaining import find_map
@@ -31,19 +30,12 @@ from bwbayes.app.running.workers import executor, one_thread
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.map_estimate import PointFit
+from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import write_bands, write_posterior, write_summary
 from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
-
-
-def start(config: Config, where: Path, out: Path, *, overwrite: bool = False) -> RunFolder:
-    """Make the folder of a new run; the config's files are relative to the folder ``where``.
-
-    Raises InputError: the config, its records or the folder cannot be used.
-    """
-    return RunFolder.create(out, resolve(config, where), overwrite)
 
 
 def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
@@ -185,9 +177,8 @@ def _start_chain(
 def _rewrite(folder: RunFolder, config: Config) -> None:
     text = dump(config)
     parse(text, "resume")  # refuses what a config cannot say
-    draft = folder.config.with_suffix(".partial")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(folder.config)
+    with draft_of(folder.config) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:

@@ -9,15 +9,17 @@ binary formats.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.record.io.columns import QUANTITIES, ColumnTable, Naming, select
 from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields, require_voltage_is
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
@@ -171,19 +173,21 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
     if suffix not in (*_TEXT, *_BINARY):
         suffixes = ", ".join((*_TEXT, *_BINARY))
         raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {suffixes}")
+    files: dict[Path, Record] = {path: record}
+    write: Callable[[Record, Path], None] = write_hdf5
     if suffix == ".mat":
-        _write_whole(path, lambda draft: write_mat(record, draft, mat_version))
-    elif suffix not in _TEXT:
-        _write_whole(path, lambda draft: write_hdf5(record, draft))
-    else:
+        write = partial(write_mat, version=mat_version)
+    elif suffix in _TEXT:
         from bwbayes.record.io.text import write_text  # noqa: PLC0415  # pandas is slow to load
 
+        write = write_text
         truth_path = _truth_path(path)
         truth_path.unlink(missing_ok=True)  # first, so that it never stands beside another record
-        _write_whole(path, lambda draft: write_text(record, draft))
         if record.truth is not None:
-            truth = replace(record, displacement=record.truth)
-            _write_whole(truth_path, lambda draft: write_text(truth, draft))
+            files[truth_path] = replace(record, displacement=record.truth)
+    for file, content in files.items():
+        with refuse_unwritable(file), draft_of(file) as draft:
+            write(content, draft)
 
 
 def require_readable(record: Record, where: str) -> None:
@@ -204,15 +208,14 @@ def _truth_path(path: Path) -> Path:
     return path.with_suffix(f".truth{path.suffix}")
 
 
-def _write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a temporary file beside `path`, then put it in place in one step."""
+@contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """Give another name to write to, which becomes the file's in one step once it is whole."""
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        write(draft)
+        yield draft
         with draft.open("rb") as file:
             os.fsync(file.fileno())
         draft.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error}); choose another place") from error
     finally:
         draft.unlink(missing_ok=True)
