@@ -47,7 +47,7 @@ def parameters_of(
     declarations, columns = table.declarations, table.layout
     named = [replace(column.declaration, name=column.name) for column in columns]
     _require_known("parameters", config.parameters, [*declarations, *named])
-    _require_known("truth", config.truth, [*declarations, *named, *every_declaration()])
+    _require_known("truth", config.truth, [*declarations, *named], elsewhere=True)
     return [
         _parameter(column, _given(config, column), contexts[column.record]) for column in columns
     ]
@@ -134,17 +134,21 @@ def every_declaration() -> list[Declaration]:
 
 
 def _require_known(
-    table: str, stated: Collection[str], declarations: Collection[Declaration]
+    table: str,
+    stated: Collection[str],
+    declarations: Collection[Declaration],
+    *,
+    elsewhere: bool = False,
 ) -> None:
-    """Refuse what is said of a parameter that the model does not have."""
+    """Refuse what is said of a parameter that the model has not, nor any model if ``elsewhere``."""
     names = list(dict.fromkeys(d.name for d in declarations))
-    for name in stated:
-        if name in names:
-            continue
-        if name in {d.name for d in every_declaration()}:
+    for name in [name for name in stated if name not in names]:
+        if name not in {d.name for d in every_declaration()}:
+            aliases = {alias: d.name for d in declarations for alias in d.aliases}
+            hint = suggestion(name, names, aliases)
+            raise InputError(f"{table}.{name}: no such parameter here; {hint}")
+        if not elsewhere:
             raise InputError(f"{table}.{name}: is not in this model; see [model], or remove it")
-        hint = suggestion(name, names, {alias: d.name for d in declarations for alias in d.aliases})
-        raise InputError(f"{table}.{name}: no such parameter here; {hint}")
 
 
 def _parameter(column: Column, stated: ParameterConfig, context: Context) -> Parameter:
