@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -104,6 +106,39 @@ class Result:
         """Whether all bands hold."""
         return Standing.of(self.verdicts.values())
 
+    @property
+    def validation(self) -> dict[str, dict[str, Any]]:
+        """Scores and verdict of all bands that have readings, by name."""
+        return {
+            name: scores.numbers | (self.verdicts[name].summary if name in self.verdicts else {})
+            for name, scores in self.scores.items()
+        }
+
+    @cached_property
+    def estimates(self) -> dict[str, dict[str, Any]]:
+        """Mean, sd, quantiles, convergence and unit of each free parameter, by name."""
+        flat, check = self.flat_draws, self.outcome.check
+        lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
+        sd = np.std(flat, axis=0, ddof=1)
+        columns = {
+            "mean": np.mean(flat, axis=0),
+            "sd": sd,
+            "median": median,
+            "lower_95": lower,
+            "upper_95": upper,
+            "ess_bulk": check.ess_bulk,
+            "ess_tail": check.ess_tail,
+            "rhat": check.rhat,
+            "mcse_mean": sd / np.sqrt(check.ess_mean),
+        }
+        table: dict[str, dict[str, Any]] = {}
+        for i, parameter in enumerate(self.free):
+            row = {key: float(values[i]) for key, values in columns.items()}
+            table[parameter.name] = row | {"unit": parameter.unit}
+            if parameter.name in self.truth:
+                table[parameter.name]["truth"] = self.truth[parameter.name]
+        return table
+
 
 def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
@@ -130,10 +165,6 @@ def summary(result: Result) -> dict[str, object]:
     if not outcome.converged:
         sections = ("parameters", "validation", "innovations", "loops", "step_responses")
         return numbers | dict.fromkeys((*sections, "identifiability", "replicated", "explanations"))
-    validation = {
-        name: scores.numbers | (result.verdicts[name].summary if name in result.verdicts else {})
-        for name, scores in result.scores.items()
-    }
     innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
     if len(innovations) == 1:
         # Those of one record stand alone, those of several by their names.
@@ -141,8 +172,8 @@ def summary(result: Result) -> dict[str, object]:
     if result.agreement:
         numbers["agreement"] = {n: record.numbers for n, record in result.agreement.items()}
     return numbers | {
-        "parameters": estimates(result),
-        "validation": validation,
+        "parameters": result.estimates,
+        "validation": result.validation,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.steps.items()},
@@ -153,28 +184,3 @@ def summary(result: Result) -> dict[str, object]:
             for name, explanations in result.explanations.items()
         },
     }
-
-
-def estimates(result: Result) -> dict[str, dict[str, object]]:
-    """Return mean, sd, quantiles, convergence and unit of each free parameter, by name."""
-    flat, check = result.flat_draws, result.outcome.check
-    lower, median, upper = np.quantile(flat, [0.025, 0.5, 0.975], axis=0)
-    sd = np.std(flat, axis=0, ddof=1)
-    columns = {
-        "mean": np.mean(flat, axis=0),
-        "sd": sd,
-        "median": median,
-        "lower_95": lower,
-        "upper_95": upper,
-        "ess_bulk": check.ess_bulk,
-        "ess_tail": check.ess_tail,
-        "rhat": check.rhat,
-        "mcse_mean": sd / np.sqrt(check.ess_mean),
-    }
-    table: dict[str, dict[str, object]] = {}
-    for i, parameter in enumerate(result.free):
-        row: dict[str, object] = {key: float(values[i]) for key, values in columns.items()}
-        table[parameter.name] = row | {"unit": parameter.unit}
-        if parameter.name in result.truth:
-            table[parameter.name]["truth"] = result.truth[parameter.name]
-    return table

@@ -37,15 +37,14 @@ from bwbayes.report.words import circumstances, covered, error_text, length_text
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     """Return what a run says.
 
-    ``numbers`` are as :func:`bwbayes.report.result.summary` returns them; ``seed``, ``wall_s``,
-    ``versions`` and ``data_sha256`` are shown too if they are there, and without convergence
-    ``go_on``, the command that goes on.
+    Of its ``numbers`` the ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` are shown if they
+    are there, and without convergence ``go_on``, the command that goes on.
     """
     pictures, check = all_pictures(result), result.outcome.check
     if result.outcome.converged:
-        blocks = [*_answer(result, numbers, pictures), *_evidence(result, numbers, pictures)]
+        blocks = [*_answer(result, pictures), *_evidence(result, pictures)]
     else:
-        sampling: list[Block] = [tables.sampling_table(result, numbers), *pictures.values()]
+        sampling: list[Block] = [tables.sampling_table(result), *pictures.values()]
         blocks = [Section("Sampling", sampling, folded=False)]
     accepted = ", ".join(
         f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
@@ -160,9 +159,9 @@ def _held_out_first(result: Result) -> list[Bands]:
     return sorted(result.bands, key=lambda bands: bands.training)
 
 
-def _answer(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
+def _answer(result: Result, pictures: Pictures) -> list[Block]:
     parameters: list[Block] = [
-        tables.parameters_table(result, numbers),
+        tables.parameters_table(result),
         Text(
             "The sensor band covers a new reading, the displacement band the actuator's "
             "displacement, 95 times in 100. The parameter band covers the model output only, not "
@@ -175,7 +174,7 @@ def _answer(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> l
     return [*results, SideBySide([parameters, *loop])]
 
 
-def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> list[Block]:
+def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     ordered = _held_out_first(result)
     shown = [pictures[f"bands_{bands.name}"] for bands in ordered]
     # Of several records "innovations_NAME" is one of the innovations.
@@ -185,7 +184,7 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
     if result.scores:
         titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}
         scores = {name: result.scores[name] for name in titles}
-        records = tables.flat_records({name: numbers["validation"][name] for name in titles})
+        records = tables.flat_records({name: result.validation[name] for name in titles})
         validation = [
             tables.scores_table(scores, result.verdicts, titles, records),
             Section(
@@ -200,11 +199,11 @@ def _evidence(result: Result, numbers: Mapping[str, Any], pictures: Pictures) ->
         Section("Readings against the bands", [*shown[:1], *validation, *shown[1:]], folded=False)
     ]
     if result.loops is not None:
-        measured = tables.loops_table(result.loops, numbers)
+        measured = tables.loops_table(result.loops)
         loops: list[Block] = [measured, pictures["loops"], Glossary([*LOOP_TERMS.items()])]
         blocks.append(Section("Loops", loops, folded=False))
     if result.steps:
-        steps: list[Block] = [tables.steps_table(result.steps, numbers), pictures["steps"]]
+        steps: list[Block] = [tables.steps_table(result.steps), pictures["steps"]]
         blocks.append(Section("Step responses", steps, folded=False))
     return blocks
 
@@ -227,7 +226,7 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
     if result.outcome.converged:
         yield Section("Posterior", [pictures["corner"]])
         chains = [pictures[name] for name in ("trace", "ranks")]
-        yield Section("Sampling", [tables.sampling_table(result, numbers), *chains])
+        yield Section("Sampling", [tables.sampling_table(result), *chains])
     yield Section("Moves", [tables.moves_table(result)])
     yield Section("Run details", [Facts([*result.facts.items(), *circumstances(numbers)])])
 

@@ -30,8 +30,6 @@ from bwbayes.report.words import (
     unit_text,
 )
 
-Summary = Mapping[str, Any]
-
 # A parameter in words, with its symbol; and the columns of names, bare on a screen.
 WORDS = Markup("{words}")
 NAME = (
@@ -40,9 +38,9 @@ NAME = (
 )
 
 
-def parameters_table(result: Result, numbers: Summary) -> Table:
+def parameters_table(result: Result) -> Table:
     """Return the estimate of each free parameter."""
-    estimates = numbers["parameters"]
+    estimates = result.estimates
     is_simulated = any("truth" in estimate for estimate in estimates.values())
     columns = (
         *NAME,
@@ -63,9 +61,10 @@ def parameters_table(result: Result, numbers: Summary) -> Table:
     return Table.of("parameters", "Parameters", rows, columns, records=records, on="both")
 
 
-def sampling_table(result: Result, numbers: Summary) -> Table:
+def sampling_table(result: Result) -> Table:
     """Return how well each free parameter was sampled; without convergence that alone."""
-    check, estimates = result.outcome.check, numbers["parameters"] or {}
+    check = result.outcome.check
+    estimates = result.estimates if result.outcome.converged else {}
     agreement = "R\N{COMBINING CIRCUMFLEX ACCENT}"
     note = (
         "ESS: effective number of draws, in the bulk and in the tails; "
@@ -222,7 +221,7 @@ def other_scores_table(
     return Table("scores", "Other scores", columns, rows, records=records)
 
 
-def loops_table(loops: Loops, numbers: Summary) -> Table:
+def loops_table(loops: Loops) -> Table:
     """Return what was measured of the loops."""
     estimates = {
         f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V": loop.estimates
@@ -238,11 +237,11 @@ def loops_table(loops: Loops, numbers: Summary) -> Table:
             " Some of the models' loops had not closed after a thousand cycles and are taken as "
             "they were."
         )
-    records = flat_records({name: numbers["loops"][name] for name in ("major", "minor")})
+    records = flat_records({"major": loops.major.numbers, "minor": loops.minor.numbers})
     return _measured("loops", "Measured loops", MEASURES, estimates, records, note)
 
 
-def steps_table(steps: Mapping[str, StepResponse], numbers: Summary) -> Table:
+def steps_table(steps: Mapping[str, StepResponse]) -> Table:
     """Return what was measured of the steps."""
     estimates = {
         f"{name}: {response.step.height:.4g} V for {response.step.held:.4g} s": response.estimates
@@ -254,7 +253,7 @@ def steps_table(steps: Mapping[str, StepResponse], numbers: Summary) -> Table:
         "creep; overshoot is what goes beyond that. Creep is the growth from 0.1 s to the end of "
         "the step, of the displacement at 0.1 s, a decade of time."
     )
-    records = flat_records(numbers["step_responses"])
+    records = flat_records({name: response.numbers for name, response in steps.items()})
     return _measured("steps", "Measured step responses", STEP_MEASURES, estimates, records, note)
 
 

@@ -230,9 +230,7 @@ class Fit(Shown):
         """
         import pandas as pd
 
-        from bwbayes.report.result import estimates
-
-        return pd.DataFrame.from_dict(estimates(self._converged()), orient="index")
+        return pd.DataFrame.from_dict(self._converged().estimates, orient="index")
 
     @cached_property
     def bands(self) -> dict[str, Prediction]:

@@ -7,7 +7,7 @@ What is worked out is kept with the run, and read from there; see
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, lines
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import load, save, state_of, version_remarks, versions
-from bwbayes.app.running.predictions import judged, predictions
+from bwbayes.app.running.predictions import predictions, validate_predictions
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
@@ -49,7 +49,7 @@ def assemble(
     """
     posterior, seed, records = problem.posterior, problem.config.seed, problem.records
     artist = artist or Artist()
-    result = _drawn(problem, chain, outcome)
+    result = _read_draws(problem, chain, outcome)
     flat = result.flat_draws
     remarks = [
         *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
@@ -63,8 +63,8 @@ def assemble(
     if not outcome.converged:
         return result
     several = len(records) > 1
-    chosen = thinned(flat, generator(seed, "draws"))
-    steps = measure_steps(posterior, chosen, {**(records if several else {}), **problem.others})
+    subset = thinned(flat, generator(seed, "draws"))
+    steps = measure_steps(posterior, subset, {**(records if several else {}), **problem.others})
     bands = predictions(problem, flat, partial(watch, "predictions"))
     result = replace(result, bands=bands, steps=steps)
     artist.draw(result)
@@ -76,14 +76,14 @@ def assemble(
     starts = {name: record.start for name, record in records.items()}
     compared = agreement.agreements(posterior, chain.point, starts)
     background = Background.of(posterior, flat)
-    unexplained = judged(problem, bands, background, {})
+    unexplained = validate_predictions(problem, bands, background, {})
     result = replace(
         result,
         scores={
             band.name: score(band, background.extent) for band in bands if band.name in unexplained
         },
         innovations=series,
-        loops=measure_loops(posterior, chosen),
+        loops=measure_loops(posterior, subset),
         agreement=compared,
     )
     artist.draw(result)
@@ -100,7 +100,7 @@ def assemble(
         )
         for name in records
     }
-    verdicts = judged(problem, bands, background, explanations)
+    verdicts = validate_predictions(problem, bands, background, explanations)
     remarks += map(str, agreement.disagreements(compared))
     for said in (
         departures,
@@ -116,14 +116,14 @@ def assemble(
         explanations=explanations,
         learned=information_gain(posterior.prior, result.draws, result.log_density, source),
         replicated={
-            dataset.name: check_predictions(posterior, chosen, source, dataset.name)
+            dataset.name: check_predictions(posterior, subset, source, dataset.name)
             for dataset in posterior.datasets
         },
         remarks=tuple(remarks),
     )
 
 
-def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
+def _read_draws(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     """Return the draws, and what the problem says of them."""
     plan, steps = problem.plan, ", ".join(f"{chain.steps(p)} steps of {p}" for p in PHASES)
     accepted = {
@@ -149,9 +149,9 @@ def _drawn(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
 
 def save_result(path: Path, problem: Problem, chain: ChainFile, result: Result) -> None:
     """Keep what takes time of a result: all that neither the chain nor the config holds."""
-    drawn = ("name", "parameters", "draws", "log_density", "moves", "facts", "truth")
-    values = {name: value for name, value in vars(result).items() if name not in drawn}
-    save(path, state_of(problem, chain), values)
+    read = ("name", "parameters", "draws", "log_density", "moves", "facts", "truth")
+    names = [field.name for field in fields(result) if field.name not in read]
+    save(path, state_of(problem, chain), {name: getattr(result, name) for name in names})
 
 
 def load_result(path: Path, problem: Problem, chain: ChainFile) -> Result | None:
@@ -159,4 +159,4 @@ def load_result(path: Path, problem: Problem, chain: ChainFile) -> Result | None
     values = load(path, state_of(problem, chain))
     if values is None:
         return None
-    return replace(_drawn(problem, chain, values["outcome"]), **values)
+    return replace(_read_draws(problem, chain, values["outcome"]), **values)

@@ -85,28 +85,28 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
         name: climb(posterior.alone(name), posterior.select_draws(point.optima, name))
         for name in problem.records
     }
-    worth = {default: sum(fit.log_evidence for fit in rough.values())}
+    evidence = {default: sum(fit.log_evidence for fit in rough.values())}
     # Innovations less likely than this by chance may be explained by another noise.
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
-    for noise in [n for n in NOISES if n not in worth and (n == "white" or p < colored)]:
+    for noise in [n for n in NOISES if n not in evidence and (n == "white" or p < colored)]:
         other = problem.reconfigured({"noise": noise}, {})
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
-        worth[noise] = sum(
+        evidence[noise] = sum(
             climb(
                 other.alone(name), other.select_draws(places, name), least=fit.log_density
             ).log_evidence
             for name, fit in rough.items()
         )
-    best = max(worth, key=lambda noise: worth[noise])
-    if worth[best] < worth[default] + TIED:
+    best = max(evidence, key=lambda noise: evidence[noise])
+    if evidence[best] < evidence[default] + TIED:
         best = default
     against = [
         f"{lead:+.3g} nats against {noise}" if lead > TIED else f"a tie with {noise}"
-        for noise, lead in ((noise, worth[best] - nats) for noise, nats in worth.items())
+        for noise, lead in ((noise, evidence[best] - nats) for noise, nats in evidence.items())
         if noise != best
     ]
     if p >= colored:
@@ -119,17 +119,17 @@ def find_map(problem: Problem) -> tuple[Problem, PointFit, str]:
 
     The problem as it is, and no reason, if its config names a noise.
     """
-
-    def fitted(problem: Problem) -> PointFit:
-        return map_estimate.fit(problem.posterior, generator(problem.config.seed, "point fit"))
-
-    point = fitted(problem)
+    point = _fit_point(problem)
     if problem.config.model.noise != "auto":
         return problem, point, ""
     noise, why = chosen_noise(problem, point)
     chosen = problem.with_noise(noise)
     same = chosen.posterior is problem.posterior
-    return chosen, point if same else fitted(chosen), why
+    return chosen, point if same else _fit_point(chosen), why
+
+
+def _fit_point(problem: Problem) -> PointFit:
+    return map_estimate.fit(problem.posterior, generator(problem.config.seed, "point fit"))
 
 
 def improve_model(
@@ -148,7 +148,7 @@ def improve_model(
         problem = resolve(config, folder, records)
         (name,) = problem.records
         console.print("searching for missing parts of the model ...", highlight=False)
-        point = map_estimate.fit(problem.posterior, generator(config.seed, "point fit"))
+        point = _fit_point(problem)
         found = explained(problem, name, point.optima, thorough=True)
         parts = likely_causes([cause for cause in found if cause.changes])
         if followed_causes(found) or not parts:

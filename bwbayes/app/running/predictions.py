@@ -130,8 +130,8 @@ def predict_another(problem: Problem, flat: FloatArray, other: Validation, name:
     assert other.record is not None
     posterior = problem.posterior
     beyond = beyond_training(posterior, other.record.voltage, other.record.interval)
-    chosen = thinned(flat, generator(problem.config.seed, "draws"))
-    bands = _of_another(problem, chosen, other, name, beyond)
+    subset = thinned(flat, generator(problem.config.seed, "draws"))
+    bands = _of_another(problem, subset, other, name, beyond)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
@@ -151,10 +151,10 @@ def predict_after(
     joined = np.concatenate([record.voltage, voltage])
     after = slice(record.samples, None)
     beyond = beyond_training(problem.posterior, joined, record.interval, after)
-    chosen = thinned(flat, generator(seed, "draws"))
+    subset = thinned(flat, generator(seed, "draws"))
     source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
     longer = replace(record, voltage=joined, displacement=None, truth=None)
-    alone, own_draws = _reaching(problem, chosen, of, longer, beyond)
+    alone, own_draws = _reaching(problem, subset, of, longer, beyond)
     bands = forecast(alone, own_draws, record, voltage, source, name)
     return Prediction(**vars(bands), remarks=tuple(finding.note for finding in beyond))
 
@@ -171,7 +171,7 @@ def predictions(
     ``watch`` is called with the share that is done.
     """
     posterior, seed = problem.posterior, problem.config.seed
-    chosen = thinned(flat, generator(seed, "draws"))
+    subset = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
     total = sum(r.samples for r in (*problem.records.values(), *problem.others.values()))
     done = 0
@@ -181,7 +181,7 @@ def predictions(
         done += samples
         watch(min(done / total, 1.0))
 
-    for name, alone, own_draws in posterior.each(chosen):
+    for name, alone, own_draws in posterior.each(subset):
         windows = problem.windows(name) if training else problem.held_out(name)
         if windows:
             record = problem.records[name]
@@ -191,7 +191,7 @@ def predictions(
     for name, held_out in problem.validations.items():
         if held_out.record is not None:
             beyond = problem.extrapolations[name]
-            bands.append(_of_another(problem, chosen, held_out, name, beyond, more))
+            bands.append(_of_another(problem, subset, held_out, name, beyond, more))
     return tuple(bands)
 
 
@@ -226,13 +226,13 @@ def _reaching(
     return posterior.alone(of), posterior.select_draws(draws, of)
 
 
-def judged(
+def validate_predictions(
     problem: Problem,
     bands: Iterable[Bands],
     background: Background,
     explanations: Mapping[str, Sequence[Explanation]],
 ) -> dict[str, Verdict]:
-    """Judge all bands that have readings, by name.
+    """Validate all bands that have readings, by name.
 
     ``explanations`` are by the name of the training record.
     """
