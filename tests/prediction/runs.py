@@ -18,7 +18,7 @@ from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, explained
-from bwbayes.app.running.predictions import judged
+from bwbayes.app.running.predictions import validate_predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Background, Verdict
 from bwbayes.inference import map_estimate as pointfit
@@ -132,13 +132,13 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     background = Background.of(posterior, draws)
-    verdicts = judged(problem, bands, background, {})
+    verdicts = validate_predictions(problem, bands, background, {})
     if again:
         failed = verdicts["training"].holds is False
         places = posterior.prior.unconstrain(best[np.newaxis])
         places = np.concatenate([places, point.optima])
         found = explained(problem, "record", places, thorough=failed)
-        verdicts = judged(problem, bands, background, {"record": found})
+        verdicts = validate_predictions(problem, bands, background, {"record": found})
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 
 
