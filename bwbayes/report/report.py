@@ -1,17 +1,24 @@
 """What a product has to say: a title, banners, tables, pictures and texts, in their order.
 
-A :class:`Product` describes itself by a :class:`Report`; :mod:`~bwbayes.report.screen`,
-:mod:`~bwbayes.report.page` and :mod:`~bwbayes.report.outputs` show it. The page has all of it. The
-screen has the banners, and those tables and texts that are meant for it. A text is escaped where it
-is shown; a :class:`~markupsafe.Markup` is taken as HTML.
+A :class:`Product` describes itself by a :class:`Report`. :func:`show` shows it on a terminal of 80
+columns, :mod:`~bwbayes.report.page` as a page, and :mod:`~bwbayes.report.outputs` writes its files.
+The page has all of it. The screen has the banners, and those tables and texts that are meant for
+it. A text is escaped where it is shown; a :class:`~markupsafe.Markup` is taken as HTML.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+from markupsafe import Markup
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as Grid
 
 from bwbayes.shown import head
 
@@ -244,6 +251,50 @@ def standing_banner(standing: Standing, on: Target = "both") -> list[Banner]:
     return [Banner(kind, standing.headline, items=standing.lines, blocks=about, on=on)]
 
 
+def show(report: Report, console: Console) -> None:
+    """Show the banners of a report, and the tables and texts that are meant for a screen."""
+    for banner in report.banners:
+        if banner.on == "page":
+            continue
+        color = {"good": "green", "note": "yellow", "bad": "red"}[banner.kind]
+        lines = [escape(_plain(line)) for line in banner.lines]
+        headline = f"[bold {color}]{escape(_plain(banner.headline))}[/]"
+        label = escape(banner.label) or headline
+        if lines or not banner.items:
+            lines = [": ".join([headline, *lines[:1]]), *lines[1:]]
+        for line in [*lines, *(f"{label}: {escape(_plain(item))}" for item in banner.items)]:
+            _say(line, console)
+    for block in report.all_blocks():
+        if isinstance(block, Table) and block.on != "page" and block.rows:
+            columns, rows = block.cells("screen")
+            grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+            for i, column in enumerate(columns):
+                title = f"{column.group}: {column.title}" if column.group else column.title
+                grid.add_column(escape(_plain(title)), no_wrap=i == 0)
+            for row in rows:
+                grid.add_row(*(escape(_plain(text)) for text in row))
+            console.print(grid)
+        elif isinstance(block, Text) and block.on != "page":
+            _say(escape(_plain(block.text)), console)
+
+
+def as_text(report: Report, width: int = 110) -> str:
+    """Return a report as it is shown on a screen of so many columns."""
+    text = StringIO()
+    show(report, Console(file=text, width=width, force_jupyter=False, color_system=None))
+    return text.getvalue().rstrip()
+
+
+def _say(text: str, console: Console) -> None:
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def _plain(text: str) -> str:
+    """Return a text in characters that every terminal has, without tags."""
+    text = Markup(text).striptags() if isinstance(text, Markup) else text
+    return text.replace("µ", "u").replace("–", "-")
+
+
 class Shown:
     """What shows itself by its report: its head as a repr, all of it in print and a notebook."""
 
@@ -260,8 +311,6 @@ class Shown:
         return head(str(self))
 
     def __str__(self) -> str:
-        from bwbayes.report.screen import as_text  # noqa: PLC0415  # slow to load
-
         return "\n".join(filter(None, [self.heading, as_text(self.report())]))
 
     def _repr_html_(self) -> str:

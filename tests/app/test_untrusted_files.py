@@ -23,9 +23,8 @@ from bwbayes.app.config.config import parse
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.record import Record, read_record, write_record
-from bwbayes.report.report import Report
+from bwbayes.report.report import Report, as_text
 from bwbayes.report.result import Result
-from bwbayes.report.screen import as_text
 from bwbayes.report.tables import priors_table
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example

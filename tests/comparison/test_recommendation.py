@@ -14,7 +14,7 @@ from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.report.screen import as_text
+from bwbayes.report.report import as_text
 
 
 def noise(seed: int, size: int = 10) -> FloatArray:

@@ -164,7 +164,7 @@ def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) ->
 def show_report(report: Report) -> None:
     """Show a report on the screen."""
     # Here, because it is slow to load.
-    from bwbayes.report.screen import show
+    from bwbayes.report.report import show
 
     show(report, Console())
 
