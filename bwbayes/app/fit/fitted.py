@@ -129,7 +129,10 @@ class Fit(Shown):
     @cached_property
     def standing(self) -> Standing:
         """Whether the bands hold, all together: as its folder says, if it does."""
-        return self.folder.standing() if self.folder.numbers() else self.result.standing
+        from bwbayes.diagnosis.validation import Standing
+
+        numbers = self.folder.numbers()
+        return Standing.read(numbers) if numbers else self.result.standing
 
     @property
     def holds(self) -> bool | None:
@@ -144,14 +147,7 @@ class Fit(Shown):
     @property
     def remarks(self) -> tuple[str, ...]:
         """What to know of the record, the priors and the fit, one line each."""
-        from bwbayes.app.running.fingerprint import version_remarks, versions
-
-        written = self.folder.numbers()
-        if "result" in self.__dict__ or not written:
-            return self.result.remarks
-        now = versions(self.problem.posterior.engine)
-        changed = version_remarks(self.chain.attributes().get("versions"), now)
-        return tuple(dict.fromkeys([*changed, *written["remarks"]]))
+        return self.result.remarks
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -260,7 +260,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     fit = finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
     with executor_of(1, fit.problem.posterior.engine) as pool:
         result = _candidate(name, fit, pool, future=future)
-    return replace(result, standing=folder.standing()) if is_finished else result
+    return replace(result, standing=fit.standing) if is_finished else result
 
 
 def _standing(folder: RunFolder, files: bool) -> Standing:

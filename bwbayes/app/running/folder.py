@@ -22,7 +22,6 @@ from bwbayes.errors import InputError, refuse_unwritable
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
-    from bwbayes.diagnosis.validation import Standing
 
 
 class FileOf:
@@ -188,13 +187,6 @@ class RunFolder(Folder):
             return {}
         numbers: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
         return numbers
-
-    def standing(self) -> Standing:
-        """Return whether the bands of the run hold, which is finished."""
-        from bwbayes.diagnosis.validation import Standing
-
-        self.require_finished()
-        return Standing.read(self.numbers())
 
     def require_finished(self) -> None:
         """Raise an InputError if the run is not finished."""
