@@ -25,16 +25,6 @@ from bwbayes.report.report import Picture, Report
 from bwbayes.report.result import Result
 
 
-def write_posterior(
-    path: Path, result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
-) -> None:
-    """Write the draws as arviz groups to a NetCDF file; see :func:`posterior_tree`."""
-    # From memory: HDF5 does not survive a disk that is full.
-    whole = posterior_tree(result, log_likelihood, records).to_netcdf(engine="h5netcdf")
-    with draft_of(path) as draft:
-        draft.write_bytes(whole)
-
-
 def posterior_tree(
     result: Result, log_likelihood: FloatArray, records: Mapping[str, Record]
 ) -> Any:

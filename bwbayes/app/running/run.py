@@ -31,7 +31,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.record.io.formats import draft_of
-from bwbayes.report.outputs import write_bands, write_posterior, write_summary
+from bwbayes.report.outputs import write_bands, write_summary
 from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import first_chain, sample
@@ -188,7 +188,9 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
     artist.draw(result)
-    write_posterior(folder.path / "posterior.nc", result, fit.log_likelihood, fit.problem.records)
+    with draft_of(folder.path / "posterior.nc") as draft:
+        # From memory: HDF5 does not survive a disk that is full.
+        draft.write_bytes(fit.posterior.to_netcdf(engine="h5netcdf"))
     bands.unlink(missing_ok=True)
     if result.bands:
         write_bands(bands, result.bands)
