@@ -129,8 +129,8 @@ def _sampled(result: Result) -> str:
 def _results(result: Result) -> list[Text]:
     """Return what the bands did on readings that were not fitted, or else on those that were."""
     texts = []
-    judged = [bands for bands in _held_out_first(result) if bands.name in result.scores]
-    for bands in [bands for bands in judged if not bands.training] or judged:
+    scored = [bands for bands in result.bands if bands.name in result.scores]
+    for bands in [bands for bands in scored if not bands.training] or scored:
         scores, verdict = result.scores[bands.name], result.verdicts.get(bands.name)
         status = Markup("validation {}. ").format(mark(verdict.status)) if verdict else ""
         texts.append(
@@ -155,10 +155,6 @@ def _results(result: Result) -> list[Text]:
     return [Text(text) for text in (*texts, sampling)]
 
 
-def _held_out_first(result: Result) -> list[Bands]:
-    return sorted(result.bands, key=lambda bands: bands.training)
-
-
 def _answer(result: Result, pictures: Pictures) -> list[Block]:
     parameters: list[Block] = [
         tables.parameters_table(result),
@@ -175,7 +171,7 @@ def _answer(result: Result, pictures: Pictures) -> list[Block]:
 
 
 def _evidence(result: Result, pictures: Pictures) -> list[Block]:
-    ordered = _held_out_first(result)
+    ordered = sorted(result.bands, key=lambda bands: bands.training)  # held out first
     shown = [pictures[f"bands_{bands.name}"] for bands in ordered]
     # Of several records "innovations_NAME" is one of the innovations.
     for kind in ("agreement", "coverage", "innovations", "spectrum"):

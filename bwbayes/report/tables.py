@@ -20,15 +20,7 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.report import UNKNOWN, Table, TableColumn
 from bwbayes.report.result import Result
-from bwbayes.report.words import (
-    covered,
-    digits,
-    error_text,
-    length_text,
-    mark,
-    symbol,
-    unit_text,
-)
+from bwbayes.report.words import covered, digits, error_text, length_text, mark, symbol, unit_text
 
 # A parameter in words, with its symbol; and the columns of names, bare on a screen.
 WORDS = Markup("{words}")

@@ -38,16 +38,13 @@ ALONE = "record"
 ONE, SEVERAL = "one record", "several records"
 
 
-def _is_table(value: object) -> bool:
-    return isinstance(value, Mapping | RecordConfig)
-
-
 def _one_or_several(value: object) -> str:
     """Tell the keys of one record from the tables of several."""
     if not isinstance(value, Mapping) or not value:
         return ONE
-    tables = all(key not in RecordConfig.model_fields and _is_table(value[key]) for key in value)
-    return SEVERAL if tables else ONE
+    tables = [name for name in value if isinstance(value[name], Mapping | RecordConfig)]
+    is_several = tables == [*value] and not RecordConfig.model_fields.keys() & value.keys()
+    return SEVERAL if is_several else ONE
 
 
 class Config(ConfigTable):
@@ -83,7 +80,8 @@ class Config(ConfigTable):
     def _not_both(cls, value: object) -> object:
         if isinstance(value, Mapping):
             single = [key for key in value if key in RecordConfig.model_fields]
-            tables = [key for key in value if key not in single and _is_table(value[key])]
+            others = [key for key in value if key not in single]
+            tables = [key for key in others if isinstance(value[key], Mapping | RecordConfig)]
             if single and tables:
                 raise ValueError(
                     f"{single[0]} is a key of one record, and {tables[0]} a table of several; move "

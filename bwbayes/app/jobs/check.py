@@ -17,14 +17,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, find_map, lines
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.report.outputs import save
-from bwbayes.report.report import (
-    Banner,
-    Picture,
-    Report,
-    Section,
-    Text,
-    remarks_banner,
-)
+from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
 from bwbayes.report.tables import priors_table
 
 

@@ -18,7 +18,6 @@ from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.jobs.at_work import limits_of
-from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
@@ -85,15 +84,17 @@ def design(
     problem = fit.problem
     low, high = voltage or limits_of(problem, None)
     amplifier = Limits(low, high, np.inf if slew is None else slew, current, capacitance)
-    # Of several records, what all of them taught of the actuator, seen from one.
-    record = liveliest(problem)
-    signals = candidates_of(candidates, problem.records[record], amplifier)
+    # Of several records, what all of them taught of the actuator, seen from the one whose voltage
+    # turns most: the new one is to be alike.
+    records = problem.records
+    record = max(records, key=lambda name: turning_points(records[name].voltage).size)
+    signals = candidates_of(candidates, records[record], amplifier)
     quantity: str | FloatArray
     parameter, drive = None, None
     if isinstance(target, str):
         quantity = parameter = target
     elif isinstance(target, Path):
-        quantity, drive = _drive(str(target), problem.records[record].interval), str(target)
+        quantity, drive = _drive(str(target), records[record].interval), str(target)
     else:
         quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
     promises = rank(
@@ -115,15 +116,10 @@ def design(
         drive,
         amplifier,
         signals,
-        problem.records[record].interval,
+        records[record].interval,
         fit.standing,
         promises,
     )
-
-
-def liveliest(problem: Problem) -> str:
-    """Return the name of the fitted record whose voltage turns most: the new one is to be alike."""
-    return max(problem.records, key=lambda name: turning_points(problem.records[name].voltage).size)
 
 
 def candidates_of(

@@ -8,11 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bwbayes.app.problem.records import Validation
-from bwbayes.app.running.predictions import (
-    Prediction,
-    predict_after,
-    predict_another,
-)
+from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import InputError, refuse_unwritable, suggestion
 from bwbayes.prediction.initial_state import Start

@@ -16,11 +16,6 @@ from bwbayes.errors import InputError
 from bwbayes.record.io.series import Series, Source, in_seconds
 
 
-def is_lvm(text: str) -> bool:
-    """Tell whether a text is a LabVIEW measurement."""
-    return text.startswith("LabVIEW Measurement")
-
-
 def plain_lvm(path: Path, text: str) -> tuple[str, float | None]:
     """Return a measurement's rows below one header with units, and its step, s.
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
 from bwbayes.record.io.columns import QUANTITIES, power_of
-from bwbayes.record.io.labview import is_lvm, plain_lvm
+from bwbayes.record.io.labview import plain_lvm
 from bwbayes.record.io.series import Series, Source, in_seconds
 from bwbayes.record.record import Record
 
@@ -64,7 +64,7 @@ def read_text(path: Path) -> Source:
         If lines above the header are skipped.
     """
     text, interval = _decoded(path), None
-    if is_lvm(text):
+    if text.startswith("LabVIEW Measurement"):
         text, interval = plain_lvm(path, text)
     lines = text.split("\n")
     # What programs write below the numbers is no sample, and shows that the last one is whole.
