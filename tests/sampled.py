@@ -8,7 +8,7 @@ import numpy as np
 
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain
@@ -20,7 +20,7 @@ from bwbayes.sampling.sampler import first_chain, sample
 def sampled(problem: Problem, workers: int = 1) -> tuple[Outcome, Chain]:
     """Return how the sampling of a problem ended, and the chain."""
     posterior, seed = problem.posterior, problem.config.seed
-    with one_thread(), executor(workers, posterior.engine) as pool:
+    with one_thread(), open_executor(workers, posterior.engine) as pool:
         point = pointfit.fit(posterior, generator(seed, "point fit"))
         chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
         return sample(posterior, problem.plan, chain, pool), chain

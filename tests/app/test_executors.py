@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_info
 from bwbayes.app.running import workers as workers_module
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
-from bwbayes.app.running.workers import executor, one_thread, side_by_side
+from bwbayes.app.running.workers import one_thread, open_executor, side_by_side
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
@@ -70,7 +70,7 @@ def sampled(pool: Executor, watcher: Callable[..., None] = lambda *_: None) -> A
 @pytest.fixture(scope="module")
 def here() -> Any:
     """Return the draws as one thread of this process makes them."""
-    with executor(1) as pool:
+    with open_executor(1) as pool:
         return sampled(pool)
 
 
@@ -111,7 +111,7 @@ def cluster() -> Iterator[tuple[str, Any, list[Any]]]:
 
 
 def test_a_cluster_gives_the_same_bits(here: Any, cluster: tuple[str, Any, list[Any]]) -> None:
-    with executor(backend=f"dask://{cluster[0]}") as pool:
+    with open_executor(executor=f"dask://{cluster[0]}") as pool:
         np.testing.assert_array_equal(here, sampled(pool))
         pool.submit(pow, 2, 2).result(PATIENCE)
         assert side_by_side(pool, None, 10) in (2, 4)  # of one worker or of both
@@ -123,7 +123,7 @@ def test_a_client_that_somebody_made_is_an_executor_and_stays_open(
 ) -> None:
     client = distributed.Client(f"tcp://{cluster[0]}")
     try:
-        with executor(backend=client) as pool:
+        with open_executor(executor=client) as pool:
             assert [4] == [pool.submit(pow, 2, 2).result()]
             error = pool.submit(int, "x").exception()
             assert isinstance(error, ValueError)
@@ -144,7 +144,7 @@ def test_a_worker_killed_within_a_block_costs_no_bit(
             killed.append(workers[0].pid)
             workers[0].kill()
 
-    with executor(backend=f"dask://{cluster[0]}") as pool:
+    with open_executor(executor=f"dask://{cluster[0]}") as pool:
         np.testing.assert_array_equal(here, sampled(pool, watcher))
     assert killed
 
@@ -156,7 +156,7 @@ def test_with_the_scheduler_lost_a_run_is_resumed_here(tmp_path: Path) -> None:
     with scheduler(1) as (address, main, _):
         threading.Thread(target=_kill_at_first_block, args=(folder, main), daemon=True).start()
         with pytest.raises(BrokenExecutor, match="the scheduler is gone"):
-            resume(folder, small.quiet(), backend=f"dask://{address}", files=False)
+            resume(folder, small.quiet(), executor=f"dask://{address}", files=False)
     resumed = resume(RunFolder.open(folder.path), small.quiet(), workers=1, files=False)
     np.testing.assert_array_equal(expected.result.draws, resumed.result.draws)
 
@@ -173,11 +173,11 @@ def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
 ) -> None:
     monkeypatch.setattr(workers_module, "PATIENCE", 0.2)
     with pytest.raises(InputError, match="no scheduler there; start one with `dask scheduler`"):
-        executor(backend="dask://127.0.0.1:9").__enter__()
+        open_executor(executor="dask://127.0.0.1:9").__enter__()
     with pytest.raises(InputError, match="'ray' is unknown; write one of local, threads"):
-        executor(backend="ray").__enter__()
+        open_executor(executor="ray").__enter__()
     with pytest.raises(InputError, match="object has no submit"):
-        executor(backend=object()).__enter__()  # type: ignore[arg-type]
+        open_executor(executor=object()).__enter__()  # type: ignore[arg-type]
 
 
 class Foreign(Executor):
@@ -195,7 +195,7 @@ class Foreign(Executor):
 
 def test_any_executor_with_a_submit_gives_the_same_bits(here: Any) -> None:
     foreign = Foreign()
-    with executor(backend=foreign) as pool:
+    with open_executor(executor=foreign) as pool:
         np.testing.assert_array_equal(here, sampled(pool))
     assert foreign.sent > 8
 
@@ -206,7 +206,7 @@ def die() -> None:
 
 def test_a_process_that_dies_ends_the_work_at_once() -> None:
     """What is on disk can be resumed; the command line says so (`cli.main`)."""
-    with executor(1, backend="processes") as pool, pytest.raises(BrokenProcessPool):
+    with open_executor(1, executor="processes") as pool, pytest.raises(BrokenProcessPool):
         pool.submit(die).result(PATIENCE)
 
 
@@ -220,7 +220,7 @@ def linear_algebra_threads() -> set[int]:
 def test_workers_get_the_whole_model_and_use_one_thread_each(workers: int, engine: Engine) -> None:
     model = replace(posterior(), engine=engine)
     theta = truth(model)
-    with one_thread(), executor(workers, engine) as pool:
+    with one_thread(), open_executor(workers, engine) as pool:
         threads = [pool.submit(linear_algebra_threads) for _ in range(2 * workers)]
         assert [{1}] * len(threads) == [future.result() for future in threads]
         density = pool.submit(model.log_likelihood, theta).result()

@@ -29,7 +29,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.workers import executor
+from bwbayes.app.running.workers import open_executor
 from bwbayes.calibration.replicates import replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
@@ -76,7 +76,7 @@ def our_run(problem: Problem) -> Run:
     point = map_estimate.fit(posterior, generator(seed, "point fit"))
     chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
     passed("point fit")
-    with executor(2, posterior.engine) as pool:
+    with open_executor(2, posterior.engine) as pool:
         outcome = sample(posterior, problem.plan, chain, pool, watcher)
     return Run(chain, outcome, seconds)
 

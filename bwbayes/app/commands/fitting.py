@@ -25,7 +25,6 @@ from bwbayes.errors import ColumnsError, InputError, NoNumbersError, refuse_unwr
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.config.proposal import ConfigProposal
-    from bwbayes.app.problem.problem import Problem
 
 
 @click.command()
@@ -107,29 +106,27 @@ def run(
             RunFolder.require_free(path, overwrite)
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
         folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
-
-        def show(problem: Problem) -> None:
+        problem = folder.problem()
+        if not quiet:
             # Of a record alone the remarks are shown already.
             banners = [] if is_proposal else remarks_banner(problem.remarks)
             priors = priors_table(problem.posterior.prior)
-            if not quiet:
-                show_report(Report(title="priors", banners=banners, blocks=[priors]))
-
-        options = {"workers": workers, "backend": executor, "artist": artist}
-        return finish(folder.path, quiet=quiet, show=show, **options)
+            show_report(Report(title="priors", banners=banners, blocks=[priors]))
+        options = {"workers": workers, "executor": executor, "artist": artist}
+        return finish(folder.path, quiet=quiet, problem=problem, **options)
 
 
 @click.command()
 @folder_argument
 @options_of("bwbayes.app.fit.calls:resume", "progress")
 @quiet_option
-def resume(folder: Path, quiet: bool, executor: str | None, **options: Any) -> int:
+def resume(folder: Path, quiet: bool, **options: Any) -> int:
     """Resume the run in FOLDER, interrupted or short of its target.
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
     with artist_of(options["workers"]) as artist:
-        return finish(folder, quiet=quiet, backend=executor, artist=artist, **options)
+        return finish(folder, quiet=quiet, artist=artist, **options)
 
 
 @click.command()

@@ -26,7 +26,6 @@ from bwbayes.app.config import LARGEST_SEED
 from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
-    from bwbayes.app.problem.problem import Problem
     from bwbayes.diagnosis.validation import Standing
     from bwbayes.report.report import Report
 
@@ -203,13 +202,10 @@ def present(
     return standing.exit_status
 
 
-def finish(
-    path: Path, *, quiet: bool, show: Callable[[Problem], None] | None = None, **options: Any
-) -> int:
+def finish(path: Path, *, quiet: bool, **options: Any) -> int:
     """Sample the run in a folder to its end, say how it went, and return the exit status.
 
-    ``show`` is called with the problem at first; ``options`` are those of
-    :func:`~bwbayes.app.running.run.resume`.
+    ``options`` are those of :func:`~bwbayes.app.running.run.resume`.
     """
     from bwbayes.app.running.folder import RunFolder
     from bwbayes.app.running.run import resume
@@ -219,7 +215,6 @@ def finish(
         fit = resume(
             folder,
             Console(stderr=True, quiet=quiet),
-            show=show,
             answer=lambda fit: None if quiet else show_report(fit.report()),
             **options,
         )

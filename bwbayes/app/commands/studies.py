@@ -134,7 +134,7 @@ def campaign(
         text, where = ("", folder) if config is None else (config_text(config), config.parent)
         out = out or Path("results") / folder.absolute().name
         batch = start(folder, text, where, out, pictures=not no_pictures, overwrite=overwrite)
-    with resumable(f"`bwbayes campaign --resume {batch.path}`"):
+    with resumable(batch.resuming):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
     if not quiet:
         show_report(result.report())

@@ -95,7 +95,7 @@ def fit(
         console,
         workers=workers,
         files=scratch is None,
-        backend=executor,
+        executor=executor,
     )
     warn([note for note in result.notes if note not in problem.remarks], 3)
     return result.knowing(_scratch=scratch)
@@ -276,7 +276,7 @@ def resume(
         ess=ess,
         steps=steps,
         engine=engine,
-        backend=executor,
+        executor=executor,
     )
     warn(result.notes, 3)
     return result

@@ -114,11 +114,11 @@ class Fit(Shown):
         """How the sampling ended, or stands."""
         if self._loaded is not None:
             return self._loaded.outcome
-        from bwbayes.app.running.workers import executor
+        from bwbayes.app.running.workers import open_executor
         from bwbayes.sampling.sampler import sample
 
         plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
-        with executor(1) as pool:
+        with open_executor(1) as pool:
             return sample(self.problem.posterior, plan, self.chain, pool)
 
     @property
@@ -300,7 +300,7 @@ class Fit(Shown):
 
         return compare(self, *others, **options)
 
-    def resume(self, *, executor: Any = None, progress: bool = True, **options: Any) -> Fit:
+    def resume(self, *, progress: bool = True, **options: Any) -> Fit:
         """Continue the sampling, with a new target or budget, and return what comes of it.
 
         Options and errors are as in :func:`bwbayes.resume`.
@@ -308,8 +308,8 @@ class Fit(Shown):
         from bwbayes.app.jobs.at_work import console_of, warn
         from bwbayes.app.running import run
 
-        options |= {"files": self._scratch is None, "backend": executor}
-        fit = run.resume(self.folder, console_of(progress), **options)
+        files = self._scratch is None
+        fit = run.resume(self.folder, console_of(progress), files=files, **options)
         warn(fit.notes, 3)
         return fit.knowing(_scratch=self._scratch)
 

@@ -104,7 +104,7 @@ def resume(
         Replicates side by side; default: all cores. The result does not depend on it.
     executor
         local (default), threads, processes, dask, or dask://HOST:PORT. In Python any executor, as
-        in :func:`~bwbayes.app.running.workers.executor`.
+        in :func:`~bwbayes.app.running.workers.open_executor`.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
@@ -129,7 +129,7 @@ def resume(
             done=len(entries),
             short={"not converged": unconverged},
             workers=workers,
-            backend=executor,
+            executor=executor,
         ):
             entries[made.entry["number"]] = made.entry
             _append(folder, json.dumps(made.entry))

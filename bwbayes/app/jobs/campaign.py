@@ -82,7 +82,7 @@ def start(
     Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
-    origin = Origin(str(records.absolute()), str(where.absolute()), pictures)
+    origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
@@ -119,7 +119,7 @@ def resume(
             done=len(fitted) - len(tasks),
             short={"not converged": 0, "refused": 0},
             workers=workers,
-            backend=executor,
+            executor=executor,
         ):
             if outcome.refused:
                 refused[outcome.file.name] = outcome.short

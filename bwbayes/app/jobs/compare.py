@@ -29,8 +29,7 @@ from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.run import begin, resume
-from bwbayes.app.running.workers import executor as executor_of
-from bwbayes.app.running.workers import one_thread, side_by_side
+from bwbayes.app.running.workers import one_thread, open_executor, side_by_side
 from bwbayes.calibration.replicates import as_done
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison
@@ -91,7 +90,7 @@ def compare(
     candidates = []
     for name, fit in fits.items():
         console.print(f"judging {name} ...", highlight=False)
-        with one_thread(), executor_of(workers, fit.problem.posterior.engine, executor) as pool:
+        with one_thread(), open_executor(workers, fit.problem.posterior.engine, executor) as pool:
             candidate = _candidate(name, fit, pool, future=future)
         standing = fit.standing if fit.converged else None
         candidates.append(replace(candidate, standing=standing))
@@ -135,7 +134,7 @@ def compare_models(
         folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
         folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
-    with one_thread(), executor_of(count, backend=executor) as pool:
+    with one_thread(), open_executor(count, executor=executor) as pool:
         together = side_by_side(pool, workers, len(models))
         console.print(f"screening {len(models)} models ...", highlight=False)
         screened = as_done(pool, together, _screened, folders.items())
@@ -258,7 +257,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     is_finished = folder.summary.is_file()
     quiet = Console(quiet=True)
     fit = finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
-    with executor_of(1, fit.problem.posterior.engine) as pool:
+    with open_executor(1, fit.problem.posterior.engine) as pool:
         result = _candidate(name, fit, pool, future=future)
     return replace(result, standing=fit.standing) if is_finished else result
 

@@ -14,9 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict
 
 from bwbayes.errors import InputError, refuse_unwritable
 
@@ -211,11 +212,13 @@ class CalibrationFolder(RunFolder):
     summary = FileOf("calibration.json")
 
 
-class Origin(NamedTuple):
+class Origin(BaseModel):
     """Where a campaign began: the folder of its records, the folder that its config's files are in.
 
     ``pictures`` tells whether every run draws its figures.
     """
+
+    model_config = ConfigDict(strict=True, frozen=True)
 
     records: str
     where: str
@@ -268,7 +271,7 @@ class CampaignFolder(Folder):
         folder = cls(path)
         with folder.drafted() as draft:
             draft.config.write_text(config, encoding="utf-8")
-            draft.mark.write_text(json.dumps(origin._asdict()), encoding="utf-8")
+            draft.mark.write_text(origin.model_dump_json(), encoding="utf-8")
         return folder
 
     def origin(self) -> Origin:
@@ -277,9 +280,8 @@ class CampaignFolder(Folder):
         Raises InputError: the folder does not say it.
         """
         try:
-            noted = json.loads(self.mark.read_bytes())
-            return Origin(str(noted["records"]), str(noted["where"]), bool(noted["pictures"]))
-        except (KeyError, TypeError, ValueError):
+            return Origin.model_validate_json(self.mark.read_bytes())
+        except ValueError:
             raise InputError(
                 f"{self.mark}: does not say which records it is about; start again with "
                 "`overwrite=True`"

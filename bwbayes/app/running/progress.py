@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bwbayes.app.running.workers import executor, side_by_side
+from bwbayes.app.running.workers import open_executor, side_by_side
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, Check
 from bwbayes.sampling.plan import SamplingPlan
@@ -116,7 +116,7 @@ def batch[T](
     done: int,
     short: Mapping[str, int],
     workers: int | None,
-    backend: str | Executor | None,
+    executor: str | Executor | None,
 ) -> Iterator[T]:
     """Call a function with each of the arguments, and yield each result as soon as it is there.
 
@@ -130,7 +130,7 @@ def batch[T](
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
     short = dict(short)
-    with executor(count, backend=backend) as pool, ProgressLine(console) as line:
+    with open_executor(count, executor=executor) as pool, ProgressLine(console) as line:
         together = side_by_side(pool, workers, len(arguments))
         for fresh, result in enumerate(as_done(pool, together, call, arguments), start=1):
             yield result

@@ -26,7 +26,7 @@ from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
-from bwbayes.app.running.workers import executor, one_thread
+from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.map_estimate import PointFit
@@ -58,19 +58,19 @@ def resume(
     engine: Engine | None = None,
     predict: bool = True,
     files: bool = True,
-    backend: str | Executor | None = None,
+    executor: str | Executor | None = None,
     artist: Artist | None = None,
-    show: Callable[[Problem], None] | None = None,
+    problem: Problem | None = None,
     answer: Callable[[Fit], None] | None = None,
 ) -> Fit:
     """Finish a run, from wherever it stands; progress goes to the console.
 
-    ``workers`` and ``backend`` are as of :func:`~bwbayes.app.running.workers.executor`; the result
-    does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or engine;
-    another engine has the same posterior, but from here on not the same bits. Unless it is to
-    ``predict``, it ends with the sampling. ``files`` are what a run leaves besides its config,
-    records and chain; the ``artist``, if any, draws them. ``show`` and ``answer`` are called with
-    the problem before anything is done with it, and with the fit before its files are written.
+    ``workers`` and ``executor`` are as of :func:`~bwbayes.app.running.workers.open_executor`; the
+    result does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or
+    engine; another engine has the same posterior, but from here on not the same bits. Unless it is
+    to ``predict``, it ends with the sampling. ``files`` are what a run leaves besides its config,
+    records and chain; the ``artist``, if any, draws them. The ``problem`` is the folder's, if it is
+    known already. ``answer`` is called with the fit before its files are written.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
@@ -83,14 +83,12 @@ def resume(
             config = load(folder.config)
             sampling = config.sampling.model_copy(update=targets)
             _rewrite(folder, config.model_copy(update={"sampling": sampling}))
-        problem = folder.problem()
-        if show is not None:
-            show(problem)
+        problem = problem or folder.problem()
         artist.rehearse(problem.posterior)
         problem, chain = _open_chain(folder, problem, console, engine)
         plan = problem.plan
         with (
-            executor(workers, problem.posterior.engine, backend) as pool,
+            open_executor(workers, problem.posterior.engine, executor) as pool,
             Progress(console, plan) as progress,
         ):
             # It is written last, as the sign that all is done; now there is more to do.

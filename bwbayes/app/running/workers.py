@@ -45,8 +45,8 @@ PATIENCE = 20.0
 
 
 @contextmanager
-def executor(
-    workers: int | None = None, engine: Engine = "numpy", backend: str | Executor | None = None
+def open_executor(
+    workers: int | None = None, engine: Engine = "numpy", executor: str | Executor | None = None
 ) -> Iterator[Executor]:
     """Give an executor with that many workers, by default one a core.
 
@@ -57,7 +57,7 @@ def executor(
     engine
         Compiled code runs in threads of this process, side by side. Several workers with NumPy,
         which does not, are processes; a single one is this process itself.
-    backend
+    executor
         "local", which is that; "threads" or "processes" whatever the engine; "dask", processes
         of this machine under a scheduler; "dask://HOST:PORT", the workers of a scheduler that runs
         already; or any executor with the methods of ``concurrent.futures``, or a
@@ -65,26 +65,26 @@ def executor(
 
     Raises InputError: another word, or a cluster that does not answer.
     """
-    if backend is not None and not isinstance(backend, str):
+    if executor is not None and not isinstance(executor, str):
         # Calls go to others than threads by value.
-        if hasattr(backend, "get_executor"):
-            yield _on_client(backend)
-        elif isinstance(backend, ThreadPoolExecutor | ByValue):
-            yield backend
-        elif callable(getattr(backend, "submit", None)):
-            yield ByValue(backend)
+        if hasattr(executor, "get_executor"):
+            yield _on_client(executor)
+        elif isinstance(executor, ThreadPoolExecutor | ByValue):
+            yield executor
+        elif callable(getattr(executor, "submit", None)):
+            yield ByValue(executor)
         else:
             raise InputError(
-                f"executor: {type(backend).__name__} has no submit; give an executor of "
+                f"executor: {type(executor).__name__} has no submit; give an executor of "
                 "concurrent.futures, or one of " + ", ".join(KINDS)
             )
         return
     count = workers or os.cpu_count() or 1
-    kind, _, address = (backend or "local").partition("://")
+    kind, _, address = (executor or "local").partition("://")
     if kind not in KINDS or (address and kind != "dask"):
         kinds = ", ".join(KINDS)
         raise InputError(
-            f"executor: {backend!r} is unknown; write one of {kinds}, dask://HOST:PORT"
+            f"executor: {executor!r} is unknown; write one of {kinds}, dask://HOST:PORT"
         )
     if kind == "local":
         kind = "processes" if engine == "numpy" and count > 1 else "threads"
