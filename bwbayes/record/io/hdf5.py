@@ -50,14 +50,11 @@ def write_hdf5(record: Record, path: Path) -> None:
     with h5py.File(content, "w", libver="v108") as file:
         for name, values in record_arrays(record).items():
             file.create_dataset(name, data=values)
-        # Text of fixed length, since HDF5 can loop for ever over damaged text of variable length.
-        file.attrs["voltage_is"] = np.bytes_(record.voltage_is)
-        if record.origin:
-            file.attrs["origin"] = np.bytes_(record.origin.encode())
-        file.attrs["interval_s"] = record.interval
-        if record.time_offset:
-            file.attrs["time_offset_s"] = record.time_offset
-    path.write_bytes(content.getbuffer())
+        for name, value in record_notes(record).items():
+            # Text of fixed length: HDF5 can loop for ever over damaged text of variable length.
+            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+    # Not a view of it: one that the traceback of an error holds can crash Python.
+    path.write_bytes(content.getvalue())
 
 
 def record_arrays(record: Record) -> dict[str, Any]:
@@ -69,6 +66,17 @@ def record_arrays(record: Record) -> dict[str, Any]:
         "truth_um": record.truth,
     }
     return {name: values for name, values in arrays.items() if values is not None}
+
+
+def record_notes(record: Record) -> dict[str, str | float]:
+    """Return what a file says of a record beside its arrays, by the names of `NOTES`."""
+    notes: dict[str, str | float] = {
+        "voltage_is": record.voltage_is,
+        "origin": record.origin,
+        "interval_s": record.interval,
+        "time_offset_s": record.time_offset,
+    }
+    return {name: value for name, value in notes.items() if value}
 
 
 def _series(

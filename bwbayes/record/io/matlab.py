@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from bwbayes.errors import InputError
-from bwbayes.record.io.hdf5 import record_arrays
+from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.series import MAXIMUM_SAMPLES, NOTES, Series, Source, note, vectors
 from bwbayes.record.record import Record
 
@@ -68,10 +68,10 @@ def read_mat(path: Path) -> Source:
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     """Write a record as column vectors of a MATLAB file, every number exactly."""
-    texts = {"voltage_is": record.voltage_is, "origin": record.origin}
-    arrays = record_arrays(record) | {"interval_s": np.array([record.interval])}
-    if record.time_offset:
-        arrays["time_offset_s"] = np.array([record.time_offset])
+    notes = record_notes(record).items()
+    texts = {name: value for name, value in notes if isinstance(value, str)}
+    numbers = {name: np.array([value]) for name, value in notes if name not in texts}
+    arrays = record_arrays(record) | numbers
     if version == "5":
         scipy.io.savemat(path, arrays | texts, appendmat=False, oned_as="column")
     else:
@@ -161,15 +161,11 @@ def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> Non
             dataset.attrs["MATLAB_class"] = np.bytes_("double")
         for name, text in texts.items():
             codes = np.frombuffer(text.encode("utf-16-le"), dtype="<u2")
-            empty = codes.size == 0
-            data = np.array([0, 0], dtype=np.uint64) if empty else codes[:, np.newaxis]
-            dataset = file.create_dataset(name, data=data)
+            dataset = file.create_dataset(name, data=codes[:, np.newaxis])
             dataset.attrs["MATLAB_class"] = np.bytes_("char")
             dataset.attrs["MATLAB_int_decode"] = np.int32(2)
-            if empty:
-                dataset.attrs["MATLAB_empty"] = np.uint8(1)
     # Text of 116 bytes, 8 bytes that stay zero, version 2.0, and the mark of little-endian files.
     header = b"MATLAB 7.3 MAT-file, written by bwbayes".ljust(116) + bytes(8) + b"\x00\x02IM"
     content.seek(0)
     content.write(header)
-    path.write_bytes(content.getbuffer())
+    path.write_bytes(content.getvalue())

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
 from bwbayes.record.io.columns import QUANTITIES, power_of
+from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.labview import plain_lvm
 from bwbayes.record.io.series import Series, Source, in_seconds
 from bwbayes.record.record import Record
@@ -105,16 +106,10 @@ def read_text(path: Path) -> Source:
 
 def write_text(record: Record, path: Path) -> None:
     """Write a record as text, all floats with the shortest digits that give them back exactly."""
-    columns = {"time_s": record.time, "voltage_V": record.voltage}
-    if record.displacement is not None:
-        columns["displacement_um"] = record.displacement
+    columns = {name: v for name, v in record_arrays(record).items() if name != "truth_um"}
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(f"# voltage: {record.voltage_is}\n")
-        if record.origin:
-            file.write(f"# origin: {record.origin}\n")
-        file.write(f"# interval_s: {record.interval!r}\n")
-        if record.time_offset:
-            file.write(f"# time_offset_s: {record.time_offset!r}\n")
+        for name, value in record_notes(record).items():
+            file.write(f"# {'voltage' if name == 'voltage_is' else name}: {value}\n")
         pd.DataFrame(columns).to_csv(file, index=False, lineterminator="\n")
 
 
