@@ -82,7 +82,7 @@ def start(
     Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
-    origin = Origin(records=str(records.absolute()), where=str(where.absolute()), pictures=pictures)
+    origin = Origin(str(records.absolute()), str(where.absolute()), pictures)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 

@@ -14,10 +14,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict
 
 from bwbayes.errors import InputError, refuse_unwritable
 
@@ -96,23 +95,25 @@ class Folder:
             if not (empty or cls(path).is_of_its_kind()):
                 raise InputError(f"{path}: is not a {cls.KIND}'s folder; choose another")
 
+    @classmethod
     @contextmanager
-    def drafted(self) -> Iterator[Self]:
-        """Give a draft of the folder, with ``records`` in it, that takes its place when whole.
+    def drafted(cls, path: Path, overwrite: bool) -> Iterator[Self]:
+        """Give a draft of a new folder, with ``records`` in it, that takes its place when whole.
 
-        Raises InputError: it cannot be written, or another process is writing the one that it
-        replaces.
+        Raises InputError: as :meth:`require_free`; it cannot be written, or another process is
+        writing the one that it replaces.
         """
-        draft = self.path.absolute().with_name(f".{self.path.name}.partial")
+        cls.require_free(path, overwrite)
+        draft = path.absolute().with_name(f".{path.name}.partial")
         try:
-            with refuse_unwritable(self.path, "choose another folder"):
+            with refuse_unwritable(path, "choose another folder"):
                 shutil.rmtree(draft, ignore_errors=True)
                 (draft / "records").mkdir(parents=True)
-                yield type(self)(draft)
-                if self.path.exists():
-                    with self.locked():
-                        shutil.rmtree(self.path)
-                draft.rename(self.path)
+                yield cls(draft)
+                if path.exists():
+                    with cls(path).locked():
+                        shutil.rmtree(path)
+                draft.rename(path)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
@@ -165,15 +166,13 @@ class RunFolder(Folder):
         from bwbayes.app.config.config import dump
         from bwbayes.record import write_record
 
-        cls.require_free(path, overwrite)
-        folder = cls(path)
-        with folder.drafted() as draft:
+        with cls.drafted(path, overwrite) as draft:
             for name, record in {**problem.records, **problem.others}.items():
                 write_record(record, draft.path / f"records/{name}.h5")
             draft.config.write_text(dump(problem.config), encoding="utf-8")
             if mark:
                 draft.replicates.write_bytes(mark)
-        return folder
+        return cls(path)
 
     def problem(self) -> Problem:
         """Return what its config and records say."""
@@ -212,13 +211,11 @@ class CalibrationFolder(RunFolder):
     summary = FileOf("calibration.json")
 
 
-class Origin(BaseModel):
+class Origin(NamedTuple):
     """Where a campaign began: the folder of its records, the folder that its config's files are in.
 
     ``pictures`` tells whether every run draws its figures.
     """
-
-    model_config = ConfigDict(strict=True, frozen=True)
 
     records: str
     where: str
@@ -267,12 +264,10 @@ class CampaignFolder(Folder):
                     "folder, or give `overwrite=True`"
                 )
             return existing
-        cls.require_free(path, overwrite)
-        folder = cls(path)
-        with folder.drafted() as draft:
+        with cls.drafted(path, overwrite) as draft:
             draft.config.write_text(config, encoding="utf-8")
-            draft.mark.write_text(origin.model_dump_json(), encoding="utf-8")
-        return folder
+            draft.mark.write_text(json.dumps(origin._asdict()), encoding="utf-8")
+        return cls(path)
 
     def origin(self) -> Origin:
         """Return where it began.
@@ -280,8 +275,9 @@ class CampaignFolder(Folder):
         Raises InputError: the folder does not say it.
         """
         try:
-            return Origin.model_validate_json(self.mark.read_bytes())
-        except ValueError:
+            noted = json.loads(self.mark.read_bytes())
+            return Origin(str(noted["records"]), str(noted["where"]), bool(noted["pictures"]))
+        except (KeyError, TypeError, ValueError):
             raise InputError(
                 f"{self.mark}: does not say which records it is about; start again with "
                 "`overwrite=True`"
