@@ -8,8 +8,8 @@ figures alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
@@ -18,9 +18,6 @@ from bwbayes.report.figures.control import draw_tracking
 from bwbayes.report.figures.pictures import PICTURES, draw_kind, pictures
 from bwbayes.report.figures.record import record_pictures
 from bwbayes.report.report import Figure
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
 
 
 class Plots:

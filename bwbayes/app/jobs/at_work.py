@@ -14,17 +14,15 @@ from collections.abc import Callable, Iterable
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Concatenate
+from typing import Concatenate
 
 import numpy as np
 from rich.console import Console
 
+from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
-    from bwbayes.app.problem.problem import Problem
 
 
 def at_work[**P, R](

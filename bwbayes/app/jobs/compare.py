@@ -282,5 +282,4 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )
         return folder
-    path.parent.mkdir(parents=True, exist_ok=True)
     return RunFolder.create(path, problem, overwrite)

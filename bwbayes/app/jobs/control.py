@@ -14,10 +14,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
@@ -36,9 +37,6 @@ from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.formats import read_reference
 from bwbayes.report.outputs import refuse_existing, write_summary
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
 
 FILES = ("model.json", "actuator.c")  # of an export
 

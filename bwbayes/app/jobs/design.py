@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import ValidationError
@@ -17,6 +16,7 @@ from pydantic import ValidationError
 from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
@@ -36,9 +36,6 @@ from bwbayes.record.waveforms import (
     signal,
     signal_names,
 )
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
 
 
 def design(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
 from bwbayes.diagnosis.validation import Standing
@@ -16,9 +16,6 @@ from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
 from bwbayes.report.outputs import write_bands, write_summary
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
 
 
 def predict(

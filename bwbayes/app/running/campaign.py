@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
@@ -47,9 +48,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
 from bwbayes.shown import brief
-
-if TYPE_CHECKING:
-    from bwbayes.app.fit.fitted import Fit
 
 # How a record ended, in the order in which they matter, and the exit status of each.
 STATUSES = {
@@ -209,9 +207,7 @@ class Campaign(Product):
         InputError
             It has none.
         """
-        from bwbayes.app.fit.calls import open_run  # noqa: PLC0415  # which makes fits
-
-        return open_run(self.folder.run(name))
+        return finished(RunFolder.open(self.folder.run(name)))
 
     def predict(
         self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float | None = None
