@@ -169,15 +169,15 @@ def _changes(name: str) -> dict[str, Any]:
     changes: dict[str, Any] = dict.fromkeys(OPTIONS)
     changes |= {"hysteresis": operator, "gain": [], "creep": False, "creep_growth": False}
     try:
-        said = tomllib.loads(f"options = {{ {options} }}")["options"]
+        stated = tomllib.loads(f"options = {{ {options} }}")["options"]
     except (ValueError, RecursionError):
         raise InputError(
             f"models: {name!r}: cannot read {options!r}; write options as in thresholds=4"
         ) from None
-    for key in said:
+    for key in stated:
         if key not in OPTIONS:
             raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
-    changes |= said
+    changes |= stated
     for word in (term.strip() for term in others):
         if word in TERMS:
             changes["gain"] = [*changes["gain"], word]

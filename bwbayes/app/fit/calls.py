@@ -362,7 +362,7 @@ def campaign(
                 write_record(record, file)
     else:
         source = Path(records)
-    begun = start(source, text, where, path, pictures=pictures, overwrite=overwrite)
-    finished = resume(begun, console_of(progress), workers=workers, executor=executor)
-    warn(finished.notes, 3)
-    return replace(finished, _scratch=scratch)
+    batch = start(source, text, where, path, pictures=pictures, overwrite=overwrite)
+    result = resume(batch, console_of(progress), workers=workers, executor=executor)
+    warn(result.notes, 3)
+    return replace(result, _scratch=scratch)

@@ -120,7 +120,7 @@ def resume(
             path.unlink(missing_ok=True)
         shutil.rmtree(folder.path / "figures", ignore_errors=True)
         unconverged = sum(not entry["converged"] for entry in entries.values())
-        for made in batch(
+        for result in batch(
             replicate,
             [(common, seed, number) for number in range(requested) if number not in entries],
             lambda result: "" if result.entry["converged"] else "not converged",
@@ -131,8 +131,8 @@ def resume(
             workers=workers,
             executor=executor,
         ):
-            entries[made.entry["number"]] = made.entry
-            _append(folder, json.dumps(made.entry))
+            entries[result.entry["number"]] = result.entry
+            _append(folder, json.dumps(result.entry))
         console.print("judging and drawing ...", highlight=False)
         ordered = [entries[number] for number in sorted(entries)]
         plan, packages = problem.plan, versions(problem.posterior.engine)

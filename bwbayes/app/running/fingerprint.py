@@ -130,7 +130,7 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
     content = BytesIO()
     np.savez(content, allow_pickle=False, text=np.array(text), **arrays)
     with draft_of(path) as draft:
-        draft.write_bytes(sha256(content.getbuffer()).digest() + content.getbuffer())
+        draft.write_bytes(sha256(content.getvalue()).digest() + content.getvalue())
 
 
 def load(path: Path, state: str) -> dict[str, Any] | None:
@@ -188,10 +188,10 @@ def _object_of(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     module, _, name = value["class"].partition(":")
     if not module.startswith("bwbayes."):
         raise ValueError(f"{value['class']} is no class of this package")
-    made = getattr(import_module(module), name)
-    if not isinstance(made, type) or _names_of(made) is None:
+    cls = getattr(import_module(module), name)
+    if not isinstance(cls, type) or _names_of(cls) is None:
         raise ValueError(f"{value['class']} is no dataclass")
-    return made(**items)
+    return cls(**items)
 
 
 def _names_of(kind: type) -> Sequence[str] | None:

@@ -27,7 +27,7 @@ class ProgressLine(Live):
 
     def __init__(self, console: Console) -> None:
         super().__init__(console=console, transient=True, auto_refresh=console.is_terminal)
-        self.begun = self.printed = time.monotonic()
+        self.started_at = self.printed = time.monotonic()
 
     def show(self, line: str, *, printed: bool = True) -> None:
         """Show a line; without a terminal only if it may be ``printed`` and the time has come."""
@@ -44,14 +44,14 @@ class StepProgress(ProgressLine):
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
-        self.step, self.latest = "", self.begun
+        self.step, self.latest = "", self.started_at
 
     def __call__(self, step: str, share: float) -> None:
         """Take note of how much of a step is done, from 0 to 1."""
         if step != self.step:
-            self.step, self.begun = step, self.latest
+            self.step, self.started_at = step, self.latest
         self.latest = time.monotonic()
-        elapsed = self.latest - self.begun
+        elapsed = self.latest - self.started_at
         remaining = _minutes(elapsed * (1 - share) / share) if share else "unknown"
         self.show(f"{step} {share:.0%}   ETA {remaining}")
 
@@ -80,12 +80,12 @@ class Progress(ProgressLine):
                 remaining = max(min(needed, self.plan.most_steps) - check.steps, 0)
                 now = time.monotonic()
                 if np.isfinite(needed):
-                    self.end = now + remaining * (now - self.begun) / self.steps
+                    self.end = now + remaining * (now - self.started_at) / self.steps
         self.show(self.line(phase), printed=check is not None)
 
     def line(self, phase: Phase) -> str:
         """Return the line that is shown."""
-        elapsed = max(time.monotonic() - self.begun, 1e-9)
+        elapsed = max(time.monotonic() - self.started_at, 1e-9)
         rate = self.steps * self.plan.ensembles * self.plan.walkers / elapsed
         if self.check is None:
             return f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   burn-in"
@@ -136,7 +136,7 @@ def batch[T](
             yield result
             if label(result):
                 short[label(result)] += 1
-            rate = fresh / max(time.monotonic() - line.begun, 1e-9)
+            rate = fresh / max(time.monotonic() - line.started_at, 1e-9)
             counts = "   ".join(f"{name} {number}" for name, number in short.items())
             line.show(
                 f"{kind} {done + fresh} of {total}   {60 * rate:.1f} a minute   "

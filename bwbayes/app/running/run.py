@@ -188,7 +188,7 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
     artist.draw(result)
     with draft_of(folder.path / "posterior.nc") as draft:
         # From memory: HDF5 does not survive a disk that is full.
-        draft.write_bytes(fit.posterior.to_netcdf(engine="h5netcdf"))
+        draft.write_bytes(bytes(fit.posterior.to_netcdf(engine="h5netcdf")))
     bands.unlink(missing_ok=True)
     if result.bands:
         write_bands(bands, result.bands)
