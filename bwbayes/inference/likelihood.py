@@ -234,9 +234,7 @@ class Likelihood:
             # Here, because it is slow to load.
             from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
 
-            compiled = walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
-            if compiled is not None:
-                return compiled.to
+            return walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
         state, now = None, 0
 
         def onwards(last: int) -> FloatArray:

@@ -76,14 +76,20 @@ def _type_of(formula: HysteresisStep | RemembersExtrema, _: Any) -> FormulaType:
     kind: Any = type(formula)
     # To read the sources takes longer than a short record: a class does so once.
     if "_numba_type_" not in vars(kind):
-        function = kind.everett if issubclass(kind, RemembersExtrema) else kind.move
-        files = sorted({inspect.getfile(inner) for inner in _functions(function)})
+        files = sorted({inspect.getfile(inner) for inner in _functions(_formula_of(kind))})
         # Which knows the cells of a notebook too.
         lines = (line for file in files for line in linecache.getlines(file))
         digest = sha256("".join(lines).encode()).hexdigest()[:16]
         kind._numba_type_ = FormulaType(f"{kind.__module__}:{kind.__qualname__}@{digest}")
         kind._numba_type_.kind = kind
     return cast("FormulaType", kind._numba_type_)
+
+
+def _formula_of(kind: Any) -> Callable[..., Any]:
+    """Return the formula of a class."""
+    function: Callable[..., Any]
+    function = kind.everett if issubclass(kind, RemembersExtrema) else kind.move
+    return function
 
 
 register_model(FormulaType)(models.OpaqueModel)
@@ -94,31 +100,16 @@ def _unboxed(kind: Any, formula: Any, context: Any) -> Any:  # noqa: ARG001  # i
     return NativeValue(context.context.get_dummy_value())  # type: ignore[no-untyped-call]
 
 
-def move(step: Any, parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
-    """Return what the ``move`` of a step's class does: of numbers here, where it is compiled."""
-    result: tuple[Any, Any] = step.move(parameters, memory, voltage, after)
-    return result
+def formula(owner: Any, *arguments: Any) -> Any:
+    """Return what the formula that an owner brings makes of numbers, where it is compiled."""
+    return _formula_of(type(owner))(*arguments)
 
 
-@overload(move, jit_options=cast("Any", INNER), strict=False)
-def _move(step: Any, parameters: Any, memory: Any, voltage: Any, after: Any) -> Any:  # noqa: ARG001
-    """Return the function of a step's class, with all that it calls made known to numba."""
-    inner = compiled(step.kind.move)
-    return lambda step, parameters, memory, voltage, after: inner(  # noqa: ARG005
-        parameters, memory, voltage, after
-    )
-
-
-def everett(operator: Any, numbers: Any, start: Any, voltage: Any) -> Any:
-    """Return what the ``everett`` of an operator's class does: of numbers, where it is compiled."""
-    return operator.everett(numbers, start, voltage)
-
-
-@overload(everett, jit_options=cast("Any", INNER), strict=False)
-def _everett(operator: Any, numbers: Any, start: Any, voltage: Any) -> Any:  # noqa: ARG001
-    """Return the function of an operator's class, with all that it calls made known to numba."""
-    inner = compiled(operator.kind.everett)
-    return lambda operator, numbers, start, voltage: inner(numbers, start, voltage)  # noqa: ARG005
+@overload(formula, jit_options=cast("Any", INNER), strict=False)
+def _formula(owner: Any, *arguments: Any) -> Any:  # noqa: ARG001
+    """Return the function of an owner's class, with all that it calls made known to numba."""
+    inner = compiled(_formula_of(owner.kind))
+    return lambda owner, *arguments: inner(*arguments)  # noqa: ARG005
 
 
 def compiled[Function: Callable[..., Any]](function: Function) -> Function:

@@ -16,7 +16,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes, whitening
 from bwbayes.inference.compiled.motion import physics, shared
-from bwbayes.inference.compiled.stages import DRIVES, Stage, given, prepared
+from bwbayes.inference.compiled.stages import Stage, advance_of, given, prepared
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
@@ -68,9 +68,8 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
         for unknown, tap in np.ndindex(responses.shape[1:]):
             named[f"free_{unknown + 1}{tap + 1}"] = responses[:, unknown, tap]
         models = np.zeros((len(theta), len(lanes.PARAMETERS)))
-        for row, name in enumerate(lanes.PARAMETERS):
-            if name in named:
-                models[:, row] = named[name]
+        for name, values in named.items():
+            models[:, lanes.PARAMETERS.index(name)] = values
         over_gaps = np.ascontiguousarray(lanes.in_lanes(steps[:, rows]).swapaxes(0, 1))
         result = kernels.sums(
             *record, lanes.in_lanes(models[rows]), over_gaps, second,
@@ -120,17 +119,14 @@ def _staged(
     """Yield which models go together, and the stage that makes their drive."""
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
     operator, others = actuator.hysteresis, np.arange(column["offset"].size)
-    compiled = DRIVES.get(type(operator))
-    if compiled is None:
-        memory = actuator.begin(column, voltage, from_rest=from_rest)
-        stage = prepared(operator, column, voltage, memory)
-        if stage is not None:
-            yield slice(None), stage
-            return
+    memory = actuator.begin(column, voltage, from_rest=from_rest)
+    stage = prepared(operator, column, voltage, memory)
+    if stage is not None:
+        yield slice(None), stage
+        return
     # Elements (models x samples) of the drive that is worked out beforehand, at a time.
     size = max((1 << 23) // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
         values = {name: column[name][rows] for name in actuator.parameters}
         memory = actuator.begin(values, voltage, from_rest=from_rest)
-        drive = (compiled or type(operator).advance)(operator, values, voltage, memory)[0]
-        yield rows, given(drive[:, 0], drive)
+        yield rows, given(advance_of(operator)(operator, values, voltage, memory)[0])

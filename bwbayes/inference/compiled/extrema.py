@@ -12,7 +12,7 @@ from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.model.compiled import everett
+from bwbayes.model.compiled import formula
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
 # Rows: a model's number in the plan, w₀, w of the last sample, the direction, how many extrema
@@ -147,7 +147,7 @@ def _branch(
     """Write w along a branch from an extremum on; along the first one it moves half as far."""
     if depth == 1:
         for t in range(voltage.size):
-            w[t] = level + 0.5 * s * everett(operator, numbers, -voltage[t], voltage[t])
+            w[t] = level + 0.5 * s * formula(operator, numbers, -voltage[t], voltage[t])
     else:
         for t in range(voltage.size):
-            w[t] = level + s * everett(operator, numbers, turned, voltage[t])
+            w[t] = level + s * formula(operator, numbers, turned, voltage[t])

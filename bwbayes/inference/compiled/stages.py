@@ -9,17 +9,16 @@ and no stage, is worked out beforehand, and its drive is the plan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import overload
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled import extrema, pinned, relaxing
 from bwbayes.inference.compiled.lanes import LANES, inner
-from bwbayes.model.compiled import FormulaType, move
+from bwbayes.model.compiled import FormulaType, formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
@@ -60,43 +59,32 @@ def prepared(operator: Operator, column: Values, voltage: FloatArray, memory: An
     return Stage(step, equilibrium, group, step.parameters)
 
 
-# What makes the drive of a whole piece at once, (models, samples), as the operator's ``advance``.
-DRIVES: Mapping[
-    type[Operator], Callable[[Any, Values, FloatArray, Any], tuple[FloatArray, Any]]
-] = {
-    JilesAtherton: pinned.drive,
-    DomainWall: pinned.drive,
-}
+def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
+    """Return what makes the drive of a whole piece at once, as the operator's class advances."""
+    integrated = type(operator) in (JilesAtherton, DomainWall)
+    return pinned.drive if integrated else type(operator).advance
 
 
-def given(equilibrium: FloatArray, drive: FloatArray) -> Stage:
-    """Take a known drive (models, samples), um, whose first sample was ``equilibrium``."""
+def given(drive: FloatArray) -> Stage:
+    """Take a known drive (models, samples), um."""
+    equilibrium = drive[:, 0]
     group = np.stack([np.arange(equilibrium.size), equilibrium], axis=1)
     # All that follows would be compiled once more for another layout.
     return Stage(None, equilibrium, group, np.ascontiguousarray(drive))
 
 
-@njit(nogil=True, cache=True)
 def drive_of(
-    kind: Kind,
-    group: FloatArray,
-    plan: FloatArray,
-    voltage: FloatArray,
-    first: int,
-    last: int,
-    out: FloatArray,
+    kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
 ) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on."""
-    _along(kind, group, plan, voltage, first, last, out)
+    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on.
 
-
-def _along(kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any) -> None:
-    """Do what the stage of a kind does; chosen by its type, so that no other is compiled."""
+    By the stage of a kind, which is chosen by its type, so that no other is compiled.
+    """
     raise NotImplementedError
 
 
-@overload(_along, strict=False)
-def _compiled_along(
+@overload(drive_of, strict=False)
+def _compiled_drive_of(
     kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
 ) -> Any:
     del group, plan, voltage, first, last, out
@@ -107,13 +95,9 @@ def _compiled_along(
             stage = relaxing.relaxing
         elif issubclass(kind.kind, RemembersExtrema):
             stage = extrema.along_branches
-
-    def along(
-        kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
-    ) -> None:
-        stage(kind, group, plan, voltage, first, last, out)
-
-    return along
+    return lambda kind, group, plan, voltage, first, last, out: stage(  # noqa: PLW0108  # a source
+        kind, group, plan, voltage, first, last, out
+    )
 
 
 @inner(fastmath={"contract", "nsz"})
@@ -154,7 +138,7 @@ def _stepped(
         for k in range(memory.size):
             memory[k] = group[(2 + k) * LANES + i]
         for t in range(first, last):
-            w, _ = move(step, parameters, memory, voltage[t], after)
+            w, _ = formula(step, parameters, memory, voltage[t], after)
             out[(t - first) * LANES + i] = w - group[LANES + i]
             for k in range(memory.size):
                 memory[k] = after[k]

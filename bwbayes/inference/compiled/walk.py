@@ -12,47 +12,10 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, X2, in_lanes
+from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
-from bwbayes.inference.compiled.stages import DRIVES, Kind, Stage, drive_of, given, prepared
+from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
-
-
-class Walk:
-    """Models on their way along a voltage; see :func:`walk`.
-
-    ``drive`` makes the next piece of the operator's drive, where that has no stage of its own.
-    """
-
-    def __init__(
-        self,
-        stage: Stage,
-        known: tuple[FloatArray, FloatArray, FloatArray],
-        state: FloatArray,
-        voltage: FloatArray,
-        drive: Callable[[FloatArray], FloatArray] | None,
-    ) -> None:
-        self.stage, self.known, self.state, self.voltage = stage, known, state, voltage
-        self.drive = drive
-        self.groups = in_lanes(stage.group)
-        self.now = 0
-
-    def to(self, last: int) -> FloatArray:
-        """Displacement (models, samples), um, from where the models are to before a sample."""
-        displacement = np.empty((len(self.stage.group), last - self.now))
-        begin, end, plan, voltage = self.now, last, self.stage.plan, self.voltage
-        curve, lags, growth = self.known
-        if self.drive is not None:
-            piece = slice(begin, end)
-            voltage, curve, begin, end = voltage[piece], curve[piece], 0, last - self.now
-            growth = growth[piece]
-            plan = np.ascontiguousarray(self.drive(voltage))
-        _walk(
-            self.stage.kind, self.groups, plan, curve, lags, growth, self.state, voltage, begin,
-            end, displacement,
-        )  # fmt: skip
-        self.now = last
-        return displacement
 
 
 def walk(
@@ -62,44 +25,49 @@ def walk(
     unrest: FloatArray | None = None,
     *,
     from_rest: bool = False,
-) -> Walk | None:
-    """Put models to a voltage's first sample; None if they are left to NumPy.
+) -> Callable[[int], FloatArray]:
+    """Put models to a voltage's first sample; what is returned walks them on to a sample.
 
-    That is so for an operator that is not compiled. Parameters and errors are those of
+    Called with growing numbers of samples, it returns the displacement (models, samples), um, from
+    where they are. Parameters and errors are those of
     :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the ``voltage`` (samples,) is known
     up to the end.
     """
-    operator, drive = actuator.hysteresis, None
+    operator = actuator.hysteresis
     column = actuator.columns(theta)
     actuator.check(column)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
-    stage: Stage | None
-    if type(operator) in DRIVES:
-        make = DRIVES[type(operator)]
-
-        def along(piece: FloatArray) -> FloatArray:
-            nonlocal memory
-            moved, memory = make(operator, column, piece, memory)
-            return moved
-
-        drive, stage = along, given(along(voltage[:1])[:, 0], np.empty((0, 0)))
-    else:
-        stage = prepared(operator, column, voltage, memory)
-    if stage is None:
-        return None
-    rows = {
-        PARAMETERS.index(name): values
-        for name, values in physics(actuator, column, stage.rest, voltage).items()
-    }
-    moving, *crept = actuator.sections(column).begin(unrest)
-    rows |= dict(zip((X1 // LANES, X2 // LANES), moving.T, strict=False))
-    rows |= {LAG // LANES + k: lag[:, 0] for k, lag in enumerate(crept)}
+    compiled, advance = prepared(operator, column, voltage, memory), advance_of(operator)
+    stage = compiled or given(advance(operator, column, voltage[:1], memory)[0])
     models = np.zeros((len(theta), STATE // LANES))
-    for row, values in rows.items():
-        models[:, row] = values
+    for name, values in physics(actuator, column, stage.rest, voltage).items():
+        models[:, PARAMETERS.index(name)] = values
+    moving, *crept = actuator.sections(column).begin(unrest)
+    models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
+    for row, lag in enumerate(crept, LAG // LANES):
+        models[:, row] = lag[:, 0]
+    groups, state, now = in_lanes(stage.group), in_lanes(models), 0
     # Not to be written to, whatever it was: of one type, for which one walk is compiled.
     known = np.broadcast_to(voltage, voltage.shape)
-    return Walk(stage, shared(actuator, voltage), in_lanes(models), known, drive)
+    curve, lags, growth = shared(actuator, voltage)
+
+    def onwards(last: int) -> FloatArray:
+        nonlocal memory, now
+        displacement = np.empty((len(theta), last - now))
+        piece, begin, plan = slice(0, None), now, stage.plan
+        if compiled is None:
+            # The drive of this piece is known, and what goes with it begins where it does.
+            piece, begin = slice(now, last), 0
+            drive, memory = advance(operator, column, voltage[piece], memory)
+            plan = np.ascontiguousarray(drive)
+        _walk(
+            stage.kind, groups, plan, curve[piece], lags, growth[piece], state, known[piece], begin,
+            begin + last - now, displacement,
+        )  # fmt: skip
+        now = last
+        return displacement
+
+    return onwards
 
 
 @njit(nogil=True, cache=True)
