@@ -92,7 +92,8 @@ def _fold(
     for k in range(count):
         at, rho = series[k] * LANES, decays[k]
         for i in range(LANES):
-            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - _part(state, second, i, rho))
+            part, _ = _parts(state, second, i, rho)
+            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - part)
         row = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
         for i in range(LANES):
             pull = state[VALUE + at + i] * state[INNOVATION + at + i]
@@ -110,29 +111,22 @@ def _fold(
         for i in range(LANES):
             response = state[RESPONSE + at + i] * weight[k]
             state[RESPONSE + at + i] = response
-            state[ESTIMATE + at + i] = response * _part(state, second, i, decays[k])
-            if second is not None:
-                state[ESTIMATE_2 + at + i] = response * _part_2(state, i, decays[k])
+            part, part_2 = _parts(state, second, i, decays[k])
+            state[ESTIMATE + at + i], state[ESTIMATE_2 + at + i] = (
+                response * part,
+                response * part_2,
+            )
 
 
 @inner(error_model="numpy")
-def _part(state: FloatArray, second: bool | None, i: int, rho: float) -> float:
-    """Return c, the estimate of a response that keeps ρ of itself, over the response."""
+def _parts(state: FloatArray, second: bool | None, i: int, rho: float) -> tuple[float, float]:
+    """Return c and c₂, the estimates of a response that keeps ρ of itself, over the response."""
+    gain, first = float(state[GAIN + i]), rho - state[KEPT + i]
     if second is None:
-        return float(state[GAIN + i] / (rho - state[KEPT + i] + state[GAIN + i]))
-    gain, across = state[GAIN + i], state[KEPT_12 + i]
-    left, pull = rho - state[KEPT_22 + i], state[GAIN_2 + i]
-    total = (rho - state[KEPT + i] + gain) * left + across * (across + pull)
-    return float((gain * left + across * pull) / total)
-
-
-@inner(error_model="numpy")
-def _part_2(state: FloatArray, i: int, rho: float) -> float:
-    """Return c₂, that of the second state."""
-    gain, across = state[GAIN + i], state[KEPT_12 + i]
-    first, pull = rho - state[KEPT + i], state[GAIN_2 + i]
-    total = (first + gain) * (rho - state[KEPT_22 + i]) + across * (across + pull)
-    return float((first * pull - across * gain) / total)
+        return gain / (first + gain), 0.0
+    across, left, pull = state[KEPT_12 + i], rho - state[KEPT_22 + i], state[GAIN_2 + i]
+    total = (first + gain) * left + across * (across + pull)
+    return (gain * left + across * pull) / total, (first * pull - across * gain) / total
 
 
 @inner(error_model="numpy")
@@ -141,17 +135,15 @@ def is_tracked(
 ) -> bool:
     """Tell whether the estimates of all those responses only follow them, to their rounding."""
     for k in range(series.size):
-        at, rho = series[k] * LANES, decays[k]
+        at = series[k] * LANES
         for i in range(LANES):
             response = state[RESPONSE + at + i]
+            part, part_2 = _parts(state, second, i, decays[k])
+            gap = abs(state[ESTIMATE + at + i] - response * part)
+            gap_2 = abs(state[ESTIMATE_2 + at + i] - response * part_2) / (1.0 + abs(part_2))
             size = 1e-13 * abs(response)
-            if not abs(state[ESTIMATE + at + i] - response * _part(state, second, i, rho)) <= size:
+            if not (gap <= size and gap_2 <= size):
                 return False
-            if second is not None:
-                part = _part_2(state, i, rho)
-                gap = abs(state[ESTIMATE_2 + at + i] - response * part)
-                if not gap <= size * (1.0 + abs(part)):
-                    return False
     return True
 
 
