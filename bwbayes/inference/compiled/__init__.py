@@ -51,9 +51,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     free = likelihood.unknowns - offset
     column = likelihood.table.columns(theta)
     parameters = likelihood.table.noise(theta)
-    step, process, sensor, second, steps = _filtering(
-        noise, parameters, likelihood.readings.gaps[0]
-    )
+    filtering, second, steps = _filtering(noise, parameters, likelihood.readings.gaps[0])
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
@@ -61,18 +59,12 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
-        named = physics(actuator, column, equilibrium, voltage)
-        named |= dict(zip(lanes.PARAMETERS[lanes.KEPT // lanes.LANES :], step, strict=False))
-        named |= {"process": process, "sensor": sensor}
+        named = physics(actuator, column, equilibrium, voltage) | filtering
         responses = actuator.sections(column).recursions[0].free
         for unknown, tap in np.ndindex(responses.shape[1:]):
             named[f"free_{unknown + 1}{tap + 1}"] = responses[:, unknown, tap]
-        models = np.zeros((len(theta), len(lanes.PARAMETERS)))
-        for name, values in named.items():
-            models[:, lanes.PARAMETERS.index(name)] = values
-        over_gaps = np.ascontiguousarray(lanes.in_lanes(steps[:, rows]).swapaxes(0, 1))
         result = kernels.sums(
-            *record, lanes.in_lanes(models[rows]), over_gaps, second,
+            *record, lanes.in_lanes(lanes.by_rows(named)[rows]), _over_gaps(steps[rows]), second,
             stage.kind, lanes.in_lanes(stage.group), stage.plan, *together, *unknowns,
         )  # fmt: skip
         sums[:, rows] = result[:, : len(stage.group)]
@@ -81,7 +73,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     for i in range(size):
         for j in range(i + 1):
             pairs[:, i, j] = pairs[:, j, i] = sums[i * (i + 1) // 2 + j]
-    typical = likelihood.readings.rows.size * np.log(step[3] + sensor)
+    typical = likelihood.readings.rows.size * np.log(filtering["fresh_11"] + filtering["sensor"])
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
@@ -93,24 +85,32 @@ def whiten(
     Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um;
     and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
     """
-    step, process, sensor, second, steps = _filtering(noise, theta, gaps[0])
+    filtering, second, steps = _filtering(noise, theta, gaps[0])
+    models, over_gaps = lanes.in_lanes(lanes.by_rows(filtering)), _over_gaps(steps)
     # Each layout of an array would be compiled by itself.
-    rows, series = np.ascontiguousarray(step.T), np.ascontiguousarray(series)
-    return whitening.whitened(rows, process, sensor, second, gaps[1], steps, series)
+    return whitening.whitened(models, second, gaps[1], over_gaps, np.ascontiguousarray(series))
 
 
 def _filtering(
     noise: Noise, theta: FloatArray, missing: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, bool | None, FloatArray]:
-    """Return the filter's usual step (rows, models), variances of discrepancy and sensor (models,).
+) -> tuple[dict[str, FloatArray], bool | None, FloatArray]:
+    """Return the filter's usual step and the variances, (models,), by the names of ``PARAMETERS``.
 
     Then whether there is a second state, what is None being left out when it is compiled, and the
-    step over each gap (gaps, models, rows) but the first, which misses none.
+    steps over all gaps but the first, which misses none, side by side (models, gaps times rows).
     """
-    process, sensor = (sd**2 for sd in noise.marginal_sd(theta))
-    steps = np.array([noise.step(theta, number).T for number in missing[1:].tolist()])
-    steps = steps.reshape(-1, len(theta), lanes.STEP)
-    return noise.step(theta), process, sensor, True if noise.states > 1 else None, steps
+    names = lanes.PARAMETERS[lanes.KEPT // lanes.LANES :]
+    named = dict(zip(names, noise.step(theta), strict=False))
+    named["process"], named["sensor"] = (sd**2 for sd in noise.marginal_sd(theta))
+    steps = [noise.step(theta, number) for number in missing[1:].tolist()]
+    over = np.concatenate([np.empty((0, len(theta))), *steps]).T
+    return named, True if noise.states > 1 else None, over
+
+
+def _over_gaps(steps: FloatArray) -> FloatArray:
+    """Put steps over gaps side by side, (groups, gaps, rows times lanes)."""
+    groups = lanes.in_lanes(steps)
+    return groups.reshape(len(groups), -1, lanes.STEP * lanes.LANES)
 
 
 def _staged(

@@ -7,6 +7,7 @@ these numbers into what it compiles, so whoever changes them deletes what it has
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,14 @@ PAIRS = SERIES * (SERIES + 1) // 2
 LOG_DETERMINANT = PAIRS
 SUMS = PAIRS + 1
 STATE = PRODUCTS + LANES * PAIRS
+
+
+def by_rows(named: Mapping[str, FloatArray], size: int = len(PARAMETERS)) -> FloatArray:
+    """Return models (models, size) of what is known by the names of `PARAMETERS`; others are 0."""
+    models = np.zeros((max(values.size for values in named.values()), size))
+    for name, values in named.items():
+        models[:, PARAMETERS.index(name)] = values
+    return models
 
 
 def in_lanes(models: FloatArray) -> FloatArray:

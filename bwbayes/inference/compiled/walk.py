@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.compiled.lanes import LAG, LANES, PARAMETERS, STATE, X1, in_lanes
+from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator
@@ -39,9 +39,7 @@ def walk(
     memory = actuator.begin(column, voltage, from_rest=from_rest)
     compiled, advance = prepared(operator, column, voltage, memory), advance_of(operator)
     stage = compiled or given(advance(operator, column, voltage[:1], memory)[0])
-    models = np.zeros((len(theta), STATE // LANES))
-    for name, values in physics(actuator, column, stage.rest, voltage).items():
-        models[:, PARAMETERS.index(name)] = values
+    models = by_rows(physics(actuator, column, stage.rest, voltage), STATE // LANES)
     moving, *crept = actuator.sections(column).begin(unrest)
     models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
     for row, lag in enumerate(crept, LAG // LANES):

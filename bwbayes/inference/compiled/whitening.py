@@ -16,7 +16,8 @@ from bwbayes.arrays import FloatArray, IntArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    COVARIANCE, COVARIANCE_12, COVARIANCE_22, KEPT, LANES, LOG, PROCESS, RATIO, SENSOR, STATE, STEP,
+    COVARIANCE, COVARIANCE_12, COVARIANCE_22, FRESH, KEPT, LANES, LOG, PROCESS, RATIO, SENSOR,
+    STATE,
 )
 # fmt: on
 # isort: on
@@ -26,9 +27,7 @@ from bwbayes.inference.compiled.motion import PIECE
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def whitened(
-    step: FloatArray,
-    process: FloatArray,
-    sensor: FloatArray,
+    models: FloatArray,
     second: bool | None,
     gaps: IntArray,
     steps: FloatArray,
@@ -38,35 +37,25 @@ def whitened(
 
     Parameters
     ----------
-    step
-        (models, ``STEP``) the filter's step from reading to reading.
-    process, sensor
-        (models,) variances of the discrepancy and of the sensor, um².
-    second
-        None unless the noise has two states.
+    models, second, steps
+        As in :func:`bwbayes.inference.compiled.kernels.sums`; of the models the filter alone.
     gaps
         (readings,) which of the gaps is just before a reading; 0 if none is.
-    steps
-        (gaps, models, ``STEP``) the filter's step over each gap.
     series
         (models, series, readings), um.
     """
-    models, count, readings = series.shape
-    white, logs = np.empty_like(series), np.empty(models)
-    state, over = np.zeros(STATE), np.zeros((steps.shape[0], STEP * LANES))
+    _, count, readings = series.shape
+    white, logs, state = np.empty_like(series), np.empty(len(series)), np.zeros(STATE)
     estimate, other = np.zeros((count, LANES)), np.zeros((count, LANES))
     gains = np.empty((3, PIECE * LANES))
     values = np.zeros(PIECE * LANES)
-    for first in range(0, models, LANES):
-        lanes = min(models - first, LANES)
+    for group in range(len(models)):
+        first = group * LANES
+        lanes, over = min(len(series) - first, LANES), steps[group]
+        for i in range(models.shape[1]):
+            state[i] = models[group, i]
         for i in range(LANES):
-            model = min(first + i, models - 1)
-            for row in range(STEP):
-                state[KEPT + row * LANES + i] = step[model, row]
-                for gap in range(steps.shape[0]):
-                    over[gap, row * LANES + i] = steps[gap, model, row]
-            state[SENSOR + i], state[PROCESS + i] = sensor[model], process[model]
-            state[COVARIANCE + i] = state[COVARIANCE_22 + i] = process[model]
+            state[COVARIANCE + i] = state[COVARIANCE_22 + i] = state[PROCESS + i]
             state[COVARIANCE_12 + i] = state[LOG + i] = 0.0
             state[RATIO + i] = 1.0
         estimate[:], other[:] = 0.0, 0.0
@@ -86,6 +75,6 @@ def whitened(
                         row = t * LANES + i
                         white[first + i, k, now + t] = values[row] * math.sqrt(gains[2, row])
         for i in range(lanes):
-            typical = step[first + i, 3] + sensor[first + i]
+            typical = state[FRESH + i] + state[SENSOR + i]
             logs[first + i] = state[LOG + i] + readings * math.log(typical)
     return white, logs
