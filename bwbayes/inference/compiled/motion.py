@@ -27,7 +27,7 @@ PIECE = 64
 
 def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what gain and creep of all models have in common, as :func:`displace` takes it."""
-    curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.empty(0)
+    curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.zeros(voltage.size)
     if actuator.gain is not None:
         x = actuator.gain.scaled(voltage)
         curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
@@ -79,7 +79,7 @@ def displace(
 
     ``curve`` (samples, 2) are x² − x₀² and x³ − x₀³ of the gain, or empty; ``lags`` (times, 3) each
     lag's two coefficients of the drive and the part that it keeps of itself; ``growth`` (samples,)
-    is |u| / U, or empty.
+    is |u| / U, or zero.
     """
     if curve.size > 0:
         _bend(state, curve, first, last, drive)
@@ -125,10 +125,9 @@ def _creep(
     followed = np.empty_like(drive[: (last - first) * LANES])
     for t in range(first, last):
         row = (t - first) * LANES
-        size = 1.0 if growth.size == 0 else growth[t]
         for i in range(LANES):
             w = drive[row + i] + state[EQUILIBRIUM + i]
-            followed[row + i] = w * (1.0 + state[GROWTH + i] * size) - state[CREPT + i]
+            followed[row + i] = w * (1.0 + state[GROWTH + i] * growth[t]) - state[CREPT + i]
     _follow(state, last - first, drive)
     for k in range(lags.shape[0]):
         at, strength = LAG + k * LANES, STRENGTH + k * LANES
