@@ -144,23 +144,19 @@ class ParameterTable:
         return theta
 
     @cached_property
-    def _columns_of(self) -> dict[str, list[int]]:
-        """Where each record's own θ has its columns in the joint one."""
+    def columns_of(self) -> dict[str, list[int]]:
+        """Where each record's own θ has its columns in the joint one, by record."""
         return {
             record: [i for i, column in enumerate(self.layout) if column.record in ("", record)]
             for record in self.records
         }
 
-    def columns_of(self, record: str) -> list[int]:
-        """Return where the columns of a record's own θ are in the joint one."""
-        return self._columns_of[record]
-
     def of(self, theta: FloatArray, record: str) -> FloatArray:
         """Return θ of one record (models, its parameters) from the joint one."""
-        columns: FloatArray = theta[:, self._columns_of[record]]
+        columns: FloatArray = theta[:, self.columns_of[record]]
         return columns
 
     def name_of(self, name: str, record: str) -> str:
         """Return the name of the column that is a record's parameter ``name``."""
         plain = [declaration.name for declaration in self.declarations]
-        return self.names[self._columns_of[record][plain.index(name)]]
+        return self.names[self.columns_of[record][plain.index(name)]]

@@ -276,7 +276,7 @@ class Posterior:
             return {self.only.name: self}
         posteriors = {}
         for dataset in self.datasets:
-            columns = self.table.columns_of(dataset.name)
+            columns = self.table.columns_of[dataset.name]
             parameters = (self.prior.parameters[column] for column in columns)
             prior = JointPrior(
                 (replace(p, name=p.plain, record="") for p in parameters), self.prior.constraint
