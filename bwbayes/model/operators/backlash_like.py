@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, ceiling, d, initial
 from bwbayes.model.relaxing import RelaxingStep
@@ -42,7 +41,3 @@ class BacklashLike(OneState):
     def step(self, column: Values) -> HysteresisStep:
         """Return that of n = 1 Bouc-Wen hysteresis with γ = 0."""
         return RelaxingStep.of([column["d"]], [column["alpha"]], column["beta"], column["beta"])
-
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range

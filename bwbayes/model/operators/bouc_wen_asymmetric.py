@@ -126,10 +126,6 @@ class BoucWenAsymmetric(OneState):
         slow, fast = np.stack(pairs, axis=1)
         return RelaxingStep.of([column["d"]], [column["alpha"]], slow - fast, slow + fast)
 
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range
-
 
 def rates(column: Values, s: float, x: float) -> tuple[FloatArray, FloatArray]:
     """Return β′ and γ′ (models,), 1/V, where the voltage goes in direction s and has the sign x."""

@@ -129,10 +129,6 @@ class Duhem(OneState):
         mean = column["d"] + even * (low + high)
         return np.asarray(mean + column["d3"] * (low**2 + low * high + high**2))
 
-    def opening(self, column: Values, half_range: float) -> FloatArray:
-        """Return β U."""
-        return column["beta"] * half_range
-
 
 class DuhemStep(RelaxingStep):
     """w = f(u) − h with Duhem hysteresis h, exact: dg/dv = α(u) − β g, g = s h."""

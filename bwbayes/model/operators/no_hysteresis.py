@@ -38,12 +38,6 @@ class NoHysteresis(OneState):
         """Return zero."""
         return np.zeros_like(column["d"])
 
-    def trace(
-        self, column: Values, voltage: FloatArray, state: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return w = d u (models, samples), and the state as it was."""
-        return column["d"][:, np.newaxis] * voltage, state
-
     def step(self, column: Values) -> HysteresisStep:
         """Return d u."""
         nothing = np.zeros_like(column["d"])

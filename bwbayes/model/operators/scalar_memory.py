@@ -50,6 +50,10 @@ class OneState(Operator):
         """Return d."""
         return column["d"]
 
+    def opening(self, column: Values, half_range: float) -> FloatArray | None:
+        """Return β U, or None for an operator without β."""
+        return column["beta"] * half_range if "beta" in column else None
+
     def trace(
         self, column: Values, voltage: FloatArray, state: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
