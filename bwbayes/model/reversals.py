@@ -39,22 +39,15 @@ def monotone_stretches(voltage: FloatArray, longest: int | None = None) -> Itera
     """
     steps = np.sign(np.diff(voltage))
     moving = np.flatnonzero(steps)
-    if moving.size == 0:
-        yield from _cut(Stretch(0, voltage.size - 1, 1.0), longest)
-        return
-    turns = moving[1:][steps[moving[1:]] != steps[moving[:-1]]]
-    first = 0
-    for turn in (*turns.tolist(), voltage.size - 1):
-        # The voltage turns at sample `turn`: the step from there on goes the other way.
-        direction = float(steps[moving[np.searchsorted(moving, first)]])
-        yield from _cut(Stretch(first, turn, direction), longest)
-        first = turn
-
-
-def _cut(stretch: Stretch, longest: int | None) -> Iterator[Stretch]:
-    size = longest or max(stretch.last - stretch.first, 1)
-    for first in range(stretch.first, stretch.last, size):
-        yield Stretch(first, min(first + size, stretch.last), stretch.direction)
+    direction = float(steps[moving[0]]) if moving.size else 1.0
+    # The voltage turns at these samples: the step from there on goes the other way.
+    turns = moving[1:][np.diff(steps[moving]) != 0]
+    ends = [*turns.tolist(), voltage.size - 1]
+    for start, end in zip([0, *ends[:-1]], ends, strict=True):
+        size = longest or max(end - start, 1)
+        for first in range(start, end, size):
+            yield Stretch(first, min(first + size, end), direction)
+        direction = -direction
 
 
 def turning_points(voltage: FloatArray, threshold: float | None = None) -> IntArray:
