@@ -165,8 +165,7 @@ class JointPrior:
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
         }
         self._free_rows = [self.names.index(name) for name in self.free_names]
-        self._fixed_rows = [self.names.index(name) for name in self._fixed]
-        self._fixed_values = np.array([*self._fixed.values()])[:, np.newaxis]
+        self._template = np.array([np.nan if p.fixed is None else p.fixed for p in self.parameters])
         # A formula maps most of the free parameters, and nothing cuts them.
         self._cut = [(row, p) for row, p in enumerate(self.free) if p.formula is None]
         # What free parameters must be above, or reach at least: two columns.
@@ -205,9 +204,8 @@ class JointPrior:
 
     def theta(self, free: FloatArray) -> FloatArray:
         """Put free parameters (models, free) and fixed ones together: (models, parameters)."""
-        theta = np.empty((len(self.names), free.shape[0]))
+        theta = np.repeat(self._template[:, np.newaxis], len(free), axis=1)
         theta[self._free_rows] = free.T
-        theta[self._fixed_rows] = self._fixed_values
         return theta.T
 
     def log_density(self, free: FloatArray) -> FloatArray:
@@ -268,8 +266,7 @@ class JointPrior:
         scaled = scale * safe[rows]
         grown = center * np.exp(np.where(logarithmic, scaled, 0.0))
         free[rows] = np.where(logarithmic, grown, center + scaled)
-        values = self._values(None, rows=coordinates.shape[0])
-        values.update(zip(self.free_names, free, strict=True))
+        values = self._values(free.T)  # as they are found
         room = np.ones(coordinates.shape[0])
         for row, parameter in self._cut:
             bounds = self._limits(parameter, values)
@@ -295,12 +292,9 @@ class JointPrior:
         rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
         return rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
 
-    def _values(self, free: FloatArray | None, rows: int = 0) -> dict[str, FloatArray]:
-        size = rows if free is None else free.shape[0]
-        values = {name: np.full(size, value) for name, value in self._fixed.items()}
-        if free is not None:
-            values.update(zip(self.free_names, free.T, strict=True))
-        return values
+    def _values(self, free: FloatArray) -> dict[str, FloatArray]:
+        values = {name: np.full(len(free), value) for name, value in self._fixed.items()}
+        return values | dict(zip(self.free_names, free.T, strict=True))
 
     def _limits(self, parameter: Parameter, values: Values) -> tuple[FloatArray, FloatArray]:
         """Bounds (models,) of a parameter, given those that come before it."""
