@@ -39,11 +39,6 @@ SERIES, THIRD = (
     tuple((-1.0) ** k / math.factorial(k + order) for k in range(9)) for order in (1, 3)
 )
 
-# Below this argument the φ functions are summed as a series of so many terms, which is exact there;
-# above it nothing cancels in their recursion.
-NEAR, TERMS = 1.0, 16
-INVERSE_FACTORIALS = tuple(1 / math.factorial(order) for order in range(TERMS + 2, 2, -1))
-
 
 class RelaxingStep(OneStateStep):
     """w = f(u) − h, with h that relaxes along the voltage's path: dg/dv = a(u) − c g, g = s h."""
@@ -228,21 +223,19 @@ def phi(z: Any) -> Any:
 
 
 def phi_functions(z: Any) -> tuple[Any, Any, Any]:
-    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0, a number or an array, to rounding.
+    """Return φ₁, φ₂ and φ₃ at −z, for z ≥ 0, a number or an array, to 3e-14.
 
     φ₁(−z) = (1 − exp(−z))/z, φ₂(−z) = (1 − φ₁)/z, φ₃(−z) = (1/2 − φ₂)/z; at zero they are 1, 1/2
-    and 1/6. Each falls with z and stays positive.
+    and 1/6. Each falls with z and stays positive. Where z is not small nothing cancels.
     """
-    near = np.minimum(z, NEAR)
-    phi_3 = 0.0 * near
-    for order in range(TERMS):
-        phi_3 = phi_3 * -near + INVERSE_FACTORIALS[order]
+    near = np.minimum(z, BENT)
+    phi_3 = third(near)
     phi_2 = 0.5 - near * phi_3
     phi_1 = 1.0 - near * phi_2
-    if anywhere(z > NEAR):
-        large = np.maximum(z, NEAR)
+    if anywhere(z > BENT):
+        large = np.maximum(z, BENT)
         one_far = -np.expm1(-large) / large
         two_far = (1.0 - one_far) / large
-        phi_3 = select(z > NEAR, (0.5 - two_far) / large, phi_3)
-        phi_2, phi_1 = select(z > NEAR, two_far, phi_2), select(z > NEAR, one_far, phi_1)
+        phi_3 = select(z > BENT, (0.5 - two_far) / large, phi_3)
+        phi_2, phi_1 = select(z > BENT, two_far, phi_2), select(z > BENT, one_far, phi_1)
     return phi_1, phi_2, phi_3
