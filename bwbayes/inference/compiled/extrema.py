@@ -145,9 +145,8 @@ def _branch(
     w: FloatArray,
 ) -> None:
     """Write w along a branch from an extremum on; along the first one it moves half as far."""
-    if depth == 1:
-        for t in range(voltage.size):
-            w[t] = level + 0.5 * s * formula(operator, numbers, -voltage[t], voltage[t])
-    else:
-        for t in range(voltage.size):
-            w[t] = level + s * formula(operator, numbers, turned, voltage[t])
+    first = depth == 1
+    part = 0.5 * s if first else s
+    for t in range(voltage.size):
+        u = voltage[t]
+        w[t] = level + part * formula(operator, numbers, -u if first else turned, u)
