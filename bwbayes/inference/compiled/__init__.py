@@ -70,9 +70,8 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
         sums[:, rows] = result[:, : len(stage.group)]
     size = 1 + offset + free
     pairs = np.empty((len(theta), size, size))
-    for i in range(size):
-        for j in range(i + 1):
-            pairs[:, i, j] = pairs[:, j, i] = sums[i * (i + 1) // 2 + j]
+    i, j = np.tril_indices(size)
+    pairs[:, i, j] = pairs[:, j, i] = sums[: i.size].T
     typical = likelihood.readings.rows.size * np.log(filtering["fresh_11"] + filtering["sensor"])
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
