@@ -89,13 +89,7 @@ def _take(group: FloatArray, before: float, u: float) -> None:
 
 
 @inner()
-def _move(
-    group: FloatArray,
-    before: float,
-    u: float,
-    steepest: float,
-    curved: bool,
-) -> None:
+def _move(group: FloatArray, before: float, u: float, steepest: float, curved: bool) -> None:
     """Move h along a step on which the voltage keeps its sign, and write w − w₀."""
     s, v = 1.0 if u > before else -1.0, abs(u - before)
     short = v * steepest <= (BENT if curved else SHORT)

@@ -27,11 +27,7 @@ from bwbayes.inference.compiled.motion import PIECE
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def whitened(
-    models: FloatArray,
-    second: bool | None,
-    gaps: IntArray,
-    steps: FloatArray,
-    series: FloatArray,
+    models: FloatArray, second: bool | None, gaps: IntArray, steps: FloatArray, series: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return innovations (models, series, readings) over their sds, and log determinants (models,).
 

@@ -191,11 +191,7 @@ class RemembersExtrema(Operator):
 
 
 def _follow(
-    branch: Branch,
-    extrema: list[Extremum],
-    direction: float,
-    voltage: FloatArray,
-    out: FloatArray,
+    branch: Branch, extrema: list[Extremum], direction: float, voltage: FloatArray, out: FloatArray
 ) -> None:
     """Write w along a monotone stretch (samples,) to ``out``, and drop the extrema it wipes out."""
     done = 0
@@ -214,11 +210,7 @@ def _follow(
 
 
 def _along(
-    branch: Branch,
-    extrema: list[Extremum],
-    direction: float,
-    voltage: FloatArray,
-    out: FloatArray,
+    branch: Branch, extrema: list[Extremum], direction: float, voltage: FloatArray, out: FloatArray
 ) -> None:
     """Write w along a part of a stretch that wipes nothing out to ``out`` (models, samples)."""
 

@@ -67,10 +67,7 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
         )
         rayleigh, saturation = DENSITY
         # Of a width that is fixed.
-        saturation = replace(
-            saturation,
-            bounds=lambda earlier: (earlier["width"] / WIDEST, np.inf),
-        )
+        saturation = replace(saturation, bounds=lambda earlier: (earlier["width"] / WIDEST, np.inf))
         return (SLOPE, rayleigh, saturation, width, INITIAL)
 
     def check(self, column: Values) -> None:
