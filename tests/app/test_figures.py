@@ -18,6 +18,8 @@ import pytest
 from bokeh.models import ColumnDataSource
 from hypothesis import given, settings
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from bwbayes.app.running.figure_worker import Artist, artist_of
@@ -58,20 +60,31 @@ def places(panel: Axes) -> tuple[int, int]:
     return spec.rowspan.start, spec.colspan.start
 
 
+def names(panel: Axes) -> list[str]:
+    """Return the names of the cells of a panel, if it has any."""
+    return [text.get_text() for text in panel.texts]
+
+
 def test_outer_axes_are_named_with_their_units(figures: Mapping[str, Figure]) -> None:
     for name, figure in figures.items():
         panels = sorted(visible(figure), key=places)
         lowest = {places(panel)[1]: panel for panel in panels}
         leftmost = [p for p in panels if places(p)[1] == 0 and len(p.get_yticks())]
         assert leftmost, name
-        assert all(panel.get_xlabel() for panel in lowest.values()), name
-        assert all(panel.get_ylabel() for panel in leftmost), name
+        if name != "corner":
+            assert all(panel.get_xlabel() for panel in lowest.values()), name
+            assert all(panel.get_ylabel() for panel in leftmost), name
         labels = {p.get_xlabel() for p in figure.axes} | {p.get_ylabel() for p in figure.axes}
-        for label in labels - {"", "step", "$n$"}:
+        if name in ("corner", "trace", "ranks"):
+            labels |= {label for panel in figure.axes for label in names(panel)}
+        for label in labels - {"", "step", "$n$", "mean of the walkers, and 90 % of them"}:
             assert re.search(r"\((.+)\)$", label), label
             assert "um" not in re.findall(r"\w+", label), label
-    titles = [panel.get_title() for panel in visible(figures["ranks"])]
-    assert [r"$d$ (µm/V)", r"$\alpha$ (µm/V)", r"$\tau_\mathrm{lag}$ (s)", "$k$ (N/m)"] == titles
+    known = [r"$d$ (µm/V)", r"$\alpha$ (µm/V)", r"$\tau_\mathrm{lag}$ (s)", "$k$ (N/m)"]
+    (corner,), ranks = figures["corner"].axes, figures["ranks"].axes
+    assert (known[::2], known[1::2]) == tuple(map(names, ranks))
+    assert set(known) == set(names(corner))
+    assert 7 == len(names(corner))
 
 
 def test_names_are_read_as_mathematics_only_if_they_are() -> None:
@@ -81,7 +94,7 @@ def test_names_are_read_as_mathematics_only_if_they_are() -> None:
         run = example.run(False, example.draws()[..., :1], (parameter,))
         figure = draw_trace(run)
         figure.draw_without_rendering()
-        assert label == figure.axes[0].get_ylabel()
+        assert label == names(figure.axes[0])[0]
     figure = draw_loop([example.bands(r"$\nonsense{$")])
     figure.draw_without_rendering()
     assert r"\$\nonsense{\$ (held out)" == figure.axes[0].get_title()
@@ -117,9 +130,11 @@ def test_one_parameter_and_bands_at_rest_without_a_measurement_can_be_drawn() ->
         figure.draw_without_rendering()
     assert "coverage" not in figures
     assert "band − mean (µm)" == figures["bands_held-out"].axes[4].get_ylabel()
-    assert "$d$ (µm/V)" == figures["corner"].axes[0].get_xlabel()
-    low, high = figures["corner"].axes[0].get_xlim()
-    assert low < 0.8 < high
+    (corner,) = figures["corner"].axes
+    assert ["$d$ (µm/V)"] == names(corner)
+    lines = [drawn for drawn in corner.collections if isinstance(drawn, LineCollection)]
+    (truth, *_) = (line for line in lines if Color.TRUTH == to_hex(line.get_color()[0]).upper())
+    assert 0 < truth.get_segments()[0][0, 0] < 1
 
 
 def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-import scipy
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from bwbayes.arrays import FloatArray
 from bwbayes.report.figures import style
@@ -37,74 +38,90 @@ def pair_contours() -> Callable[..., None]:
 def draw_corner(result: Result) -> Figure:
     """Draw every pair of free parameters, with contours that hold 50 and 90 % of the draws.
 
-    The true values, where they are known, are lines.
+    The true values, where they are known, are lines. All is in one panel, where each parameter has
+    a cell of side one in each direction: panels of their own would take many times as long.
     """
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
     truths = [result.truth.get(parameter.name) for parameter in result.free]
     ranges = [_range(x, truth) for x, truth in zip(flat.T, truths, strict=True)]
-    ticks = [FixedLocator(_inner_ticks(*limits)) for limits in ranges]
     labels = [style.axis_label(parameter) for parameter in result.free]
-    # Inches: a panel has 1.25, the margin for the labels 1.3.
+    # Inches: a cell has 1.25, the margin for the labels 1.3.
     side = 1.25 * free + 1.5
     figure, hist2d = Figure(figsize=(side, side)), pair_contours()
-    low, high = 1.3 / side, 1 - 0.2 / side
-    grid = figure.add_gridspec(
-        free, free, left=low, bottom=low, right=high, top=high, wspace=0.05, hspace=0.05
-    )
-    for row, column in ((i, j) for i in range(free) for j in range(i + 1)):
-        # Set before there are any ticks: to change those of so many panels takes longer.
-        with mpl.rc_context({"axes.grid": False, "xtick.labelsize": 11, "ytick.labelsize": 11}):
-            panel = figure.add_subplot(grid[row, column])
-        is_lowest, is_first = row == free - 1, column == 0 < row
-        panel.tick_params(labelbottom=is_lowest, labelleft=is_first)
-        if is_lowest:
-            panel.tick_params("x", labelrotation=90)
-            panel.set_xlabel(labels[column], fontsize=13)
-            panel.xaxis.set_label_coords(0.5, -0.75)
-        if is_first:
-            panel.set_ylabel(labels[row], fontsize=13)
-            panel.yaxis.set_label_coords(-0.75, 0.5)
-        if (truth := truths[column]) is not None:
-            panel.axvline(truth, color=style.Color.TRUTH)
-        if row == column:
-            panel.hist(flat[:, row], 20, range=ranges[row], histtype="step", color=style.COLORS[0])
-            panel.set(xlim=ranges[row], yticks=[])
-            panel.xaxis.set_major_locator(ticks[row])
-            continue
-        hist2d(
-            flat[:, column],
-            flat[:, row],
-            ax=panel,
-            range=[ranges[column], ranges[row]],
-            levels=(0.5, 0.9),
-            color=style.COLORS[0],
-            smooth=0.8,
-            plot_density=False,
-            fill_contours=True,
-            data_kwargs={"alpha": 0.3, "ms": 1.2},
-            quiet=True,
-        )
-        panel.xaxis.set_major_locator(ticks[column])
-        panel.yaxis.set_major_locator(ticks[row])
-        if (truth := truths[row]) is not None:
-            panel.axhline(truth, color=style.Color.TRUTH)
+    panel = figure.subplots()
+    figure.subplots_adjust(1.3 / side, 1.3 / side, 1 - 0.2 / side, 1 - 0.2 / side)
+    columns, rows = np.arange(free), np.arange(free)[::-1]
+    scaled = np.stack([_scale(x, r) for x, r in zip(flat.T, ranges, strict=True)])
+    scaled[(scaled < 0) | (scaled > 1)] = np.nan
+    for i in range(free):
+        counts, edges = np.histogram(scaled[i], 20, range=(0, 1))
+        heights = rows[i] + 0.95 * counts / max(counts.max(), 1)
+        panel.stairs(heights, columns[i] + edges, baseline=rows[i], color=style.COLORS[0])
+        for j in range(i):
+            hist2d(
+                columns[j] + scaled[j],
+                rows[i] + scaled[i],
+                ax=panel,
+                range=[(columns[j], columns[j] + 1), (rows[i], rows[i] + 1)],
+                levels=(0.5, 0.9),
+                color=style.COLORS[0],
+                smooth=0.8,
+                plot_density=False,
+                no_fill_contours=True,  # these that fill are opaque
+                fill_contours=True,
+                contourf_kwargs={"colors": ["none", "#AAD0E5", style.COLORS[0]]},
+                data_kwargs={"alpha": 0.3, "ms": 1.2},
+                quiet=True,
+            )
+        if (truth := truths[i]) is not None:
+            at = _scale(truth, ranges[i])
+            panel.vlines(columns[i] + at, 0, rows[i] + 1, color=style.Color.TRUTH)
+            panel.hlines(rows[i] + at, 0, columns[i], color=style.Color.TRUTH)
+    frame: style.Look = {"color": "black", "lw": 0.8}
+    panel.hlines(rows, 0, columns + 1, **frame)
+    panel.vlines(columns, 0, rows + 1, **frame)
+    _label(panel.xaxis, columns, ranges)
+    _label(panel.yaxis, rows[1:], ranges[1:])
+    panel.tick_params(labelsize=11)
+    panel.tick_params("x", labelrotation=90)
+    panel.set(xlim=(0, free), ylim=(0, free))
+    panel.grid(visible=False)
+    panel.spines[:].set_visible(False)
+    center: style.Look = {"ha": "center", "va": "center", "fontsize": 13}
+    for column, row, label in zip(columns, rows, labels, strict=True):
+        panel.text(column + 0.5, -0.75, label, **center)
+        if column:
+            panel.text(-0.75, row + 0.5, label, rotation=90, **center)
     return figure
 
 
-def _inner_ticks(low: float, high: float) -> list[float]:
-    """Return ticks that keep away from the ends, where they would meet the next panel's."""
-    ticks = np.asarray(MaxNLocator(4).tick_values(low, high), dtype=np.float64)
-    return [float(x) for x in ticks if abs(x - (low + high) / 2) < 0.4 * (high - low)]
+def _scale(values: Any, limits: tuple[float, float]) -> Any:
+    """Return where values are within their cell: 0 at its lower limit, 1 at its upper."""
+    low, high = limits
+    return (values - low) / (high - low)
+
+
+def _label(axis: Axis, places: Iterable[int], ranges: Sequence[tuple[float, float]]) -> None:
+    """Label the cells along an axis with their values, away from where they meet."""
+    ticks, texts = [], []
+    for place, (low, high) in zip(places, ranges, strict=True):
+        for value in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high):
+            at = _scale(value, (low, high))
+            if abs(at - 0.5) < 0.4:
+                ticks.append(place + at)
+                texts.append(f"{value:.10g}".replace("-", "\N{MINUS SIGN}"))
+    axis.set_ticks(ticks, texts)
 
 
 def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
-    """Return the range of a parameter's axis: nearly all draws, and the truth."""
+    """Return the limits of a parameter's cell: nearly all draws, and the truth."""
     low, high = np.quantile(draws, [0.001, 0.999])
     if truth is not None:
         low, high = min(low, truth), max(high, truth)
-    margin = 0.05 * (high - low)
+    # Contours, which end half a bin beyond the last draw, stay within the cell.
+    margin = 0.1 * (high - low)
     return float(low - margin), float(high + margin)
 
 
@@ -114,7 +131,6 @@ def draw_trace(result: Result) -> Figure:
     All parameters, and the log density. Ensembles that stay apart or drift have not converged.
     """
     names = [*map(style.axis_label, result.free), "log density (nats)"]
-    figure, panels = style.panel_grid(len(names), 2, 1.5, "step", sharex=True)
     steps = style.starts(result.draws.shape[0], 400)
     series = np.concatenate([result.draws[steps], result.log_density[steps][..., None]], axis=-1)
     series = np.where(np.isfinite(series), series, np.nan)
@@ -126,13 +142,15 @@ def draw_trace(result: Result) -> Figure:
     ]
     low, high = np.stack([*spread, spread[-1]], axis=1)
     ends = np.append(steps, result.draws.shape[0])[cuts]
-    for i, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        panel.set_ylabel(name)
+    limits = [_limits(low[..., i], high[..., i], mean[..., i]) for i in range(len(names))]
+    figure, cells = _columns_of_cells(names, limits, "step")
+    for i, (panel, place) in enumerate(cells):
+        lower, upper, middle = (place + _scale(x[..., i], limits[i]) for x in (low, high, mean))
         for ensemble in range(series.shape[1]):
-            edges = low[:, ensemble, i], high[:, ensemble, i]
-            look = _look(ensemble)
+            edges, look = (lower[:, ensemble], upper[:, ensemble]), _look(ensemble)
             panel.fill_between(ends + 1, *edges, color=look["color"], alpha=0.15, lw=0, step="post")
-            panel.plot(steps + 1, mean[:, ensemble, i], **look)
+            panel.plot(steps + 1, middle[:, ensemble], **look)
+    figure.axes[0].set_ylabel("mean of the walkers, and 90 % of them")
     style.share_legend(figure)
     return figure
 
@@ -140,6 +158,35 @@ def draw_trace(result: Result) -> Figure:
 def _look(ensemble: int) -> style.Look:
     color = style.COLORS[ensemble % len(style.COLORS)]
     return {"color": color, "label": f"ensemble {ensemble + 1}"}
+
+
+def _limits(*drawn: FloatArray) -> tuple[float, float]:
+    """Return the limits of a cell that holds all that is drawn, below its name."""
+    values = np.concatenate([x[np.isfinite(x)] for x in drawn])
+    low, high = (values.min(), values.max()) if values.size else (0.0, 0.0)
+    size = float(high - low) or abs(low) or 1.0
+    return float(low - 0.06 * size), float(high + 0.25 * size)
+
+
+def _columns_of_cells(
+    names: Sequence[str], limits: Sequence[tuple[float, float]], xlabel: str
+) -> tuple[Figure, list[tuple[Axes, int]]]:
+    """Return a figure with named cells in two columns: the panel of each, and its place there.
+
+    A column is one panel, in which the cells, each of height one, have values of their own.
+    """
+    rows = -(-len(names) // 2)
+    figure, (panels,) = style.new_figure(11, 1.4 * rows + 0.9, 1, 2)
+    for side, panel in enumerate(panels):
+        column = slice(side, None, 2)
+        places = range(rows - 1, -1, -1)[: len(names[column])]
+        _label(panel.yaxis, places, limits[column])
+        across = panel.get_yaxis_transform()
+        panel.hlines(places, 0, 1, color="black", lw=0.8, transform=across)
+        for place, name in zip(places, names[column], strict=True):
+            panel.text(0.01, place + 0.96, name, va="top", transform=across)
+        panel.set(xlabel=xlabel, ylim=(0, rows))
+    return figure, [(panels[i % 2], rows - 1 - i // 2) for i in range(len(names))]
 
 
 def draw_ranks(result: Result) -> Figure:
@@ -151,24 +198,24 @@ def draw_ranks(result: Result) -> Figure:
     its half width is 1.96 √((B − 1)(E − 1) τ/n).
     """
     steps, ensembles, walkers, free = result.draws.shape
-    labels = "rank among all draws (%)", "draws per bin\n(expected: 1)"
-    figure, panels = style.panel_grid(free, min(3, free), 1.8, *labels, sharex=True)
     # About 100,000 draws are ranked.
     thinned = result.draws[style.starts(steps, max(100_000 // (ensembles * walkers), 1))]
-    for i, panel in enumerate(panels):
-        panel.set_title(style.axis_label(result.free[i]))
-        panel.margins(y=0.12)
-        panel.axhline(1.0, color=style.Color.EXPECTED, lw=0.8)
-        time = float(np.maximum(result.outcome.check.autocorrelation[i], 1.0))
-        if np.isfinite(time):
-            independent = steps * ensembles * walkers / time
-            reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) / independent)
-            label = "what independent draws show"
-            band = max(1 - reach, 0.0), 1 + reach
-            panel.axhspan(*band, color=style.Color.CHANCE, lw=0, label=label)
-        edges = np.linspace(0, 100, RANK_BINS + 1)
-        for ensemble, heights in enumerate(_rank_heights(thinned[..., i])):
-            panel.stairs(heights, edges, baseline=None, lw=1.2, **_look(ensemble))
+    heights = [_rank_heights(thinned[..., i]) for i in range(free)]
+    time = np.maximum(result.outcome.check.autocorrelation[:free], 1.0)
+    reach = 1.96 * np.sqrt((RANK_BINS - 1) * (ensembles - 1) * time / (steps * ensembles * walkers))
+    bands = np.stack([np.maximum(1 - reach, 0), 1 + reach], axis=1)
+    limits = [_limits(band, x) for band, x in zip(bands, heights, strict=True)]
+    names = [*map(style.axis_label, result.free)]
+    figure, cells = _columns_of_cells(names, limits, "rank among all draws (%)")
+    edges = np.linspace(0, 100, RANK_BINS + 1)
+    for (panel, place), lines, band, limit in zip(cells, heights, bands, limits, strict=True):
+        panel.axhline(place + _scale(1.0, limit), color=style.Color.EXPECTED, lw=0.8)
+        label = "what independent draws show"
+        panel.axhspan(*(place + _scale(band, limit)), color=style.Color.CHANCE, lw=0, label=label)
+        for ensemble, line in enumerate(lines):
+            drawn = place + _scale(line, limit)
+            panel.stairs(drawn, edges, baseline=None, lw=1.2, **_look(ensemble))
+    figure.axes[0].set_ylabel("draws per bin (expected: 1)")
     style.share_legend(figure)
     return figure
 
@@ -178,7 +225,8 @@ def _rank_heights(draws: FloatArray) -> FloatArray:
 
     ``draws`` is (steps, ensembles, walkers); what is not a number has no rank.
     """
-    ranks = (scipy.stats.rankdata(draws) - 0.5).reshape(draws.shape) / draws.size
+    _, order, counts = np.unique(draws, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - counts / 2)[order] / draws.size  # in the middle of equal ones
     edges = np.linspace(0, 1, RANK_BINS + 1)
     counts = [np.histogram(ranks[:, e], edges)[0] for e in range(draws.shape[1])]
     heights: FloatArray = np.asarray(counts) * (RANK_BINS * draws.shape[1] / draws.size)
