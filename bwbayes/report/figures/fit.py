@@ -98,10 +98,10 @@ def _draw_quantiles(panel: Axes, white: FloatArray) -> None:
     size = white.size
     rows = np.arange(size)
     at = rows[(rows < 100) | (rows >= size - 100) | (rows % max(1, size // 600) == 0)]
-    expected = scipy.stats.norm.ppf((at + 0.5) / size)
+    expected = scipy.special.ndtri((at + 0.5) / size)
     # Where each of so many independent ones lies, pointwise, from the beta distribution.
     low, high = (
-        scipy.stats.norm.ppf(scipy.stats.beta.ppf(level, at + 1, size - at))
+        scipy.special.ndtri(scipy.special.betaincinv(at + 1, size - at, level))
         for level in (0.025, 0.975)
     )
     label = "95 % of normal ones"
