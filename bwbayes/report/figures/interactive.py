@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import json
 import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from bokeh.embed import json_item
+from bokeh import __version__, models
+from bokeh.document import Document
 from bokeh.layouts import gridplot, row
-from bokeh.models import BasicTicker, ColumnDataSource, DataRange1d, HoverTool, Model
-from bokeh.models.annotations import BoxAnnotation
-from bokeh.models.renderers import DataRenderer
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
@@ -43,7 +43,9 @@ def draw(result: Result) -> dict[str, Markup]:
 
     ``loop`` and ``bands_NAME`` for each of the result's bands; nothing without convergence.
     """
-    plots: dict[str, Model] = {f"bands_{bands.name}": _series(bands) for bands in result.bands}
+    plots: dict[str, models.Model] = {
+        f"bands_{bands.name}": _series(bands) for bands in result.bands
+    }
     loops = [_loop(bands) for bands in sorted(result.looped, key=lambda b: b.training)]
     if loops:
         # A row goes on below where it is too narrow.
@@ -51,12 +53,15 @@ def draw(result: Result) -> dict[str, Markup]:
     return {name: _page_json(plot, i) for i, (name, plot) in enumerate(plots.items())}
 
 
-def _page_json(plot: Model, number: int) -> Markup:
+def _page_json(plot: models.Model, number: int) -> Markup:
     """Return a plot as JSON that may stand in HTML, and is the same whenever it is drawn.
 
     Bokeh numbers its models on through a process; here they are numbered through the plot.
     """
-    text = json.dumps(json_item(plot))
+    document = Document()
+    document.add_root(plot)
+    item = {"root_id": plot.id, "doc": document.to_json(deferred=False), "version": __version__}
+    text = json.dumps(item)
     names: dict[str, str] = {}
     text = re.sub(
         r'"(p\d+)"', lambda old: f'"{names.setdefault(old[1], f"p{number}-{len(names)}")}"', text
@@ -80,45 +85,63 @@ def _figure(height: int, ylabel: str, **options: Any) -> figure:
     )
     plot.toolbar.logo = None
     for axis in plot.axis:
-        axis.ticker = BasicTicker(desired_num_ticks=5)
+        axis.ticker = models.BasicTicker(desired_num_ticks=5)
         axis.update(axis_label_text_font_style="normal", axis_label_text_font_size=FONT_SIZE)
         axis.update(major_label_text_font_size=FONT_SIZE)
     return plot
 
 
-def _legend(plot: figure, columns: int) -> None:
-    """Put the legend above the plot, where a click hides what it names."""
-    legend = plot.legend[0]
-    legend.update(ncols=columns, click_policy="hide", border_line_color=None, padding=0)
-    legend.update(label_text_font_size=FONT_SIZE, glyph_height=14, spacing=8, margin=4)
+def _add_legend(
+    plot: figure, drawn: Mapping[str, list[models.GlyphRenderer]], columns: int
+) -> None:
+    """Put a legend above the plot, where a click hides what it names."""
+    legend = models.Legend(
+        items=[
+            models.LegendItem(label=name, renderers=renderers) for name, renderers in drawn.items()
+        ],
+        ncols=columns,
+        click_policy="hide",
+        border_line_color=None,
+        padding=0,
+        label_text_font_size=FONT_SIZE,
+        glyph_height=14,
+        spacing=8,
+        margin=4,
+    )
     plot.add_layout(legend, "above")
 
 
-def _series(bands: Bands) -> Model:
+def _series(bands: Bands) -> models.Model:
     """Draw voltage, displacement with its bands, and readings minus mean, over one time."""
     thinned = [style.choose(s, kept(s, bands.time.size)) for s in style.segments(bands)]
-    sources = [ColumnDataSource(_columns(segment, residuals=True)) for segment in thinned]
-    voltage = _figure(130, "voltage (V)", x_range=DataRange1d(range_padding=0.01))
+    sources = [models.ColumnDataSource(_columns(segment, residuals=True)) for segment in thinned]
+    voltage = _figure(130, "voltage (V)", x_range=models.DataRange1d(range_padding=0.01))
     residual = "band − mean (µm)" if bands.measured is None else "measured − mean (µm)"
     displacement, below = (
         _figure(height, label, x_range=voltage.x_range)
         for height, label in ((330, "displacement (µm)"), (230, residual))
     )
     for source in sources:
-        voltage.line("time", "voltage", source=source, color=style.Color.MEASURED)
+        voltage.add_glyph(
+            source, models.Line(x="time", y="voltage", line_color=style.Color.MEASURED)
+        )
     for plot, about in ((displacement, ""), (below, "_residual")):
-        means = [_draw_window(plot, source, about) for source in sources]
-        plot.add_tools(HoverTool(renderers=means, mode="vline", tooltips=_tips(bands)))
+        drawn: defaultdict[str, list[models.GlyphRenderer]] = defaultdict(list)
+        for source in sources:
+            for name, glyph in _glyphs(source, about):
+                drawn[name].append(plot.add_glyph(source, glyph))
+        hover = models.HoverTool(renderers=drawn["mean"], mode="vline", tooltips=_tips(bands))
+        plot.add_tools(hover)
+        if not about:
+            _add_legend(plot, drawn, 2)
         if bands.scored_from:
             left, right = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]].tolist()
             look: style.Look = {"fill_color": style.Color.LEAD_IN, "fill_alpha": 0.35}
-            plot.add_layout(BoxAnnotation(left=left, right=right, **look))
-    _legend(displacement, 2)
-    below.legend.visible = False
+            plot.add_layout(models.BoxAnnotation(left=left, right=right, **look))
     below.xaxis.axis_label = style.time_label(bands.time_offset)
     voltage.xaxis.major_label_text_font_size = "0px"
     displacement.xaxis.major_label_text_font_size = "0px"
-    grid: Model = gridplot(
+    grid: models.Model = gridplot(
         [[voltage], [displacement], [below]],
         sizing_mode="stretch_width",
         toolbar_location="above",
@@ -126,21 +149,23 @@ def _series(bands: Bands) -> Model:
     return grid
 
 
-def _draw_window(plot: figure, source: ColumnDataSource, about: str) -> DataRenderer:
-    """Draw bands, the sensor's with an edge, mean and readings; return the mean's line."""
+def _glyphs(source: models.ColumnDataSource, about: str) -> Iterator[tuple[str, models.Glyph]]:
+    """Yield names and glyphs: bands, the sensor's with an edge, mean and readings."""
     for kind, name in style.BAND_NAMES.items():
-        look: style.Look = {"source": source, "legend_label": name}
-        edges = f"lower_{kind}{about}", f"upper_{kind}{about}"
-        plot.varea("time", *edges, color=style.BAND_COLORS[kind], **look)
+        lower, upper = f"lower_{kind}{about}", f"upper_{kind}{about}"
+        yield name, models.VArea(x="time", y1=lower, y2=upper, fill_color=style.BAND_COLORS[kind])
         if kind == "sensor":
-            for edge in edges:
-                plot.line("time", edge, color=style.Color.EDGE, line_dash="dashed", **look)
-    look = {"source": source, "color": style.Color.MEAN, "legend_label": "mean"}
-    mean = plot.line("time", f"mean{about}", **look)
+            for edge in (lower, upper):
+                look: style.Look = {"line_color": style.Color.EDGE, "line_dash": "dashed"}
+                yield name, models.Line(x="time", y=edge, **look)
+    yield "mean", models.Line(x="time", y=f"mean{about}", line_color=style.Color.MEAN)
     if f"measured{about}" in source.data:
-        look |= {"color": style.Color.MEASURED, "legend_label": "measured"}
-        plot.scatter("time", f"measured{about}", size=2.5, alpha=0.6, **look)
-    return mean
+        yield "measured", _dots("time", f"measured{about}", size=3.5, alpha=0.6)
+
+
+def _dots(x: str, y: str, size: float, alpha: float) -> models.Scatter:
+    color = style.Color.MEASURED
+    return models.Scatter(x=x, y=y, size=size, fill_color=color, fill_alpha=alpha, line_color=None)
 
 
 def _tips(bands: Bands) -> str:
@@ -198,32 +223,28 @@ def _loop(bands: Bands) -> figure:
     )
     # A quarter of the points that the picture has.
     paths = [path(segment, density=75) for segment in style.segments(bands)]
+    drawn: defaultdict[str, list[models.GlyphRenderer]] = defaultdict(list)
     for kind in LOOP_KINDS:
         corners = [c.astype(np.float32) for along in paths for c in polygons(along, kind)]
-        source = ColumnDataSource(
+        source = models.ColumnDataSource(
             {"x": [c[:, 0] for c in corners], "y": [c[:, 1] for c in corners]}
         )
-        look: style.Look = {
-            "color": style.BAND_COLORS[kind],
-            "legend_label": style.BAND_NAMES[kind],
-        }
-        plot.patches("x", "y", source=source, **look)
+        color = style.BAND_COLORS[kind]
+        patches = models.Patches(xs="x", ys="y", fill_color=color, line_color=color)
+        drawn[style.BAND_NAMES[kind]].append(plot.add_glyph(source, patches))
     if bands.measured is not None:
         read = kept(bands, bands.time.size)
-        x, y = (values[read].astype(np.float32) for values in (bands.voltage, bands.measured))
-        look = {"color": style.Color.MEASURED, "legend_label": "measured"}
-        plot.scatter(x, y, size=2, alpha=0.4, **look)
-    means: list[DataRenderer] = [
-        plot.line(
-            "voltage",
-            "mean",
-            source=ColumnDataSource(_columns(along, residuals=False)),
-            color=style.Color.MEAN,
-            line_width=1.5,
-            legend_label="mean",
+        columns = {"voltage": bands.voltage, "measured": bands.measured}
+        source = models.ColumnDataSource(
+            {n: x[read].astype(np.float32) for n, x in columns.items()}
         )
-        for along in paths
-    ]
-    plot.add_tools(HoverTool(renderers=means, line_policy="nearest", tooltips=_tips(bands)))
-    _legend(plot, 1)
+        dots = _dots("voltage", "measured", size=3, alpha=0.4)
+        drawn["measured"].append(plot.add_glyph(source, dots))
+    for along in paths:
+        line = models.Line(x="voltage", y="mean", line_color=style.Color.MEAN, line_width=1.5)
+        source = models.ColumnDataSource(_columns(along, residuals=False))
+        drawn["mean"].append(plot.add_glyph(source, line))
+    hover = models.HoverTool(renderers=drawn["mean"], line_policy="nearest", tooltips=_tips(bands))
+    plot.add_tools(hover)
+    _add_legend(plot, drawn, 1)
     return plot
