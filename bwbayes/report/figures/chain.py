@@ -60,19 +60,21 @@ def draw_corner(result: Result) -> Figure:
         heights = rows[i] + 0.95 * counts / max(counts.max(), 1)
         panel.stairs(heights, columns[i] + edges, baseline=rows[i], color=style.COLORS[0])
         for j in range(i):
+            x, y = columns[j] + scaled[j], rows[i] + scaled[i]
+            panel.plot(x, y, ",", color=style.COLORS[0], alpha=0.4, zorder=0.5)
             hist2d(
-                columns[j] + scaled[j],
-                rows[i] + scaled[i],
+                x,
+                y,
                 ax=panel,
                 range=[(columns[j], columns[j] + 1), (rows[i], rows[i] + 1)],
                 levels=(0.5, 0.9),
                 color=style.COLORS[0],
                 smooth=0.8,
                 plot_density=False,
-                no_fill_contours=True,  # these that fill are opaque
+                plot_datapoints=False,
+                no_fill_contours=True,  # those with a color of their own hide the points as well
                 fill_contours=True,
                 contourf_kwargs={"colors": ["none", "#AAD0E5", style.COLORS[0]]},
-                data_kwargs={"alpha": 0.3, "ms": 1.2},
                 quiet=True,
             )
         if (truth := truths[i]) is not None:

@@ -34,7 +34,7 @@ def draw_command(
 
     ``reference`` (samples,), um, is what was asked for; ``limit``, um, that of the error.
     """
-    figure, panels = style.new_figure(10, 6.5, 3, sharex=True, height_ratios=(1, 2, 2))
+    figure, panels = style.new_figure(10, 6.5, 3, gap=0.15, sharex=True, height_ratios=(1, 2, 2))
     top, center, below = panels[:, 0]
     time = commands["compensated"].bands.time
     style.draw_ribbons(center, commands["compensated"].bands, kinds=("displacement", "parameter"))
@@ -137,6 +137,7 @@ def draw_promises(
     panel.scatter(percent, rows, color=colors, s=28, zorder=3)
     panel.axvline(100, color="#222222", lw=1, ls=":")
     panel.set_yticks(rows, [style.plain(name) for name in names])
+    figure.set_layout_engine("constrained")
     panel.invert_yaxis()
     panel.set(xlim=(0, 104), xlabel=style.plain(f"{label} (%)"))
     return figure

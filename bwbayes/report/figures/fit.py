@@ -161,27 +161,31 @@ def _draw_drive(panel: Axes, innovations: Innovations) -> None:
         panel.errorbar(list(ticks), values, 1.96 * error, **look)
         panel.axhline(right, color=color, lw=0.8, ls=":")
     panel.set_xticks(list(ticks), list(ticks.values()))
+    panel.set_xlim(-0.7, start - 0.8)
     low, high = panel.get_ylim()
     panel.set_ylim(min(low, -0.3), max(high, 1.3) + 0.15 * (high - low))
     panel.set_title("Size by input voltage")
     panel.legend(loc="center right")
 
 
-def draw_spectrum(innovations: Innovations) -> Figure:
-    """Draw the amplitude spectral density of the residual and of the noise model."""
-    frequency, density = innovations.residual_density()
+def draw_spectrum(residual: tuple[FloatArray, FloatArray], noise: FloatArray) -> Figure:
+    """Draw the amplitude spectral density of the residual and of the noise model, um/√Hz.
+
+    ``residual`` are its frequencies, Hz, and its density, ``noise`` is the model's density there.
+    """
+    frequency, density = residual
     figure, ((panel,),) = style.new_figure(11, 4.2)
     panel.loglog(frequency, density, color=style.Color.MEASURED, lw=0.9, label="residual")
-    model = innovations.noise_density(frequency)
-    panel.loglog(frequency, model, color=style.Color.MEAN, lw=1.5, label="noise model")
+    panel.loglog(frequency, noise, color=style.Color.MEAN, lw=1.5, label="noise model")
     panel.set(xlabel="frequency (Hz)", ylabel="amplitude density (µm/√Hz)")
-    figure.legend(loc="outside right upper")
+    panel.legend(loc="upper right")
     return figure
 
 
 def draw_agreement(agreements: Mapping[str, Agreement]) -> Figure:
     """Draw each record's residuals, along time, in the joint fit and in a fit of its own."""
-    figure, panels = style.new_figure(11, 0.9 + 1.9 * len(agreements), len(agreements))
+    count = len(agreements)
+    figure, panels = style.new_figure(11, 0.9 + 1.9 * count, count, gap=0.5)
     for (panel,), (name, agreement) in zip(panels, agreements.items(), strict=True):
         for values, color, label in (
             (agreement.joint, style.COLORS[0], f"joint fit: {agreement.joint_um:.3g} µm rms"),

@@ -31,9 +31,13 @@ def pictures(result: Result) -> Pictures:
             "coverage": (result.scores and result.bands, result.scores),
         }
         several = len(result.innovations) > 1
-        for kind in ("innovations", "spectrum"):
-            for name, innovations in result.innovations.items():
-                shown[f"{kind}_{name}" if several else kind] = (innovations,)
+        for name, innovations in result.innovations.items():
+            shown[f"innovations_{name}" if several else "innovations"] = (innovations,)
+        for name, innovations in result.innovations.items():
+            # Taken here: whoever draws need not load what takes them.
+            residual = innovations.residual_density()
+            noise = innovations.noise_density(residual[0])
+            shown[f"spectrum_{name}" if several else "spectrum"] = residual, noise
         shown["corner"] = (result,)
     shown |= {"trace": (result,), "ranks": (result,)}
     known: Pictures = {}

@@ -53,7 +53,7 @@ def record_pictures(
 
 def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Finding]) -> Figure:
     read = record.displacement is not None
-    figure, grid = style.new_figure(11, 5.6 if read else 3.2, 1 + read, sharex=True)
+    figure, grid = style.new_figure(11, 5.6 if read else 3.2, 1 + read, gap=0.15, sharex=True)
     panels = grid[:, 0]
     panels[0].plot(*style.zigzag(record.time, record.voltage), color=style.COLORS[0], lw=0.9)
     panels[0].set_ylabel("voltage (V)")
@@ -106,6 +106,7 @@ def _draw_loop(record: Record) -> Figure:
     look: style.Look = {"s": 2.0, "lw": 0, "cmap": "viridis", "rasterized": True}
     dots = panel.scatter(voltage, displacement, c=record.time[rows], **look)
     figure.colorbar(dots, label="time (s)")
+    figure.set_layout_engine("constrained")
     panel.set(xlabel="voltage (V)", ylabel="displacement (µm)")
     return figure
 

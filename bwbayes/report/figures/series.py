@@ -26,7 +26,7 @@ def draw_bands(bands: Bands) -> Figure:
     the largest displacement, if nothing was measured), where the bands can be told apart.
     """
     figure, axes = style.new_figure(
-        11, 7.4, 3, 2, sharex="col", width_ratios=(2, 1), height_ratios=(1, 2, 2)
+        11, 7.4, 3, 2, 0.15, sharex="col", width_ratios=(2, 1), height_ratios=(1, 2, 2)
     )
     zoom = _around_largest_error(bands)
     for column, shown in zip(axes.T, (bands, bands.within([zoom])), strict=True):

@@ -74,6 +74,7 @@ def draw_coverage(calibration: Calibration) -> Figure:
         covered = [100 * ranks.covered[level] for ranks in calibration.statistics.values()]
         intervals.plot(covered, range(len(labels)), "o", color=color, ms=4.5, label=f"{level} %")
     intervals.set_yticks(range(len(labels)), labels)
+    figure.set_layout_engine("constrained")
     intervals.invert_yaxis()
     intervals.set_xlabel("truths inside the interval (%)")
     intervals.set_title("posterior intervals (shaded: 99 % binomial limits)")
@@ -127,6 +128,7 @@ def draw_parameters(
         for name, estimate in estimates.items()
     }
     figure, panels = style.panel_grid(len(units), 3, 2.6, "record")
+    figure.set_layout_engine("constrained")
     for panel, (name, unit) in zip(panels, units.items(), strict=True):
         if name in new:
             low, median, high = np.quantile(new[name], [0.025, 0.5, 0.975])

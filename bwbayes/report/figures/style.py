@@ -146,13 +146,25 @@ def zigzag(
 
 
 def new_figure(
-    width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
+    width: float, height: float, rows: int = 1, columns: int = 1, gap: float = 0.8, **options: Any
 ) -> tuple[Figure, Any]:
-    """Return a figure, inches, and its panels (rows, columns); ``options`` are of ``subplots``."""
+    """Return a figure, inches, and its panels (rows, columns); ``options`` are of ``subplots``.
+
+    Margins are fixed, with ``gap`` inches between the rows: to measure all labels takes as long as
+    to draw them. Where labels may be long the figure's layout should be constrained.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415  # pages need words alone
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+    figure = Figure(figsize=(width, height))
+    panels = figure.subplots(rows, columns, squeeze=False, **options)
+    left, right, bottom, top = 0.85, width - 0.15, 0.55, height - 0.3
+    figure.subplots_adjust(left / width, bottom / height, right / width, top / height)
+    # Between panels, as a part of the size of one.
+    figure.subplots_adjust(
+        wspace=0.8 * columns / (right - left - 0.8 * (columns - 1)),
+        hspace=gap * rows / (top - bottom - gap * (rows - 1)),
+    )
+    return figure, panels
 
 
 def panel_grid(
@@ -163,7 +175,7 @@ def panel_grid(
     The lowest panel of each column has the x label, the first of each row the y label.
     """
     rows = -(-count // columns)
-    figure, grid = new_figure(11, height * rows + 0.6, rows, columns, **options)
+    figure, grid = new_figure(11, height * rows + 0.6, rows, columns, 0.35, **options)
     panels: list[Axes] = list(grid.flat)
     for i, panel in enumerate(panels):
         panel.set_visible(i < count)
@@ -206,4 +218,6 @@ def share_legend(figure: Figure, ncols: int = 8, band: str = "") -> None:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
-        figure.legend(handles.values(), handles, loc="outside upper center", ncols=ncols)
+        figure.legend(handles.values(), handles, loc="upper center", ncols=ncols)
+        height = 0.2 * -(-len(handles) // ncols)
+        figure.subplots_adjust(top=figure.subplotpars.top - height / figure.get_figheight())
