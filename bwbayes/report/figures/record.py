@@ -105,8 +105,8 @@ def _draw_loop(record: Record) -> Figure:
     figure, ((panel,),) = style.new_figure(6.4, 5.2)
     look: style.Look = {"s": 2.0, "lw": 0, "cmap": "viridis", "rasterized": True}
     dots = panel.scatter(voltage, displacement, c=record.time[rows], **look)
-    figure.colorbar(dots, label="time (s)")
     figure.set_layout_engine("constrained")
+    figure.colorbar(dots, label="time (s)")
     panel.set(xlabel="voltage (V)", ylabel="displacement (µm)")
     return figure
 
