@@ -19,7 +19,7 @@ from bokeh.models import ColumnDataSource
 from hypothesis import given, settings
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from bwbayes.app.running.figure_worker import Artist, artist_of
@@ -133,7 +133,8 @@ def test_one_parameter_and_bands_at_rest_without_a_measurement_can_be_drawn() ->
     (corner,) = figures["corner"].axes
     assert ["$d$ (µm/V)"] == names(corner)
     lines = [drawn for drawn in corner.collections if isinstance(drawn, LineCollection)]
-    (truth, *_) = (line for line in lines if Color.TRUTH == to_hex(line.get_color()[0]).upper())
+    truth_color = [*to_rgba(Color.TRUTH)]
+    (truth, *_) = [line for line in lines if np.asarray(line.get_color()).tolist() == [truth_color]]
     assert 0 < truth.get_segments()[0][0, 0] < 1
 
 

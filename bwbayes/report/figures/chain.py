@@ -227,8 +227,8 @@ def _rank_heights(draws: FloatArray) -> FloatArray:
 
     ``draws`` is (steps, ensembles, walkers); what is not a number has no rank.
     """
-    _, order, counts = np.unique(draws, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(counts) - counts / 2)[order] / draws.size  # in the middle of equal ones
+    _, order, equal = np.unique(draws, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(equal) - equal / 2)[order] / draws.size
     edges = np.linspace(0, 1, RANK_BINS + 1)
     counts = [np.histogram(ranks[:, e], edges)[0] for e in range(draws.shape[1])]
     heights: FloatArray = np.asarray(counts) * (RANK_BINS * draws.shape[1] / draws.size)

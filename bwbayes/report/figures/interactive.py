@@ -18,6 +18,9 @@ import numpy as np
 from bokeh import __version__, models
 from bokeh.document import Document
 from bokeh.layouts import gridplot, row
+from bokeh.models.annotations import BoxAnnotation, Legend, LegendItem
+from bokeh.models.glyph import Glyph
+from bokeh.models.renderers import GlyphRenderer
 from bokeh.plotting import figure
 from bokeh.resources import INLINE
 from markupsafe import Markup
@@ -92,22 +95,13 @@ def _figure(height: int, ylabel: str, **options: Any) -> figure:
 
 
 def _add_legend(
-    plot: figure, drawn: Mapping[str, list[models.GlyphRenderer]], columns: int
+    plot: figure, drawn: Mapping[str, list[GlyphRenderer[Glyph]]], columns: int
 ) -> None:
     """Put a legend above the plot, where a click hides what it names."""
-    legend = models.Legend(
-        items=[
-            models.LegendItem(label=name, renderers=renderers) for name, renderers in drawn.items()
-        ],
-        ncols=columns,
-        click_policy="hide",
-        border_line_color=None,
-        padding=0,
-        label_text_font_size=FONT_SIZE,
-        glyph_height=14,
-        spacing=8,
-        margin=4,
-    )
+    legend = Legend()
+    legend.update(items=[LegendItem(label=n, renderers=shown) for n, shown in drawn.items()])
+    legend.update(ncols=columns, click_policy="hide", border_line_color=None, padding=0)
+    legend.update(label_text_font_size=FONT_SIZE, glyph_height=14, spacing=8, margin=4)
     plot.add_layout(legend, "above")
 
 
@@ -126,18 +120,18 @@ def _series(bands: Bands) -> models.Model:
             source, models.Line(x="time", y="voltage", line_color=style.Color.MEASURED)
         )
     for plot, about in ((displacement, ""), (below, "_residual")):
-        drawn: defaultdict[str, list[models.GlyphRenderer]] = defaultdict(list)
+        drawn: defaultdict[str, list[GlyphRenderer[Glyph]]] = defaultdict(list)
         for source in sources:
             for name, glyph in _glyphs(source, about):
                 drawn[name].append(plot.add_glyph(source, glyph))
-        hover = models.HoverTool(renderers=drawn["mean"], mode="vline", tooltips=_tips(bands))
+        hover = models.HoverTool(renderers=[*drawn["mean"]], mode="vline", tooltips=_tips(bands))
         plot.add_tools(hover)
         if not about:
             _add_legend(plot, drawn, 2)
         if bands.scored_from:
             left, right = bands.time[[0, min(bands.scored_from, bands.time.size - 1)]].tolist()
             look: style.Look = {"fill_color": style.Color.LEAD_IN, "fill_alpha": 0.35}
-            plot.add_layout(models.BoxAnnotation(left=left, right=right, **look))
+            plot.add_layout(BoxAnnotation(left=left, right=right, **look))
     below.xaxis.axis_label = style.time_label(bands.time_offset)
     voltage.xaxis.major_label_text_font_size = "0px"
     displacement.xaxis.major_label_text_font_size = "0px"
@@ -149,7 +143,7 @@ def _series(bands: Bands) -> models.Model:
     return grid
 
 
-def _glyphs(source: models.ColumnDataSource, about: str) -> Iterator[tuple[str, models.Glyph]]:
+def _glyphs(source: models.ColumnDataSource, about: str) -> Iterator[tuple[str, Glyph]]:
     """Yield names and glyphs: bands, the sensor's with an edge, mean and readings."""
     for kind, name in style.BAND_NAMES.items():
         lower, upper = f"lower_{kind}{about}", f"upper_{kind}{about}"
@@ -223,7 +217,7 @@ def _loop(bands: Bands) -> figure:
     )
     # A quarter of the points that the picture has.
     paths = [path(segment, density=75) for segment in style.segments(bands)]
-    drawn: defaultdict[str, list[models.GlyphRenderer]] = defaultdict(list)
+    drawn: defaultdict[str, list[GlyphRenderer[Glyph]]] = defaultdict(list)
     for kind in LOOP_KINDS:
         corners = [c.astype(np.float32) for along in paths for c in polygons(along, kind)]
         source = models.ColumnDataSource(
@@ -244,7 +238,9 @@ def _loop(bands: Bands) -> figure:
         line = models.Line(x="voltage", y="mean", line_color=style.Color.MEAN, line_width=1.5)
         source = models.ColumnDataSource(_columns(along, residuals=False))
         drawn["mean"].append(plot.add_glyph(source, line))
-    hover = models.HoverTool(renderers=drawn["mean"], line_policy="nearest", tooltips=_tips(bands))
+    hover = models.HoverTool(
+        renderers=[*drawn["mean"]], line_policy="nearest", tooltips=_tips(bands)
+    )
     plot.add_tools(hover)
     _add_legend(plot, drawn, 1)
     return plot

@@ -146,6 +146,6 @@ PICTURES = {
         "Ranks",
         "How the ranks of each ensemble's draws among all draws are spread. Each line should stay "
         "near one, mostly inside the gray stripe that independent draws would fill.",
-        "Histograms of ranks, one line for each ensemble and a panel for each parameter",
+        "Histograms of each parameter's ranks, one line for each ensemble",
     ),
 }
