@@ -20,6 +20,19 @@ from bwbayes.report.result import Result
 
 RANK_BINS = 20
 
+# How corner draws a pair: contours whose fillings are opaque, and so hide the draws below them.
+CONTOURS: style.Look = {
+    "levels": (0.5, 0.9),
+    "color": style.COLORS[0],
+    "contourf_kwargs": {"colors": ["none", "#AAD0E5", style.COLORS[0]]},
+    "smooth": 0.8,
+    "plot_density": False,
+    "plot_datapoints": False,
+    "fill_contours": True,
+    "no_fill_contours": True,
+    "quiet": True,
+}
+
 
 def pair_contours() -> Callable[..., None]:
     """Load corner's ``hist2d`` alone: the package loads all of arviz, which no picture needs."""
@@ -61,27 +74,14 @@ def draw_corner(result: Result) -> Figure:
         panel.stairs(heights, columns[i] + edges, baseline=rows[i], color=style.COLORS[0])
         for j in range(i):
             x, y = columns[j] + scaled[j], rows[i] + scaled[i]
-            panel.plot(x, y, ",", color=style.COLORS[0], alpha=0.4, zorder=0.5)
-            hist2d(
-                x,
-                y,
-                ax=panel,
-                range=[(columns[j], columns[j] + 1), (rows[i], rows[i] + 1)],
-                levels=(0.5, 0.9),
-                color=style.COLORS[0],
-                smooth=0.8,
-                plot_density=False,
-                plot_datapoints=False,
-                no_fill_contours=True,  # those with a color of their own hide the points as well
-                fill_contours=True,
-                contourf_kwargs={"colors": ["none", "#AAD0E5", style.COLORS[0]]},
-                quiet=True,
-            )
+            panel.plot(x, y, ",", color=style.COLORS[0], zorder=0.5)
+            cell = [(columns[j], columns[j] + 1), (rows[i], rows[i] + 1)]
+            hist2d(x, y, ax=panel, range=cell, **CONTOURS)
         if (truth := truths[i]) is not None:
             at = _scale(truth, ranges[i])
             panel.vlines(columns[i] + at, 0, rows[i] + 1, color=style.Color.TRUTH)
             panel.hlines(rows[i] + at, 0, columns[i], color=style.Color.TRUTH)
-    frame: style.Look = {"color": "black", "lw": 0.8}
+    frame: style.Look = {"color": "black", "lw": 0.8, "clip_on": False}
     panel.hlines(rows, 0, columns + 1, **frame)
     panel.vlines(columns, 0, rows + 1, **frame)
     _label(panel.xaxis, columns, ranges)
