@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -110,27 +110,45 @@ def compensated(of: Problem, asked: Reference, flat: FloatArray, **options: Any)
 
 
 def promised(
-    of: Problem, command: Compensation, truths: FloatArray, source: np.random.Generator
+    of: Problem,
+    command: Compensation,
+    truths: FloatArray,
+    source: np.random.Generator,
+    before: Callable[[], FloatArray] = lambda: np.empty(0),
+    judged: slice = slice(None),
 ) -> dict[tuple[str, int], float]:
     """Return the part of truths (truths, free) whose errors are where the command says.
 
-    Each plays the command by a DAC, which holds it.
+    Each plays the command by a DAC, which holds it, after another voltage, and has a sample at
+    which it is judged.
     """
     record = of.posterior.only
     theta = of.posterior.prior.theta(truths)
     actuator = replace(record.actuator, interval=command.reference.interval, hold="zero")
-    model = actuator.displacement(record.table.actuator(theta), command.voltage, from_rest=True)
-    # Displacements count from where the actuator stands at zero volts, where it begins.
-    model -= model[:, :1]
     noise = record.noise.at(command.reference.interval)
+    samples = np.arange(command.voltage.size)[judged]
     held: dict[tuple[str, int], list[float]] = {}
-    for row, one in enumerate(model):
-        truth = one + noise.draw(record.table.noise(theta[row : row + 1]), one.size, source)[0]
+    for row in theta[:, np.newaxis]:
+        lead = before()
+        voltage = np.concatenate([lead, command.voltage])
+        moved = actuator.displacement(record.table.actuator(row), voltage, from_rest=True)[0]
+        # Displacements count from where the actuator stands at zero volts, where it begins.
+        moved = moved[lead.size :] - moved[lead.size]
+        truth = moved + noise.draw(record.table.noise(row), moved.size, source)[0]
         # One sample of each truth: its samples are not independent.
-        at = np.array([source.integers(one.size)])
-        for key, part in inside(command, truth, at).items():
+        for key, part in inside(command, truth, source.choice(samples, 1)).items():
             held.setdefault(key, []).append(part)
     return {key: float(np.mean(values)) for key, values in held.items()}
+
+
+def played(
+    asked: Reference, voltage: FloatArray, discrepancy: Any = "none", seed: int = 1
+) -> FloatArray:
+    """Return the true displacement (samples,) of the stand that holds a command, um."""
+    stand = VirtualTestStand(discrepancy, 1 / asked.interval)
+    truth = stand.run(voltage, np.random.default_rng(seed)).truth
+    assert truth is not None
+    return truth
 
 
 def inside(

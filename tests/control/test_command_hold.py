@@ -16,10 +16,8 @@ import pytest
 
 from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem
-from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference, shaped
 from bwbayes.model.linear import Hold
-from bwbayes.record.teststand import VirtualTestStand
 from tests.control.commands import (
     about,
     compensated,
@@ -29,6 +27,7 @@ from tests.control.commands import (
     inside,
     measured_voltage,
     off,
+    played,
     problem,
     promised,
     study,
@@ -45,14 +44,6 @@ def measured() -> Problem:
 @pytest.fixture(scope="module")
 def asked() -> Reference:
     return shaped("triangle", 1 / RATE, 40.0, 2.0)
-
-
-def played(asked: Reference, voltage: FloatArray) -> FloatArray:
-    """Return the displacement of the stand without discrepancy that holds a command, um."""
-    stand = VirtualTestStand("none", 1 / asked.interval)
-    truth = stand.run(voltage, np.random.default_rng(1)).truth
-    assert truth is not None
-    return truth
 
 
 @pytest.mark.parametrize("fitted", ["command", "output"])

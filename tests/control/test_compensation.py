@@ -10,22 +10,19 @@ twin is in ``test_command_hold.py``.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.prediction.bands import LEVELS
-from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import signal
 from tests.control.commands import (
     about,
@@ -33,6 +30,7 @@ from tests.control.commands import (
     drawn,
     inside,
     off,
+    played,
     problem,
     promised,
     rms,
@@ -44,14 +42,6 @@ from tests.control.commands import (
 PER_VOLT, SMOOTH = 0.45, 0.01
 
 PAPER = ("identification", "verification", "step10", "step50", "step100")
-
-
-def reached(asked: Reference, voltage: FloatArray, discrepancy: Any, seed: int) -> FloatArray:
-    """Run the stand, and return the tracking error of the true displacement, (samples,), um."""
-    stand = VirtualTestStand(discrepancy, 1 / asked.interval)
-    truth = stand.run(voltage, np.random.default_rng(seed)).truth
-    assert truth is not None
-    return np.asarray(truth - np.asarray(asked.displacement))
 
 
 def references(interval: float) -> dict[str, Reference]:
@@ -74,8 +64,11 @@ def test_errors_are_ten_times_smaller_on_the_stand_with_the_right_model() -> Non
     smaller = {}
     for name, asked in references(1e-3).items():
         command = compensated(of, asked, flat)
-        after = rms(reached(asked, command.voltage, "none", 1))
-        smaller[name] = rms(reached(asked, command.linear.voltage, "none", 1)) / after
+        after, before = (
+            rms(played(asked, one.voltage) - np.asarray(asked.displacement))
+            for one in (command, command.linear)
+        )
+        smaller[name] = before / after
     assert min(smaller.values()) > 10.0, smaller
 
 
@@ -101,33 +94,6 @@ def test_truths_are_where_the_command_says(asked: Reference) -> None:
     assert max(abs(value) for value in result.values()) < 4.0, result
 
 
-def covered_early(of: Problem, command: Compensation, truths: FloatArray) -> dict[Any, float]:
-    """Return the part of truths (truths, free) that bands hold in the first swing of a command.
-
-    Each is an actuator that ran before, and was stopped anywhere. Before that swing all of them
-    are where they stand, and after it they have forgotten how they came there.
-    """
-    record, source = of.posterior.only, np.random.default_rng(11)
-    theta = of.posterior.prior.theta(truths)
-    actuator = replace(record.actuator, interval=command.reference.interval)
-    bands = command.compensated.bands
-    held: dict[tuple[str, int], list[float]] = {}
-    for row in range(len(theta)):
-        before = running(float(command.voltage[0]), source, actuator.interval)
-        model = record.table.actuator(theta[row : row + 1])
-        whole = actuator.displacement(
-            model, np.concatenate([before, command.voltage]), from_rest=True
-        )[0, before.size :]
-        whole = whole - whole[0]
-        noise = record.noise.at(actuator.interval)
-        truth = whole + noise.draw(record.table.noise(theta[row : row + 1]), whole.size, source)[0]
-        at = int(source.integers(whole.size // 9, whole.size // 3))
-        for level in LEVELS:
-            low, high = (edge["displacement", level] for edge in (bands.lower, bands.upper))
-            held.setdefault(("early", level), []).append(low[at] <= truth[at] <= high[at])
-    return {key: float(np.mean(values)) for key, values in held.items()}
-
-
 def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: Reference) -> None:
     """The twin, which takes them to be demagnetized, is found."""
     of, source = problem(), np.random.default_rng(3)
@@ -135,13 +101,18 @@ def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: R
     flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
     truths[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
 
-    def anywhere(**options: Any) -> dict[Any, float]:
-        return off(covered_early(of, compensated(of, asked, flat, **options), truths), 400)
+    # Before the first swing all are where they stand, after it they have forgotten how they came.
+    samples = asked.time.size
+    swing, moved = slice(samples // 9, samples // 3), np.random.default_rng(11)
 
-    result = anywhere(from_rest=False)
-    assert max(abs(value) for value in result.values()) < 4.0, result
-    sure = anywhere(from_rest=True)
-    assert sure["early", 95] < -4.0, sure
+    def anywhere(**options: Any) -> list[float]:
+        command = compensated(of, asked, flat, **options)
+        before = partial(running, float(command.voltage[0]), moved, asked.interval)
+        result = off(promised(of, command, truths, moved, before, swing), 400)
+        return [result["band", level] for level in LEVELS]
+
+    assert max(map(abs, anywhere(from_rest=False))) < 4.0
+    assert anywhere(from_rest=True)[-1] < -4.0
 
 
 def test_the_expected_command_errs_less_over_the_draws_than_the_mean_one(asked: Reference) -> None:
@@ -233,8 +204,7 @@ def test_forty_seeds_of_the_stand_are_where_their_commands_say() -> None:
         of = problem.__wrapped__("process", 1000.0, seed)
         asked = shaped("triangle", 1e-3, 40.0, 0.5, periods=8)
         command = compensated(of, asked, drawn(of))
-        error = reached(asked, command.voltage, "process", 10_000 + seed)
-        return inside(command, error + np.asarray(asked.displacement))
+        return inside(command, played(asked, command.voltage, "process", 10_000 + seed))
 
     figures = study("compensation", map(part, range(40)))
     assert max(abs(error) for _, error in figures.values()) < 3.0, figures
