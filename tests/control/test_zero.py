@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,13 @@ from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.control.compensation import compensate
-from bwbayes.control.exported import exported
 from bwbayes.control.references import Reference, shaped
-from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import VirtualTestStand
-from tests.control import cases
 from tests.control.commands import compensated, fit_of
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -36,6 +31,7 @@ TIME = INTERVAL * np.arange(400)
 VALUES = {
     "d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "quadratic": 1.5, "lag": 3.8e-3,
     "offset": OFFSET, "sensor_sd": 0.1, "discrepancy_sd": 1e-6, "discrepancy_time": 0.5,
+    "creep_1": 0.012, "creep_2": 0.009,
 }  # fmt: skip
 
 
@@ -48,7 +44,8 @@ def problem(**keys: Any) -> Problem:
 
 
 def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -> None:
-    of = problem(gain=["quadratic"])
+    """With a gain about another voltage, and creep; what C makes counts from zero volts as well."""
+    of = problem(gain=["quadratic"], creep=[0.1, 1.0])
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
     asked = shaped("sine", INTERVAL, 10.0, 2.0, middle=15.0)
     command = compensated(of, asked, flat, from_rest=True).voltage
@@ -68,6 +65,12 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
 
     compiled = Compiled(model, tmp_path, needs("cc"))
     np.testing.assert_allclose(compiled.run("inverse", 0.0, reference), command[:-1], atol=1e-6)
+    assert model.model.displacement(model.model.begin(np.zeros(1))) == pytest.approx(0.0, abs=1e-12)
+    theta = of.posterior.only.table.actuator(of.posterior.prior.theta(at_zero[:1]))
+    moved = model.model.actuator.displacement(theta, command, from_rest=True)[0]
+    assert abs(moved[0]) > 0.1
+    got = compiled.run("forward", 0.0, command)
+    np.testing.assert_allclose(got, moved - moved[0], atol=1e-10)
 
 
 @pytest.mark.parametrize("from_rest", [True, False])
@@ -91,24 +94,6 @@ def test_a_command_begins_where_the_actuator_is(hysteresis: str, from_rest: bool
             spread = 6 * flat[:, of.posterior.names.index("discrepancy_sd")].max()
             edges = [played.bands.lower[kind, 95][0], played.bands.upper[kind, 95][0]]
             np.testing.assert_allclose(edges, 0.0, atol=1e-6 if kind == "parameter" else spread)
-
-
-@pytest.mark.parametrize("name", ["bouc-wen with all", "maxwell-slip with all"])
-def test_a_sampled_model_stands_at_zero_at_zero_volts(name: str, tmp_path: Path) -> None:
-    """Also with a gain about another voltage, and creep."""
-    gain = PolynomialGain(("quadratic", "cubic"), Span(0.0, 80.0))
-    actuator = replace(cases.actuator(name, "zero"), gain=gain)
-    theta = cases.theta(actuator, 1, name)
-    model = SampledModel.of(actuator, theta)
-    begun = model.begin(np.zeros(1))
-    assert model.displacement(begun) == pytest.approx(0.0, abs=1e-12)
-    voltage = cases.drive(300)
-    voltage[0] = 0.0
-    expected = actuator.displacement(theta, voltage, from_rest=True)[0]
-    assert abs(expected[0]) > 0.1
-    compiled = Compiled(exported(name, actuator, theta[0], cases.SPAN), tmp_path, needs("cc"))
-    displacement = compiled.run("forward", 0.0, voltage)
-    np.testing.assert_allclose(displacement, expected - expected[0], atol=1e-10)
 
 
 def test_a_reference_that_begins_elsewhere_gets_a_way_from_zero() -> None:
