@@ -186,12 +186,6 @@ def test_columns_are_recognized_by_word_or_unit(
         assert_same(Record.from_pandas(frame, units=units))
 
 
-def test_what_two_columns_may_be_is_left_open() -> None:
-    frame = pd.DataFrame(np.ones((20, 5)), columns=["t_s", "a_V", "b_V", "c_um", "d_um"])
-    with pytest.raises(InputError, match=r"which column is the voltage\? There are 20 values each"):
-        Record.from_pandas(frame)
-
-
 # Arrays and tables
 
 

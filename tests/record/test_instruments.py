@@ -129,14 +129,6 @@ def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> Non
         read_record(path)
 
 
-def test_every_series_of_a_struct_is_listed_with_its_range(tmp_path: Path) -> None:
-    path = INSTRUMENTS["MATLAB struct of two axes"](tmp_path).path
-    with pytest.raises(InputError) as caught:
-        read_record(path)
-    for text in ("600 values each: 'log.time' (0 to 2.995)", "'log.Ux' (", "'log.y' ("):
-        assert text in str(caught.value)
-
-
 def test_tdms_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = INSTRUMENTS["TDMS waveforms"](tmp_path).path
     monkeypatch.setitem(__import__("sys").modules, "nptdms", None)

@@ -85,16 +85,6 @@ def test_windows_outside_the_record_or_empty_name_its_span(window: tuple[float, 
         ramp(100, 0.01).window(*window)
 
 
-def test_decimate_thins_readings_and_never_the_drive() -> None:
-    record = ramp(10, 0.01, 1.0)
-    thinned = record.decimate(3)
-    np.testing.assert_array_equal(record.voltage, thinned.voltage)
-    assert (record.interval, record.start) == (thinned.interval, thinned.start)
-    assert thinned.displacement is not None
-    assert [0, 3, 6, 9] == np.flatnonzero(thinned.has_reading).tolist()
-    assert [0.0, 6.0, 12.0, 18.0] == thinned.displacement[thinned.has_reading].tolist()
-
-
 def test_excluded_readings_are_missing_and_the_voltage_is_not() -> None:
     record = ramp(100, 0.01).exclude([(0.0, 0.1), (0.5, 0.52)])
     assert [*range(10), 50, 51] == np.flatnonzero(~record.has_reading).tolist()

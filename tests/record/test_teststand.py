@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.record.teststand import Amplifier, LaserSensor, VirtualTestStand, creep
 from bwbayes.record.waveforms import Decay, Sine, Triangle, Waveform, signal
 
@@ -132,16 +132,6 @@ def test_the_structural_even_term_is_one_micrometre_at_100_volts() -> None:
         np.testing.assert_allclose(expected, even[1200:], rtol=1e-3)
 
 
-def test_the_true_parameters_are_table_1_in_micrometers_and_the_noise() -> None:
-    bouc_wen = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "exponent": 1.0}
-    mechanics = {"mass": 0.00134, "damping": 1580.0, "stiffness": 4.10e5}
-    table = bouc_wen | mechanics | {"initial": 0.0, "offset": 0.0, "sensor_sd": 0.5}
-    process = {"discrepancy_sd": 1.5, "discrepancy_time": 0.5}
-    assert table | process == VirtualTestStand("process").parameters()
-    assert table == VirtualTestStand("none").parameters()
-    assert table == VirtualTestStand("structural").parameters()
-
-
 def test_bad_input_is_named_in_one_line() -> None:
     stand = VirtualTestStand("none")
     with pytest.raises(InputError, match=r"^test stand: discrepancy: no 'noise'; .*'process'"):
@@ -158,15 +148,18 @@ def test_bad_input_is_named_in_one_line() -> None:
 # Any actuator on the stand: its truth is what the fitted model computes, to rounding
 
 RATE = 100.0
+MECHANICS = """[parameters]
+mass = { fixed = 0.00134 }
+damping = { fixed = 1580.0 }
+stiffness = { fixed = 4.1e5 }
+"""
 SIGNAL = "{ amplitude = 90.0, frequency = 1.0, duration = 4.0, decay = 0.2 }"
-MECHANICS = "".join(
-    f"{name} = {{ fixed = {value} }}\n"
-    for name, value in (("mass", 0.00134), ("damping", 1580.0), ("stiffness", 4.1e5))
-)
 
 EVERY = {name: f"hysteresis = '{name}'\n" for name in HYSTERESIS} | {
     "duhem with even terms": "hysteresis = 'duhem'\nodd = false\n",
     "plays at given thresholds": "hysteresis = 'plays'\nthresholds = [5.0, 20.0]\n",
+    "no dynamics": "hysteresis = 'prandtl-ishlinskii'\ndynamics = 'none'\n",
+    "second order": "hysteresis = 'prandtl-ishlinskii'\ndynamics = 'second-order'\n",
     "gain": "gain = ['quadratic', 'cubic']\n",
     "creep": "creep = true\n",
     "creep that grows": "creep = [0.5, 5.0]\ncreep_growth = true\n",
@@ -201,17 +194,10 @@ def test_the_model_reproduces_the_stands_record_with_the_stated_truth(
 ) -> None:
     stand = EVERY[parts]
     lag = "" if "dynamics" in stand else "dynamics = 'lag'\n"
-    problem = of(stand + lag, stand + lag, tmp_path)
+    problem = of(stand + lag, stand + lag, tmp_path, MECHANICS * (parts == "second order"))
     names = {p.name for p in problem.parameters} - {"initial"}
     assert names <= set(problem.config.truth)
     assert_reproduced(problem)
-
-
-@pytest.mark.parametrize("dynamics", DYNAMICS)
-def test_so_it_does_with_all_dynamics(dynamics: str, tmp_path: Path) -> None:
-    parts = f"hysteresis = 'prandtl-ishlinskii'\ndynamics = '{dynamics}'\n"
-    more = f"[parameters]\n{MECHANICS}" if dynamics == "second-order" else ""
-    assert_reproduced(of(parts, parts, tmp_path, more))
 
 
 @pytest.mark.parametrize("name", ["duhem", "prandtl-ishlinskii", "jiles-atherton"])

@@ -47,39 +47,21 @@ def lines(*texts: str) -> str:
     return "\n".join(texts) + "\n"
 
 
-def test_a_plain_file_is_read_in_the_units_of_its_header(tmp_path: Path) -> None:
-    record = read(tmp_path, GOOD)
-    numbers = np.array([[float(x) for x in row.split(",")] for row in ROWS])
-    np.testing.assert_array_equal(numbers[:, 1], record.voltage)
-    np.testing.assert_array_equal(numbers[:, 2], record.displacement)
-    assert (0.005, 0.0, "output") == (record.interval, record.start, record.voltage_is)
-    assert "record.csv" == record.origin
-
-
 HARMLESS = {
     "bom": b"\xef\xbb\xbf" + GOOD.encode(),
     "crlf": GOOD.replace("\n", "\r\n").encode(),
     "cr": GOOD.replace("\n", "\r").encode(),
     "no-last-newline": GOOD.rstrip("\n").encode(),
     "blank-end": (GOOD + "\n  \n").encode(),
-    "semicolons": GOOD.replace(",", ";").encode(),
-    "decimal-commas": GOOD.replace(",", ";").replace(".", ",").encode(),
-    "tabs": GOOD.replace(",", "\t").replace(".", ",").encode(),
     "blanks beside commas": GOOD.replace(",", " , ").encode(),
-    "blanks": GOOD.replace(",", " ").encode(),
     "blanks and indented": GOOD.replace(",", "  ").replace("\n", "\n  ").rstrip(" ").encode(),
-    "bars": GOOD.replace(",", "|").encode(),
     "semicolons below": lines(HEADER, *(row.replace(",", ";") for row in ROWS)).encode(),
     "header in a comment": ("# " + GOOD).encode(),
-    "utf-16": GOOD.encode("utf-16"),
     "utf-16-le": GOOD.encode("utf-16-le"),
     "utf-16-be": GOOD.encode("utf-16-be"),
     "cp1252": GOOD.replace("_um", "_µm").encode("cp1252"),
     "other names": GOOD.replace("_um", " [µm]").replace("time_s", "Zeit / s").encode("cp1252"),
     "units in a line": GOOD.replace(HEADER, "time,voltage,displacement\n(s),(V),(um)\n").encode(),
-    "units in words": GOOD.replace(
-        HEADER, "time,voltage,displacement\nsecond,Volt,micron"
-    ).encode(),
     "mu": GOOD.replace("_um", "_\u03bcm").encode(),
     "case": GOOD.replace("time", "TIME").replace("volt", "Volt").encode(),
     "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
@@ -158,12 +140,6 @@ def test_words_are_missing_readings_and_are_said(
     assert sorted(where) == np.flatnonzero(~record.has_reading).tolist()
 
 
-def test_a_column_of_words_is_refused(tmp_path: Path) -> None:
-    rows = [row.rpartition(",")[0] + ",Error" for row in ROWS[:15]]
-    text = fault(tmp_path, lines(HEADER, *rows, *ROWS[15:]))
-    assert text.startswith("record.csv:2: displacement_um: 'Error' is not a number")
-
-
 def test_too_few_readings_are_refused_and_none_are_a_plan(tmp_path: Path) -> None:
     empty = [row.rpartition(",")[0] + "," for row in ROWS]
     text = fault(tmp_path, lines(HEADER, *ROWS[:9], *empty[9:]))
@@ -229,12 +205,6 @@ def test_a_command_is_held_where_samples_are_missing_and_an_output_refused(tmp_p
         read_record(tmp_path / "record.csv", voltage_is="output")
 
 
-def test_a_gap_that_makes_the_record_too_long_is_refused(tmp_path: Path) -> None:
-    rows = [f"{i * 0.005 + 1e9 * (i > 9):.4f},{i},{i}" for i in range(40)]
-    problem = "makes the record too long"
-    assert problem in fault(tmp_path, lines("# voltage: command", HEADER, *rows))
-
-
 FAULTS: dict[str, tuple[str | bytes, str]] = {
     "missing field": (lines(*LINES[:8], "0.1,2", *LINES[9:]), ":9: 2 fields for 3 columns; compl"),
     "extra field": (
@@ -262,6 +232,14 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         ": which column is the time, which the voltage, which the displacement? There are 30 values"
         " each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.88 to 20); say "
         "columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
+    ),
+    "half of a column words": (
+        lines(HEADER, *(row.rpartition(",")[0] + ",Error" for row in ROWS[:15]), *ROWS[15:]),
+        ":2: displacement_um: 'Error' is not a number",
+    ),
+    "endless gap": (
+        lines("# voltage: command", *LINES[:20], "1e9,1,1", "1000000000.005,1,1"),
+        ":22: time_s: gap of 1e+09 s makes the record too long",
     ),
     "no unit": (GOOD.replace("voltage_V", "voltage"), ":1: which unit has 'voltage' "),
     "no times": (

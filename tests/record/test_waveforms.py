@@ -92,13 +92,6 @@ def test_a_staircase_holds_each_level_for_its_dwell_and_the_last_for_good(
     np.testing.assert_array_equal(expected, voltage)
 
 
-def test_decays_follow_their_laws() -> None:
-    time = np.array([0.0, 1.0, 2.0, 4.0, 9.0])
-    np.testing.assert_allclose([1, 1, 0.75, 0.25, 0], Decay(1.0, 0.25)(time), rtol=1e-15)
-    expected = np.exp([0, 0, -0.25, -0.75, -2.0])
-    np.testing.assert_allclose(expected, Decay(1.0, 0.25, "exponential")(time), rtol=1e-15)
-
-
 @given(st.floats(-50, 50), st.floats(0, 2), st.floats(0, 2))
 def test_a_waveform_is_its_bias_before_the_start_and_carrier_times_decay_after(
     bias: float, start: float, rate: float
