@@ -9,10 +9,9 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
-from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.prediction.loops import (
     Traced,
     initial_curve,
@@ -20,8 +19,8 @@ from bwbayes.prediction.loops import (
     measures,
     steady_loop,
 )
-from tests.inference.problems import decaying_sine, posterior_of
 from tests.model.operators.slow import by_plays
+from tests.model.operators.test_every_operator import posterior
 
 
 def still(operator: Operator | None = None) -> Actuator:
@@ -70,11 +69,7 @@ def problem(name: str, draws: int = 40) -> tuple[Any, FloatArray]:
 
     The joint prior holds models without a loop and without a range, too.
     """
-    operator = made("hysteresis", name, HYSTERESIS, {})
-    voltage = decaying_sine(300)
-    actuator = Actuator("lag", "first", 0.01, operator, span=Span(-100.0, 100.0))
-    displacement = 0.6 * voltage + np.random.default_rng(1).normal(size=voltage.size)
-    of = posterior_of(voltage, displacement, actuator, "discrepancy", {}, from_rest=True)
+    of = posterior(name, from_rest=True)
     free = of.prior.draw(np.random.default_rng(2), 400)
     away = np.sum(np.log(np.abs(free) / np.median(np.abs(free), axis=0)) ** 2, axis=1)
     return of, free[np.argsort(away)[:draws]]

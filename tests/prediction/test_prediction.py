@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
@@ -72,21 +71,6 @@ def predicted(
 
 def width(bands: Bands, kind: Kind = "parameter", level: int = 95) -> FloatArray:
     return bands.upper[kind, level] - bands.lower[kind, level]
-
-
-def test_bands_are_nested_in_level_and_in_kind(
-    posterior: Posterior, draws: FloatArray, record: Record
-) -> None:
-    bands = predict_windows(posterior, draws, record, {"all": slice(0, record.samples)}, random())[
-        0
-    ]
-    for inner, outer in pairwise(LEVELS):
-        for kind in KINDS:
-            assert (bands.lower[kind, outer] <= bands.lower[kind, inner]).all()
-            assert (bands.upper[kind, inner] <= bands.upper[kind, outer]).all()
-    for level in LEVELS:
-        for tight, loose in pairwise(KINDS):
-            assert (width(bands, tight, level) < width(bands, loose, level)).all()
 
 
 def test_a_window_is_the_same_part_of_the_whole_record(
