@@ -15,7 +15,6 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
-from bwbayes.inference.engine import Engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, made
@@ -72,14 +71,14 @@ class Case:
         return TRUE | true_values(self.actuator, TRUE) | own
 
 
-def posterior_of_case(case: Case, engine: Engine = "numba") -> Posterior:
+def posterior_of_case(case: Case) -> Posterior:
     """Return the model, its voltage range, and the width of its record; all parameters fixed."""
     actuator, true = case.actuator, case.true
     voltage = 100 * np.sin(2 * np.pi * np.arange(400) / RATE)
     names = (*actuator.parameters, "sensor_sd", "discrepancy_sd", "discrepancy_time")
     fixed = {name: true[name] for name in names}
     posterior = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", fixed)
-    return replace(posterior, engine=engine)
+    return replace(posterior, engine="numba")
 
 
 def record_of(case: Case, generator: np.random.Generator) -> Record:

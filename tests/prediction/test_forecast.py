@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,13 +18,9 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
-from tests.inference.problems import INTERVAL, TRUE_NOISE, decaying_sine, short_posterior, truth
+from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
 from tests.measured import keep
 from tests.prediction.runs import posterior_draws
-
-SD, TIME, SENSOR = (
-    TRUE_NOISE[f"{name}"] for name in ("discrepancy_sd", "discrepancy_time", "sensor_sd")
-)
 
 # Samples of a record, and of what follows it.
 LEAD, LATER = 80, 120
@@ -147,15 +143,13 @@ def replicate(seed: int) -> Replicate:
 
 def ranks(replicates: Iterable[Replicate]) -> IntArray:
     """Where readings lie in their bands, (replicates, samples): 0 below 95 %, ... 6 above it."""
-    return np.array(list(_ranks(replicates)))
-
-
-def _ranks(replicates: Iterable[Replicate]) -> Iterator[IntArray]:
+    places = []
     for posterior, draws, record, voltage, reading in replicates:
         bands = forecast(posterior, draws, record, voltage, np.random.default_rng(1))
         edges = [bands.lower["sensor", level] for level in (95, 90, 50)]
         edges += [bands.upper["sensor", level] for level in (50, 90, 95)]
-        yield np.sum(reading > np.array(edges), axis=0)
+        places.append(np.sum(reading > np.array(edges), axis=0))
+    return np.array(places)
 
 
 def smallest_p(of: IntArray) -> float:
@@ -174,15 +168,12 @@ def smallest_p(of: IntArray) -> float:
     return float(min(values))
 
 
-def known(replicates: Iterable[Replicate]) -> list[Replicate]:
-    """Take the parameters for known, at their posterior mean."""
-    return [one._replace(draws=one.draws.mean(axis=0, keepdims=True)) for one in replicates]
-
-
 @pytest.mark.slow
 def test_parameters_taken_for_known_are_noticed() -> None:
-    """The twin: bands that are those of the discrepancy alone."""
-    assert smallest_p(ranks(known(replicate(seed) for seed in range(36)))) < 1e-4
+    """The twin: bands that are those of the discrepancy alone, parameters at their mean."""
+    every = map(replicate, range(36))
+    known = (one._replace(draws=one.draws.mean(axis=0, keepdims=True)) for one in every)
+    assert smallest_p(ranks(known)) < 1e-4
 
 
 @pytest.mark.slow

@@ -150,7 +150,8 @@ def test_bands_cover_all_kinds_of_moving_records(kind: Case) -> None:
         every = studied(case, RECORDS, seed=1000 + number)
         t[case] = off(every)
         alarmed += alarms(every)
-        cells[label(case)] = {
+        label = f"{case.discrepancy:g} um, lead-in {case.lead_in:g} s, {case.cut}"
+        cells[label] = {
             str(level): [round(float(np.mean(covered(every, level))), 4), round(t[case][level], 2)]
             for level in LEVELS
         }
@@ -176,11 +177,6 @@ def test_bands_cover_all_kinds_of_moving_records(kind: Case) -> None:
     assert np.max(np.abs(values)) < strict
     assert beyond <= allowed
     assert alarmed <= MOST_ALARMS * RECORDS * len(t)
-
-
-def label(case: Case) -> str:
-    """Name what is special about a case beside its dynamics."""
-    return f"{case.discrepancy:g} um, lead-in {case.lead_in:g} s, {case.cut}"
 
 
 @pytest.mark.slow
