@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import WORDS
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import Background, Verdict, assess
-from bwbayes.prediction.bands import LeadIn
+from bwbayes.prediction.bands import Bands, LeadIn
 from tests.prediction.records import Made, bands_of, made
 
 FITTED = (-100.0, 100.0)
@@ -25,6 +25,12 @@ def one_of(generator: np.random.Generator, *values: float) -> float:
     return float(generator.choice(values))
 
 
+def judged(bands: Bands, background: Background, beyond: Sequence[Finding] = ()) -> Verdict:
+    verdict = assess(bands, background, beyond=beyond)
+    assert verdict is not None
+    return verdict
+
+
 def good(generator: np.random.Generator, number: int) -> Verdict:
     """Judge a record that its bands describe, of any length and memory."""
     length = one_of(generator, 5.0, 8.0, 14.0, 30.0, 60.0)
@@ -34,9 +40,7 @@ def good(generator: np.random.Generator, number: int) -> Verdict:
     parameters = discrepancy * one_of(generator, 0.05, 0.3, 0.8)
     record = made(generator, length, interval, memory, discrepancy, sensor, parameters)
     believed = Background(memory * one_of(generator, 0.8, 1.0, 1.5), 0.0, FITTED)
-    verdict = assess(bands_of(record, training=bool(number % 2)), believed)
-    assert verdict is not None
-    return verdict
+    return judged(bands_of(record, training=bool(number % 2)), believed)
 
 
 @pytest.mark.parametrize(
@@ -58,8 +62,7 @@ def unsure_alarms(known: float, believed: float) -> int:
     for _ in range(400):
         record = made(generator, 20.0, 0.02, 0.2, parameters=0.05)
         scale = np.sqrt(known / generator.chisquare(known))
-        verdict = assess(bands_of(record, (scale - 1) * record.error), background)
-        assert verdict is not None
+        verdict = judged(bands_of(record, (scale - 1) * record.error), background)
         count += verdict.holds is False
     return count
 
@@ -115,13 +118,9 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
         sensor = one_of(generator, 0.1, 0.3)
         record = made(generator, length, interval, memory, discrepancy, sensor, 0.3 * discrepancy)
         spoilt = SPOILT[kind](generator, record, float(record.sds["sensor"].mean()))
-        beyond = [Finding("range", "100 V exceeds the training range", "train on more")]
-        verdict = assess(
-            bands_of(record, spoilt),
-            Background(memory, 0.0, FITTED),
-            beyond=beyond if kind == "extrapolation" else [],
-        )
-        assert verdict is not None
+        far = Finding("range", "100 V exceeds the training range", "train on more")
+        beyond = [far] * (kind == "extrapolation")
+        verdict = judged(bands_of(record, spoilt), Background(memory, 0.0, FITTED), beyond)
         assert verdict.holds is False, number
         assert verdict.reasons
         assert verdict.cause is not None
@@ -134,16 +133,14 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
     for number in range(10):
         record = made(np.random.default_rng([8, number]), length=30)
         wide = replace(record, sds={kind: 3 * sd for kind, sd in record.sds.items()})
-        verdict = assess(bands_of(wide), Background(record.memory, 0.0, FITTED))
-        assert verdict is not None
+        verdict = judged(bands_of(wide), Background(record.memory, 0.0, FITTED))
         assert verdict.holds is False
         assert "times too wide" in verdict.reasons[-1]
 
 
 def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     record = made(np.random.default_rng(1), length=3, memory=1.0)
-    verdict = assess(bands_of(record), Background(1.0, 0.0, FITTED))
-    assert verdict is not None
+    verdict = judged(bands_of(record), Background(1.0, 0.0, FITTED))
     assert verdict.holds is None
     assert "is too small to validate the bands" in verdict.reasons[0]
     assert verdict.cause is None
@@ -157,15 +154,13 @@ def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
     note = "the lead-in of 0 to 1 s does not fit the model (p < 0.001)"
     for p_value, notes in ((1e-5, (note,)), (0.01, ())):
         lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=p_value)
-        verdict = assess(replace(bands, lead_in=lead), background)
-        assert verdict is not None
+        verdict = judged(replace(bands, lead_in=lead), background)
         assert verdict.holds is True
         assert notes == verdict.notes
     assert bands.measured is not None
     shifted = replace(bands, measured=bands.measured + 5 * float(record.sds["sensor"].mean()))
     lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
-    verdict = assess(replace(shifted, lead_in=lead), background)
-    assert verdict is not None
+    verdict = judged(replace(shifted, lead_in=lead), background)
     assert verdict.holds is False
     assert verdict.cause is not None
     assert "lead-in" == verdict.cause.kind
@@ -187,8 +182,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
         (noisy, True, 0.0, True),
     ):
         background = Background(record.memory, 0.0, FITTED, extent)
-        verdict = assess(bands_of(record, training=training), background)
-        assert verdict is not None
+        verdict = judged(bands_of(record, training=training), background)
         assert verdict.holds is holds
         assert holds or "on the training readings" in verdict.reasons[0]
 
