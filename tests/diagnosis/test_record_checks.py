@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ast import literal_eval
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -148,13 +147,6 @@ def test_of_the_measured_record_only_its_start_is_remarked_on() -> None:
     assert () == inspect(later)
 
 
-def test_a_fix_removes_its_finding() -> None:
-    transient = SPOILT["switch-on transient"](looping(0), np.random.default_rng(0))
-    (finding,) = inspect(transient)
-    end = transient.start + transient.duration
-    assert () == inspect(transient.upto(end, first_reading=finding.stop))
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     start=st.sampled_from([0.0, -86_400.0, 0.125, 9e5]) | st.floats(-1e6, 1e6),
@@ -173,17 +165,6 @@ def test_the_windows_of_a_fix_hold_the_samples_that_they_name(
     windows = literal_eval(fix.partition("= ")[2].removesuffix(" under [record]"))
     left_out = record.readings - record.exclude(windows).readings
     assert length - 1 <= left_out <= length + 2
-
-
-def test_a_spike_is_where_it_is_said_to_be() -> None:
-    record = looping(0)
-    assert record.displacement is not None
-    values = record.displacement.copy()
-    values[[700, 900]] += 40.0
-    (finding,) = inspect(replace(record, displacement=values))
-    assert (record.time[700], record.time[900] + record.interval) == (finding.start, finding.stop)
-    assert f"2 isolated outliers of the displacement, at {record.time[700]:.6g}, " in finding.text
-    assert "outliers = true under [model]" == finding.fix
 
 
 @pytest.mark.parametrize("kind", ["saturation", "slew limit"])
