@@ -20,7 +20,7 @@ from bwbayes.control.tracking import Tracking, track
 from bwbayes.population.population import population
 from bwbayes.shown import LONGEST, MOST_LINES, brief
 from tests.control import cases
-from tests.population.populations import drawn
+from tests.population.test_population import drawn
 
 
 @pytest.fixture(scope="module")
