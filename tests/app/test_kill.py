@@ -22,7 +22,9 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands.cli import main
+from bwbayes.app.fit import fitted
 from bwbayes.app.running import run as run_module
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from bwbayes.sampling.chain import PHASES, Phase
 from bwbayes.sampling.storage import ChainFile
@@ -223,6 +225,8 @@ def test_request_to_stop_ends_in_order(
     assert "" == (tmp_path / "out").read_text()
     assert "interrupted; resume with `bwbayes resume a`\n" == (tmp_path / "err").read_text()
     assert not (folder / "summary.json").exists()
+    with pytest.raises(InputError, match=r"no draws yet; resume with|chain does not exist"):
+        fitted.finished(RunFolder(folder))
 
 
 # Slow
