@@ -179,8 +179,10 @@ def shorter(text: str) -> str:
     return text
 
 
-def typed(line: str) -> None:
-    """Run a command line in this folder: it ends with status 0, and leaves its files.
+def typed(line: str) -> str:
+    """Run a command line in this folder, and return what it says.
+
+    It ends with status 0, and leaves its files.
 
     In this process, as on a machine with one core.
     """
@@ -199,6 +201,7 @@ def typed(line: str) -> None:
     written = {str(path) for path, state in _changes().items() if before.get(path) != state}
     for path in _promised(name, arguments):
         assert fnmatch.filter(written, path), f"{line}: {path} not in {sorted(written)}"
+    return done.output
 
 
 def _changes() -> dict[Path, tuple[int, int]]:

@@ -102,8 +102,10 @@ def test_the_commands_for_a_first_record_follow_each_other(empty: Path) -> None:
     (empty / "my.toml").write_text(blocks("toml")[0] + QUICK)
     records_of('file = "my_record.csv" file = "next.csv"', empty)
     assert FIRST[0].startswith("bwbayes run my_record.csv")
-    for line in FIRST:
-        typed(line)
+    said = [typed(line) for line in FIRST]
+    assert re.search(
+        r"training on 0 to [\d.]+, .* s, holding out the rest; save this conf", said[0]
+    )
 
 
 # The first is run above.

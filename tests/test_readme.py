@@ -57,6 +57,9 @@ def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
     exec(lines.replace("12))", "6), ess=400, walkers=24)"), names)
     assert names["fit"].converged
     assert names["bands"].scores.nrmse < 0.05
+    columns = ["time_s", "voltage_V", "displacement_um", "mean_um"]
+    assert columns == [*names["bands"].to_pandas()][:4]
+    assert names["bands"].plot().axes
 
 
 def test_each_command_starts_from_a_bare_checkout() -> None:

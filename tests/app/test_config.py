@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bwbayes.app.config.config import Config, dump, is_config, load, parse
+from bwbayes.app.config.config import dump, is_config, load, parse
 from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.errors import InputError
 from bwbayes.record.record import Record
-from tests.app import small
 
 RECORD = '[record]\nfile = "record.csv"\n'
 
@@ -184,19 +183,6 @@ def test_what_is_no_file_or_too_large_is_not_read(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=why):
             load(path)
-
-
-@pytest.mark.parametrize(
-    "result",
-    [
-        parse(RECORD, ""),
-        small.config(),
-        small.config(("seed = 3", 'seed = 3\nname = "µ \\"quoted\\" \\\\ name"')),
-    ],
-)
-def test_dumped_config_is_the_same_config(result: Config) -> None:
-    assert result == parse(dump(result), "")
-    assert dump(result) == dump(parse(dump(result), ""))
 
 
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "runs").glob("*.toml")))

@@ -79,20 +79,6 @@ def stopped(folder: Path, steps: int = 25) -> Fit:
 # Arrays to bands
 
 
-def test_arrays_become_bands_in_five_lines(folder: Path, fit: Fit) -> None:
-    """The fit is the second line of them."""
-    assert fit.converged
-    assert fit.holds is not False
-    new_record = read_record(folder / "records/sine.h5")
-    bands = fit.predict(new_record, from_rest=True)
-    table = bands.to_pandas()
-    assert list(table.columns[:4]) == ["time_s", "voltage_V", "displacement_um", "mean_um"]
-    assert len(table) == new_record.samples
-    assert bands.scores is not None
-    assert 0.8 < np.mean(np.abs(bands.residuals) < 2 * (table.sensor_upper_95_um - table.mean_um))
-    assert bands.plot().axes
-
-
 def test_draws_and_summary_are_labeled_and_agree(fit: Fit) -> None:
     assert ("chain", "draw") == tuple(fit.draws.sizes)
     table = fit.summary

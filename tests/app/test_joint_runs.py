@@ -18,7 +18,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.calibration.replicates import replicate
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError
 from bwbayes.record import Record, write_record
 from bwbayes.report.figures.pictures import pictures
 from tests.app import small
@@ -130,16 +130,6 @@ def test_a_chain_of_several_records_goes_on_and_knows_its_own(
     (copy / "records/step.h5").replace(copy / "records/loops.h5")
     with pytest.raises(InputError):
         resume(RunFolder(copy), small.quiet(), workers=1)
-
-
-def test_any_other_record_is_predicted(finished: RunFolder) -> None:
-    made = bwbayes.open_run(finished.path)
-    other = made.problem.validations["sine"].record
-    assert other is not None
-    # Four seconds are too few to validate anything, which is said.
-    with pytest.warns(InputWarning, match="inconclusive: prediction"):
-        predicted = made.predict(other, from_rest=True)
-    np.testing.assert_array_equal(predicted.mean, made.bands["sine"].mean)
 
 
 def test_replicates_make_all_records_anew() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from bwbayes.app.commands import cli, fitting
+from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
 from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import resolve
@@ -22,7 +22,6 @@ from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Waveform
 
 OWN = "time_s,voltage_V,displacement_um"
-FOREIGN = "t [ms],U_mV,pos"
 
 
 @pytest.fixture(scope="module")
@@ -66,25 +65,6 @@ def proposed(path: Path, **units: str) -> ConfigProposal:
     return propose(path, path.parent, Naming(units=units))
 
 
-# What is recognized
-
-
-def test_the_proposed_config_is_one_that_resolves(write: Write) -> None:
-    made = proposed(write(FOREIGN, (1e3, 1e3, 1e3)), displacement="nm")
-    path = write(FOREIGN, (1e3, 1e3, 1e3))
-    config = path.with_suffix(".toml")
-    config.write_text(made.text)
-    assert load(config) == made.config
-    problem = resolve(load(config), path.parent)
-    assert ["held_out"] == list(problem.validations)
-    held = problem.validations["held_out"].windows
-    assert 150 == sum(window.stop - window.start for window in held)
-    assert 450 == sum(window.stop - window.start for window in problem.posterior.only.training)
-    assert (
-        problem.config.records["record"].columns is None
-    )  # the run's own copy has the package's names
-
-
 def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: Write) -> None:
     text = proposed(write()).text
     assert text.startswith("# mine.csv: 600 samples every 0.01 s from 0 s on\n# voltage -")
@@ -95,9 +75,6 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
     assert re.search(
         r"# from_rest = false  # starts at 9\d\.\d V, moving; the initial state is", text
     )
-
-
-# What is held out
 
 
 # What is wrong
@@ -194,28 +171,3 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     assert 600 == resolve(load(elsewhere), elsewhere.parent).record.samples
     for unit in ("displacement", "length=nm", "displacement=furlong", "time=-s"):
         assert isinstance(command("init", path, "--unit", unit).exception, InputError)
-
-
-def test_run_without_a_config_runs_the_proposed_one(
-    write: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    path = write(FOREIGN.replace("pos", "pos_nm"), (1e3, 1e3, 1e3))
-    ran: list[Path] = []
-
-    def finish(folder: Path, *_: object, **__: object) -> int:
-        ran.append(folder)
-        return 0
-
-    monkeypatch.setattr(fitting, "finish", finish)
-    done = command("run", path, "--out", tmp_path / "out", "--quiet")
-    assert 0 == done.return_value
-    assert "" == done.output
-    assert [tmp_path / "out"] == ran
-    config = load(tmp_path / "out/config.toml")
-    assert "mine" == config.name
-    edges = np.ravel(
-        [*(config.records["record"].train or ()), *(config.validation["held_out"].window or ())]
-    )
-    assert (0.0, 6.0) == (edges.min(), edges.max())
-    said = command("run", path, "--out", tmp_path / "again").output
-    assert re.search(r"training on 0 to [\d.]+, .* s, holding out the rest; save this config", said)
