@@ -54,18 +54,6 @@ def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:
     }
 
 
-def test_the_campaign_is_one_problem_whose_truth_is_known() -> None:
-    """All four records share the actuator; the truth is Table 1's, with the creep of the config."""
-    problem = campaign(1)
-    assert ["loops", "step_10", "step_50", "step_100"] == [*problem.records]
-    truth = problem.config.truth
-    assert (0.7, 0.3575, 0.0272, 0.0172, 1580.0) == tuple(truth[name] for name in JUDGED[:5])
-    assert [0.01] * 3 == [truth[name] for name in JUDGED[5:]]
-    assert {"verification"} == problem.validations.keys()
-    free = set(problem.posterior.names)
-    assert {*JUDGED, "offset[loops]", "offset[step_100]", "sensor_sd"} <= free
-
-
 @pytest.mark.slow
 def test_joint_intervals_cover_the_truth_and_are_narrower_than_from_the_loops_alone() -> None:
     """Over the seeds: coverage within three standard errors of 95 %, each interval narrower.
