@@ -17,10 +17,16 @@ def process(samples: int, step: float, generator: np.random.Generator) -> FloatA
 
     It forgets by exp(-step) from sample to sample.
     """
-    remembered = np.exp(-step)
-    shocks = generator.standard_normal(samples)
-    shocks[1:] *= np.sqrt(1 - remembered**2)
-    drawn: FloatArray = lfilter([1.0], [1.0, -remembered], shocks)
+    return autoregressive(np.exp(-step), samples, (), generator)
+
+
+def autoregressive(
+    kept: float, steps: int, shape: tuple[int, ...], generator: np.random.Generator
+) -> FloatArray:
+    """Draw stationary AR(1) series (steps, *shape) of unit variance."""
+    shocks = generator.standard_normal((steps, *shape))
+    shocks[1:] *= np.sqrt(1 - kept**2)
+    drawn: FloatArray = lfilter([1.0], [1.0, -kept], shocks, axis=0)
     return drawn
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import integrate, stats
-from scipy.signal import lfilter
 
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import RecordConfig
@@ -31,6 +30,7 @@ from tests.measured import keep
 from tests.reference.make import digest
 from tests.reference.plain import FOLDER, MEASURED, load_case
 from tests.sampled import converged
+from tests.stand import autoregressive
 
 PLAN = SamplingPlan(ess=1000, walkers=24, block=25)
 
@@ -67,9 +67,7 @@ def test_the_error_is_that_of_repeated_estimates() -> None:
     p, q = stats.norm(1, 1), stats.norm(0, 1.5)
     total = 0.0
     for _ in range(60):
-        shocks = source.normal(size=(400, 4, 2))
-        shocks[1:] *= np.sqrt(1 - 0.9**2)
-        x = 1 + lfilter([1.0], [1.0, -0.9], shocks, axis=0)
+        x = 1 + autoregressive(0.9, 400, (4, 2), source)
         y = q.rvs(2000, source)
         made = bridge(p.logpdf(x) - q.logpdf(x), p.logpdf(y) - q.logpdf(y))
         total += (made.log_integral / made.error) ** 2

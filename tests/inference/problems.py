@@ -19,6 +19,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES, context, declared, joint, parameter
+from tests.stand import process
 
 INTERVAL = 0.01
 
@@ -49,13 +50,8 @@ def ring_bender(actuator: Actuator, noise: str, voltage: FloatArray, seed: int) 
     reading: FloatArray = clean + TRUE_NOISE["sensor_sd"] * generator.standard_normal(voltage.size)
     if noise == "white":
         return reading
-    kept = np.exp(-actuator.interval / TRUE_NOISE["discrepancy_time"])
-    state = TRUE_NOISE["discrepancy_sd"] * generator.standard_normal()
-    for sample in range(voltage.size):
-        reading[sample] += state
-        fresh = TRUE_NOISE["discrepancy_sd"] * np.sqrt(1 - kept**2) * generator.standard_normal()
-        state = kept * state + fresh
-    return reading
+    step = actuator.interval / TRUE_NOISE["discrepancy_time"]
+    return reading + TRUE_NOISE["discrepancy_sd"] * process(voltage.size, step, generator)
 
 
 def joint_prior(

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import fftconvolve, lfilter
+from scipy.signal import fftconvolve
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
@@ -25,6 +25,7 @@ from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests import measured
 from tests.inference.problems import posterior_of
+from tests.stand import process
 
 INTERVAL, SAMPLES = 1 / 200, 3200
 TRUE = {"d": 0.7, "alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "lag": 0.002}
@@ -50,11 +51,8 @@ def plant(
     """Return the displacement of a plant that creeps by a strength a decade, um."""
     steps = np.diff(moved(voltage, interval, "none"), prepend=0.0)
     after = np.log10(1 + np.arange(voltage.size) * interval / FIRST)
-    kept = np.exp(-interval / MEMORY)
-    fresh = DISCREPANCY * np.sqrt(1 - kept**2) * source.standard_normal(voltage.size)
-    fresh[0] = DISCREPANCY * source.standard_normal()
     crept = strength * fftconvolve(steps, after)[: voltage.size]
-    discrepancy: FloatArray = lfilter([1.0], [1.0, -kept], fresh)
+    discrepancy = DISCREPANCY * process(voltage.size, interval / MEMORY, source)
     return np.asarray(moved(voltage, interval, "lag") + crept + discrepancy, dtype=np.float64)
 
 

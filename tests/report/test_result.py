@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import lfilter
 
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import Bands
@@ -20,6 +19,7 @@ from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
 from tests.app.example import bands
+from tests.stand import autoregressive
 
 
 def parameters(draws: FloatArray) -> dict[str, dict[str, float]]:
@@ -46,10 +46,8 @@ def test_intervals_leave_two_and_a_half_percent_on_either_side() -> None:
 
 def test_the_means_error_is_that_of_a_known_process() -> None:
     """The mean of N draws of AR(1) series has the sd s √((1 + φ)/((1 − φ) N)); within a fifth."""
-    kept, shape = 0.5, (600, 4, 16, 4)
-    shocks = np.random.default_rng(2).standard_normal(shape)
-    shocks[1:] *= np.sqrt(1 - kept**2)
-    draws = 7.0 + 3.0 * lfilter([1.0], [1.0, -kept], shocks, axis=0)
+    kept = 0.5
+    draws = 7.0 + 3.0 * autoregressive(kept, 600, (4, 16, 4), np.random.default_rng(2))
     expected = 3.0 * np.sqrt((1 + kept) / (1 - kept) / (600 * 4 * 16))
     for row in parameters(draws).values():
         assert expected == pytest.approx(row["mcse_mean"], rel=0.2)

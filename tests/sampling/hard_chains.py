@@ -9,21 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
+from tests.stand import autoregressive
 
 STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 18, 2
 BLOCK = 50
-
-
-def autoregressive(
-    kept: float, steps: int, shape: tuple[int, ...], generator: np.random.Generator
-) -> FloatArray:
-    """Draw stationary AR(1) series (steps, *shape) of unit variance."""
-    draws = np.empty((steps, *shape))
-    draws[0] = generator.standard_normal(shape)
-    for step in range(1, steps):
-        shocks = generator.standard_normal(shape)
-        draws[step] = kept * draws[step - 1] + np.sqrt(1 - kept**2) * shocks
-    return draws
 
 
 def good(

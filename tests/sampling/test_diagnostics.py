@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats  # not in an __all__
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.sampling.diagnostics import (
     Check,
     as_chains,
@@ -20,27 +20,11 @@ from bwbayes.sampling.diagnostics import (
     nested_rhat,
     pareto_k,
 )
-from tests.sampling.hard_chains import autoregressive
 from tests.sampling.targets import student
-
-STEPS, ENSEMBLES, WALKERS, FREE = 600, 4, 16, 2
-BLOCK = 50
+from tests.stand import autoregressive
 
 ENOUGH = np.full(2, 3e3)
 GOOD = Check(1000, np.ones(2), ENOUGH, ENOUGH, ENOUGH, np.full(2, 4.0), 0.4, 0)
-
-
-def good_draws(seed: int = 1, kept: float = 0.5) -> FloatArray:
-    generator = np.random.default_rng(seed)
-    return autoregressive(kept, STEPS, (ENSEMBLES, WALKERS, FREE), generator)
-
-
-def moving(walkers: int = WALKERS) -> IntArray:
-    return np.full((STEPS // BLOCK, ENSEMBLES, walkers), 20, dtype=np.int64)
-
-
-def shortcomings(draws: FloatArray, accepted: IntArray | None = None) -> list[str]:
-    return check(draws, moving() if accepted is None else accepted, BLOCK).shortcomings(1000)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.9, 0.98])
@@ -77,9 +61,9 @@ def test_rhat_and_effective_draws_are_arvizs() -> None:
 def test_what_is_not_finite_anywhere_never_counts_as_converged(
     value: float, where: tuple[int | slice, ...]
 ) -> None:
-    draws = good_draws()
+    draws = autoregressive(0.5, 600, (4, 16, 2), np.random.default_rng(1))
     draws[where] = value
-    assert [] != shortcomings(draws)
+    assert [] != check(draws, np.full((12, 4, 16), 20), 50).shortcomings(1000)
 
 
 @pytest.mark.parametrize(
