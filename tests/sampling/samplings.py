@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain, Phase
 from bwbayes.sampling.diagnostics import Check, Outcome
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
-from tests.sampling.chains import arrays, assert_same
+from bwbayes.sampling.sampler import Watcher, first_chain, sample
 from tests.sampling.targets import gaussian
 
 PLAN = SamplingPlan(
@@ -27,14 +28,21 @@ LONG = replace(PLAN, most_steps=4_000)
 POSTERIOR, POINT = gaussian(3)
 
 
-def new_chain(plan: SamplingPlan = PLAN, seed: int = 1) -> Chain:
-    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(seed))
+def new_chain(plan: SamplingPlan = PLAN) -> Chain:
+    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(1))
 
 
-def run(plan: SamplingPlan = PLAN, seed: int = 1, workers: int = 1) -> tuple[Chain, Outcome]:
-    chain = new_chain(plan, seed)
-    with ThreadPoolExecutor(workers) as executor:
-        return chain, sample(POSTERIOR, plan, chain, executor)
+def run(
+    plan: SamplingPlan = PLAN,
+    seed: int = 1,
+    posterior: Posterior = POSTERIOR,
+    point: PointFit = POINT,
+    watcher: Watcher = lambda *_: None,
+) -> tuple[Chain, Outcome]:
+    """Sample a target to its end."""
+    chain = first_chain(posterior, point, plan, np.random.default_rng(seed))
+    with ThreadPoolExecutor(1) as executor:
+        return chain, sample(posterior, plan, chain, executor, watcher)
 
 
 class Watched:
@@ -51,17 +59,6 @@ class Watched:
         else:
             assert "sampling" == phase
             self.checks.append(result)
-
-
-def assert_same_chain(one: Chain, two: Chain) -> None:
-    assert_same(arrays(one), arrays(two))
-
-
-def assert_same_outcome(one: Outcome, two: Outcome) -> None:
-    assert (one.converged, one.stop_reason) == (two.converged, two.stop_reason)
-    assert (one.remarks, one.check.pareto_k) == (two.remarks, two.check.pareto_k)
-    np.testing.assert_array_equal(one.check.rhat, two.check.rhat)
-    np.testing.assert_array_equal(one.check.ess_bulk, two.check.ess_bulk)
 
 
 class InterruptedRunError(Exception):

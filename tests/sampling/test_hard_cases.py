@@ -13,7 +13,6 @@ all with ``-m slow``.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -21,13 +20,11 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import PointFit
-from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import sampler
-from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.diagnostics import Outcome, check
+from bwbayes.sampling.diagnostics import check
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
 from tests.sampling.hard_chains import BLOCK, HARD, good, hard, moved
+from tests.sampling.samplings import run
 from tests.sampling.targets import TARGETS, gaussian, target
 
 PLAN = SamplingPlan(
@@ -52,14 +49,6 @@ def test_twin_good_chain_passes_with_a_much_larger_target() -> None:
 
 
 # Targets
-
-
-def sampled(
-    posterior: Posterior, point: PointFit, plan: SamplingPlan, seed: int
-) -> tuple[Chain, Outcome]:
-    chain = first_chain(posterior, point, plan, np.random.default_rng(seed))
-    with ThreadPoolExecutor(1) as executor:
-        return chain, sample(posterior, plan, chain, executor)
 
 
 def point_at(*optima: list[float], width: float = 1.0) -> PointFit:
@@ -119,16 +108,14 @@ HARD_TARGETS = {
 @pytest.mark.parametrize("name", HARD_TARGETS)
 def test_hard_target_never_converges(name: str) -> None:
     density, point = HARD_TARGETS[name]
-    _, outcome = sampled(target(density, 2), point, PLAN, seed=1)
+    _, outcome = run(PLAN, 1, target(density, 2), point)
     assert not outcome.converged
     assert outcome.stop_reason.startswith(f"step limit {PLAN.most_steps} reached: ")
 
 
 def test_far_modes_converge_to_their_weights() -> None:
     """The proposal is fitted to both, so that walkers change between them."""
-    chain, outcome = sampled(
-        target(two_far_modes, 2), MODES, replace(PLAN, most_steps=4000), seed=2
-    )
+    chain, outcome = run(replace(PLAN, most_steps=4000), 2, target(two_far_modes, 2), MODES)
     assert outcome.converged
     share = np.mean(chain.coordinates("sampling")[..., 0] > 0)
     error = np.sqrt(0.8 * 0.2 / np.min(outcome.check.ess_bulk))
@@ -138,7 +125,7 @@ def test_far_modes_converge_to_their_weights() -> None:
 def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Differential evolution alone never changes between them: walkers stay where the pilot was."""
     monkeypatch.setattr(sampler, "_fitted", lambda *_: None)
-    chain, outcome = sampled(target(two_far_modes, 2), MODES, PLAN, seed=2)
+    chain, outcome = run(PLAN, 2, target(two_far_modes, 2), MODES)
     assert not outcome.converged
     upper = chain.coordinates("sampling")[..., 0] > 0
     assert (upper == upper[0]).all()
@@ -161,5 +148,5 @@ def test_good_run_converges(name: str, block: int, one_in: int) -> None:
     (posterior, point), runs = GOOD[name]
     plan = replace(PLAN, block=block, most_steps=1500)
     for seed in range(runs // 2 // one_in):
-        _, outcome = sampled(posterior, point, plan, seed)
+        _, outcome = run(plan, seed, posterior, point)
         assert outcome.converged, (seed, outcome.stop_reason)

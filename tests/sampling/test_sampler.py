@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import itertools
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +20,6 @@ from tests.sampling.samplings import (
     POSTERIOR,
     PluggedExecutor,
     Watched,
-    assert_same_chain,
-    assert_same_outcome,
     new_chain,
     run,
 )
@@ -35,18 +32,7 @@ def watched() -> Watched:
 
 @pytest.fixture(scope="module")
 def finished(watched: Watched) -> tuple[Chain, Outcome]:
-    chain = new_chain()
-    with ThreadPoolExecutor(1) as executor:
-        return chain, sample(POSTERIOR, PLAN, chain, executor, watched)
-
-
-def test_a_cheap_posterior_converges(finished: tuple[Chain, Outcome]) -> None:
-    chain, outcome = finished
-    assert outcome.converged
-    assert "converged (two consecutive checks)" == outcome.stop_reason
-    assert [] == outcome.check.shortcomings(PLAN.ess)
-    assert chain.steps("sampling") == outcome.check.steps
-    assert chain.proposals["sampling"] is not None
+    return run(watcher=watched)
 
 
 @pytest.mark.usefixtures("finished")
@@ -58,14 +44,6 @@ def test_it_stops_at_the_first_two_checks_that_find_nothing_missing(watched: Wat
     assert second.steps >= 1.2 * first.steps
     passed = [not result.shortcomings(PLAN.ess) for result in watched.checks]
     assert not any(before and after for before, after in itertools.pairwise(passed[:-1]))
-
-
-def test_a_used_up_budget_is_told_with_what_is_missing() -> None:
-    chain, outcome = run(replace(PLAN, most_steps=60, ess=1e6))
-    assert not outcome.converged
-    assert outcome.stop_reason.startswith("step limit 60 reached: ")
-    assert "ESS" in outcome.stop_reason
-    assert 60 == chain.steps("sampling")
 
 
 def test_a_budget_that_ends_with_the_first_good_check_is_told() -> None:
@@ -102,26 +80,14 @@ def test_without_any_proposal_differential_evolution_goes_on(
     assert remark.startswith("no proposal could be fitted to the draws of the tuning: ")
 
 
-def test_a_chain_whose_budget_was_small_goes_on_with_a_larger_one(
-    finished: tuple[Chain, Outcome],
-) -> None:
-    chain, outcome = run(replace(PLAN, most_steps=40))
-    assert not outcome.converged
-    with ThreadPoolExecutor(1) as executor:
-        outcome = sample(POSTERIOR, PLAN, chain, executor)
-    assert_same_chain(finished[0], chain)
-    assert_same_outcome(finished[1], outcome)
-
-
-@pytest.mark.parametrize("walkers", [2, 4])
-def test_too_few_walkers_are_refused(walkers: int) -> None:
-    with pytest.raises(
-        InputError, match=rf"^sampling.walkers: {walkers} are too few for 3 free .* at least 6$"
-    ):
-        new_chain(replace(PLAN, walkers=walkers))
-
-
-@pytest.mark.parametrize(("change", "says"), [({"ensembles": 3}, "4"), ({"walkers": 13}, "even")])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"ensembles": 3}, "4"),
+        ({"walkers": 13}, "even"),
+        ({"walkers": 4}, "^sampling.walkers: 4 are too few for 3 free .* at least 6$"),
+    ],
+)
 def test_a_plan_that_cannot_be_is_refused(change: dict[str, int], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        replace(PLAN, **change)
+        new_chain(replace(PLAN, **change))
