@@ -19,18 +19,9 @@ from bwbayes.inference import compiled, engine
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.inference.engine import choose
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.operator import Span
-from bwbayes.model.registry import HYSTERESIS, made
-from tests.inference.problems import (
-    INTERVAL,
-    decaying_sine,
-    posterior_of,
-    short_posterior,
-    truth,
-)
+from bwbayes.model.registry import HYSTERESIS
+from tests.inference.problems import short_posterior, truth
+from tests.model.operators.test_every_operator import posterior as of_operator
 
 MASS = {"mass": 0.00134, "stiffness": 4.1e5}
 
@@ -126,23 +117,15 @@ VOLTAGES = st.lists(
 ).filter(lambda path: max(path) - min(path) > 1)
 
 
-def of_operator(
-    name: str, gain: PolynomialGain | None = None, creep: Creep | None = None
-) -> Posterior:
-    """Return the posterior of a decaying sine with an operator and a lag, its start unknown."""
-    operator = made("hysteresis", name, HYSTERESIS, {})
-    span = Span(-100.0, 100.0)
-    actuator = Actuator("lag", "first", INTERVAL, operator, gain, creep, span)
-    voltage = decaying_sine(200)
-    return posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", {}, from_rest=False)
-
-
 @pytest.mark.parametrize("name", HYSTERESIS)
-@given(VOLTAGES, st.integers(0, 2**32 - 1))
+@given(VOLTAGES, st.integers(0, 2**32 - 1), st.booleans())
 @settings(deadline=None, max_examples=8)
-def test_engines_agree_on_any_path(name: str, path: list[float], seed: int) -> None:
+def test_engines_agree_on_any_path(
+    name: str, path: list[float], seed: int, from_rest: bool
+) -> None:
     """Plateaus, steps, turns at every sample; whole tens meet extrema and ends of the span."""
-    usual, reading = of_operator(name), np.random.default_rng(seed).normal(size=len(path))
+    usual = of_operator(name, from_rest=from_rest)
+    reading = np.random.default_rng(seed).normal(size=len(path))
     posterior = usual.altered(
         voltage=np.array(path), displacement=reading, training=(slice(0, len(path)),)
     )
@@ -150,9 +133,15 @@ def test_engines_agree_on_any_path(name: str, path: list[float], seed: int) -> N
 
 
 @pytest.mark.parametrize("name", HYSTERESIS)
+def test_engines_agree_with_gain_and_creep(name: str) -> None:
+    posterior = of_operator(name, parts=True)
+    assert_engines_agree(posterior, prior_draws(posterior, 40))
+
+
+@pytest.mark.parametrize("name", HYSTERESIS)
 def test_both_engines_simulate_alike(name: str) -> None:
     """To 1e-11 of the range; operators that are integrated, in steps of their own, to 1e-6."""
-    posterior = of_operator(name, PolynomialGain(), Creep((0.1, 1.0), growing=True))
+    posterior = of_operator(name, parts=True)
     theta = prior_draws(posterior, LANES + 3)
     expected = replace(posterior, engine="numpy").simulate(theta)
     got = replace(posterior, engine="numba").simulate(theta)

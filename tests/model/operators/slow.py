@@ -35,23 +35,17 @@ def run(
     column: Mapping[str, FloatArray],
     voltage: FloatArray,
     span: Span | None = SPAN,
-    cuts: Sequence[int] = (),
 ) -> FloatArray:
-    """Run an operator along a record, cut in pieces; without a span it starts from rest."""
+    """Run an operator along a record; without a span it starts from rest."""
     start = Span(0.0, 0.0) if span is None else span
     memory = operator.begin(column, float(voltage[0]), start, from_rest=span is None)
-    parts = []
-    for piece in np.split(voltage, sorted(cuts)):
-        if piece.size:
-            part, memory = operator.advance(column, piece, memory)
-            parts.append(part)
-    return np.concatenate(parts, axis=1)
+    return operator.advance(column, voltage, memory)[0]
 
 
-def drawn(operator: Operator, size: int, seed: int, ranges: Ranges = RANGES) -> Rows:
+def drawn(operator: Operator, size: int, seed: int) -> Rows:
     """Draw models that hold from the default priors, cut by floors and bounds."""
     generator = np.random.default_rng(seed)
-    known, size = Context(ranges), 3 * size + 20
+    known, size = Context(RANGES), 3 * size + 20
     column: Rows = {}
     for declared in operator.parameters:
         prior = declared.default(known)

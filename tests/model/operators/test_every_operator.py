@@ -61,18 +61,6 @@ def drawn_from(of: Posterior, count: int) -> FloatArray:
 
 
 @every_operator
-@pytest.mark.parametrize(("from_rest", "parts"), [(True, False), (False, True)])
-def test_engines_agree(name: str, from_rest: bool, parts: bool) -> None:
-    of = posterior(name, from_rest=from_rest, parts=parts)
-    theta = drawn_from(of, 40)
-    one = replace(of, engine="numpy").log_likelihood(theta)
-    other = replace(of, engine="numba").log_likelihood(theta)
-    assert np.isfinite(one).all()
-    size = of.only.voltage.size + np.abs(one)
-    assert np.max(np.abs(one - other) / size) < 1e-10
-
-
-@every_operator
 def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
     of = posterior(name, parts=True)
     actuator, theta = of.likelihood.actuator, of.only.table.actuator(drawn_from(of, 5))
