@@ -41,13 +41,11 @@ def scores(known: Normal, result: FloatArray) -> dict[str, float]:
             statistics[f"quantile {level} of {i}"] = (below, level)
     for i, j in combinations(range(known.mean.size), 2):
         statistics[f"covariance {i} {j}"] = (z[..., i] * z[..., j], correlation[i, j])
-    return {name: t_score(*pair) for name, pair in statistics.items()}
-
-
-def t_score(values: FloatArray, expected: float) -> float:
-    """Distance of the mean of values (steps, ensembles, walkers) from what is expected."""
-    means = np.mean(values, axis=(0, 2))
-    return float((np.mean(means) - expected) / (np.std(means, ddof=1) / means.size**0.5))
+    off = {}
+    for name, (values, expected) in statistics.items():
+        means = np.mean(values, axis=(0, 2))
+        off[name] = float((np.mean(means) - expected) / stats.sem(means))
+    return off
 
 
 def worst(known: Normal, result: FloatArray) -> float:
