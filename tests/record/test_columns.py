@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -162,28 +161,6 @@ def test_a_unit_is_read_from_any_usual_name(
 ) -> None:
     quantity, unit = base
     assert prefix + unit == unit_in(form.format(word, prefix + unit), quantity)
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["t [ms]", "U_mV", "pos (nm)"], ["t [ms]", "U_mV", "pos (nm)"]),
-        (["Timestamp [s]", "Command [V]", "Sensor [µm]"], None),
-        (["t/s", "a/V", "b/um"], None),
-        (["a/V", "b/um", "t/s", "temperature [C]"], ["t/s", "a/V", "b/um"]),
-        (["Time", "Volt", "x"], None),
-    ],
-)
-def test_columns_are_recognized_by_word_or_unit(
-    names: list[str], expected: list[str] | None
-) -> None:
-    expected = expected or names
-    values = dict(zip(expected, (TIME, VOLTAGE, DISPLACEMENT), strict=True))
-    frame = pd.DataFrame({name: values.get(name, 0 * TIME) for name in names})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        units = {"time": "s", "voltage": "V", "displacement": "um"}
-        assert_same(Record.from_pandas(frame, units=units))
 
 
 # Arrays and tables

@@ -82,12 +82,6 @@ def test_thousands_in_quotes_may_be_marked_by_the_separator(tmp_path: Path) -> N
     assert pytest.approx(record.displacement, rel=1e-12) == read(tmp_path, GOOD).displacement
 
 
-def test_lines_above_the_header_say_what_the_voltage_is_and_its_origin(tmp_path: Path) -> None:
-    record = read(tmp_path, "# voltage: command\n# origin: a stand: the first\n" + GOOD)
-    assert ("command", "a stand: the first") == (record.voltage_is, record.origin)
-    assert "output" == read_record(tmp_path / "record.csv", voltage_is="output").voltage_is
-
-
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
