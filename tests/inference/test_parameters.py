@@ -46,12 +46,6 @@ def active(prior: JointPrior) -> JointPrior:
     return joint(list(prior.parameters), passive=False)
 
 
-def passive(prior: JointPrior) -> bool:
-    """Whether a prior has that constraint."""
-    (gamma,) = (p.declared for p in prior.parameters if p.name == "gamma")
-    return gamma is not None and gamma.stated_bounds == "|gamma| <= beta"
-
-
 PRIORS = {
     "default": joint_prior(ALL, RANGES, {}),
     "cut": cut_prior(),
@@ -95,11 +89,13 @@ def test_parameters_and_coordinates_round_trip(name: str) -> None:
 
 def violations(prior: JointPrior, free: FloatArray) -> list[str]:
     v = dict(zip(prior.names, prior.theta(free).T, strict=True))
+    (gamma,) = (p.declared for p in prior.parameters if p.name == "gamma")
+    passive = gamma is not None and gamma.stated_bounds == "|gamma| <= beta"
     top = ceiling(v["alpha"], v["beta"], v["gamma"], v["exponent"])
     allowed = {
         "0 < alpha < d": (v["alpha"] > 0) & (v["alpha"] <= v["d"]),
         "|gamma| <= beta": (np.abs(v["gamma"]) <= v["beta"])
-        | (np.array(not passive(prior)) & (v["gamma"] >= -v["beta"])),
+        | (np.array(not passive) & (v["gamma"] >= -v["beta"])),
         "exponent": v["exponent"] >= 1,
         "initial": (np.abs(v["initial"]) <= top * (1 + 1e-12))
         | (("initial" not in prior.free_names) & (v["gamma"] <= v["beta"])),

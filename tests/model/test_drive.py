@@ -67,11 +67,6 @@ def test_record_and_its_every_kth_sample_have_the_same_times_and_speeds(
     assert speeds[1] == pytest.approx(speeds[0], rel=0.1)
 
 
-def test_rest_before_the_drive_does_not_make_its_times_longer() -> None:
-    voltage = np.concatenate([np.zeros(3000), sine()])
-    assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.5, rel=0.02)
-
-
 @pytest.mark.parametrize(
     "voltage", [np.zeros(1000), np.arange(1000.0), -np.arange(1000.0), np.repeat([0.0, 9.0], 500)]
 )
@@ -79,11 +74,10 @@ def test_without_a_turn_the_time_is_the_length(voltage: FloatArray) -> None:
     assert time_between_turns(voltage, INTERVAL) == pytest.approx(0.999)
 
 
-def test_record_of_one_sample_has_a_time_too() -> None:
+def test_windows_alone_count_each_with_its_own_turns_and_rest_before_a_drive_does_not() -> None:
     assert time_between_turns(np.zeros(1), INTERVAL) == INTERVAL
-
-
-def test_windows_alone_count_each_with_its_own_turns() -> None:
+    rested = np.concatenate([np.zeros(3000), sine()])
+    assert time_between_turns(rested, INTERVAL) == pytest.approx(0.5, rel=0.02)
     voltage = np.concatenate([sine(1.0, 5.0), sine(10.0, 5.0)])
     slow, fast = slice(0, 5000), slice(5000, 10000)
     assert time_between_turns(voltage, INTERVAL, [slow]) == pytest.approx(0.5)
