@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.commands import cli
 from bwbayes.app.commands.shared import finish
 from bwbayes.app.config.config import load
 from bwbayes.app.running.folder import RunFolder
@@ -19,6 +18,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
+from tests.app.conftest import Type
 
 
 @pytest.fixture(scope="module")
@@ -69,22 +69,12 @@ def test_line_on_the_screen_says_what_to_do(
     ],
 )
 def test_whatever_builds_on_it_is_refused_with_its_status(
-    cut_short: tuple[RunFolder, int],
-    command: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    bwbayes: Type, cut_short: tuple[RunFolder, int], command: str, tmp_path: Path
 ) -> None:
     words = command.replace("RUN", str(cut_short[0].path)).split()
-    monkeypatch.setattr("sys.argv", ["bwbayes", *words, "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 4
-    said = capsys.readouterr()
-    assert "" == said.out
-    assert said.err.startswith("NOT CONVERGED: ")
-    assert "`bwbayes resume " in said.err
-    assert 1 == said.err.count("\n")
+    said = bwbayes(*words, "--out", tmp_path / "out")
+    assert (4, "") == (said.status, said.out)
+    assert re.fullmatch(r"NOT CONVERGED: [^\n]*`bwbayes resume [^\n]*\n", said.err)
     assert not any(tmp_path.iterdir())
 
 
