@@ -16,13 +16,6 @@ from bwbayes.errors import InputError
 from tests.app.conftest import Type
 
 
-def write_reference(folder: Path, values: Any) -> Path:
-    path = folder / "asked.csv"
-    rows = [f"{0.02 * i:.9g},{value}" for i, value in enumerate(values)]
-    path.write_text("\n".join(["time_s,displacement_nm", *rows, ""]), encoding="utf-8")
-    return path
-
-
 @pytest.mark.filterwarnings("ignore:the reference is smoothed", "ignore:between samples")
 def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
@@ -52,7 +45,9 @@ def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: P
 def test_a_file_and_an_array_give_one_command(fit: bw.Fit, tmp_path: Path) -> None:
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
-    path = write_reference(tmp_path, [repr(float(1e3 * value)) for value in values])
+    path = tmp_path / "asked.csv"
+    rows = [f"{0.02 * i:.9g},{float(1e3 * value)!r}" for i, value in enumerate(values)]
+    path.write_text("\n".join(["time_s,displacement_nm", *rows, ""]), encoding="utf-8")
     by_file, by_array, again = (
         fit.compensate(reference, from_rest=True) for reference in (path, values, values)
     )

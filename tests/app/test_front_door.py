@@ -136,21 +136,15 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
     assert record.start + record.time_offset == pytest.approx(start, abs=1 / rate)
 
 
-def held_out(problem: Problem) -> np.ndarray[Any, Any]:
-    """Return whether each sample is held out."""
-    held = np.zeros(problem.record.samples, dtype=np.bool_)
-    for window in problem.validations["held_out"].windows:
-        held[window] = True
-    return held
-
-
 @pytest.mark.parametrize("kind", ["sine", "decaying", "unipolar", "chirp", "triangle"])
 @pytest.mark.parametrize("periods", [9.3, 40.0])
 def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: float) -> None:
     """Of every amplitude and rate that the drive has: no tail, and no end of a chirp."""
     voltage = drive(kind, periods, np.arange(4000) / 4000)
     path = written(tmp_path / "a.csv", voltage, moved(voltage, np.random.default_rng(0)))
-    held = held_out(resolved(path))
+    held = np.zeros(voltage.size, dtype=np.bool_)
+    for window in resolved(path).validations["held_out"].windows:
+        held[window] = True
     rates = np.abs(np.gradient(voltage))
     for values in (voltage, rates):
         assert stats.ks_2samp(values[held], values[~held]).statistic < 0.2

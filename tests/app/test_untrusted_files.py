@@ -216,7 +216,8 @@ class Skeleton(HTMLParser):
 
 def page(text: str, converged: bool) -> str:
     """Return the report of a run whose every text from a config or a record is this one."""
-    config = parse(QUICK + f"[parameters.d]\nfixed = 1.0\nlabel = {_toml(text)}\n", "my.toml")
+    label = "".join(f"\\U{ord(character):08X}" for character in text)
+    config = parse(QUICK + f'[parameters.d]\nfixed = 1.0\nlabel = "{label}"\n', "my.toml")
     odd = [
         dataclasses.replace(
             p, unit=text, label=config.parameters["d"].label or "", description=text
@@ -229,10 +230,6 @@ def page(text: str, converged: bool) -> str:
         run, name=text, remarks=(text,), facts={"record": origin, "config": text}
     )
     return example.page(run, pictures={"trace": b"png"})
-
-
-def _toml(text: str) -> str:
-    return '"' + "".join(f"\\U{ord(character):08X}" for character in text) + '"'
 
 
 @pytest.mark.parametrize(
