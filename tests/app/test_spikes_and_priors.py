@@ -56,8 +56,8 @@ def with_spikes(good: Record, rows: IntArray, sizes: FloatArray, signs: FloatArr
     return Spoiled(good, replace(good, displacement=displacement, truth=None), rows, sizes)
 
 
-def of_the_family(seed: int, most: int, least: float = 10.0, largest: float = 3e7) -> Spoiled:
-    """Return a record of up to `most` readings with spikes of `least` sds to `largest` um."""
+def of_the_family(seed: int, most: int) -> Spoiled:
+    """Return a record of up to `most` readings with spikes of ten sds to 30 m."""
     rng = np.random.default_rng([7, seed])
     samples = int(np.exp(rng.uniform(np.log(60), np.log(most))))
     good = measured(samples, float(rng.choice([20.0, 60.0, 100.0])), rng)
@@ -70,7 +70,7 @@ def of_the_family(seed: int, most: int, least: float = 10.0, largest: float = 3e
     if rng.random() < 0.3:
         rows[0] = 0
     rows = np.unique(rows[rows != 1])
-    sizes = np.exp(rng.uniform(np.log(least * NOISE), np.log(largest), rows.size))
+    sizes = np.exp(rng.uniform(np.log(10 * NOISE), np.log(3e7), rows.size))
     if rng.random() < 0.5:
         sizes[:] = sizes[0]
     sizes[rows == 0] += 3 * float(np.ptp(good.voltage))
@@ -104,15 +104,6 @@ def off(spoiled: Spoiled) -> str:
     without, clean = prior_arguments(problem), prior_arguments(resolved(spoiled.good))
     worst = float(np.max(np.abs(without - clean) / np.maximum(np.abs(clean), 1.0)))
     return f"priors off by {worst:.2g}" if worst > NEARLY else ""
-
-
-@pytest.mark.parametrize("size", [30.0, 1e4, 1e8])
-@pytest.mark.parametrize("samples", [60, 400])
-def test_priors_are_those_without_the_spike(samples: int, size: float) -> None:
-    """One reading of 1e3 um made d 17.6 +- 10 of 0.7, and one of 1e4 um 182 +- 97."""
-    good = measured(samples, 20.0, np.random.default_rng(1))
-    spoiled = with_spikes(good, np.array([samples // 3]), np.array([size]), np.array([1.0]))
-    assert "" == off(spoiled)
 
 
 @pytest.mark.parametrize("seed", range(10))
