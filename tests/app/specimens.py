@@ -14,11 +14,7 @@ from bwbayes.app.problem.problem import resolve
 POPULATION = {"d": (0.7, 0.05), "alpha": (0.3575, 0.08)}
 
 # Three free parameters: a record takes less than a second.
-CONFIG = """\
-seed = 3
-
-[record]
-
+MODEL = """\
 [model]
 dynamics = "none"
 noise = "white"
@@ -28,6 +24,10 @@ initial = { fixed = 0.0 }
 offset = { fixed = 0.0 }
 beta = { fixed = 0.0272 }
 gamma = { fixed = 0.0172 }
+"""
+CONFIG = (
+    f"seed = 3\n[record]\n{MODEL}"
+    + """\
 d = { prior = { distribution = "lognormal", median = 0.7, sigma = 0.3 } }
 alpha = { prior = { distribution = "lognormal", median = 0.35, sigma = 0.4 } }
 
@@ -37,6 +37,7 @@ walkers = 12
 block = 20
 pilot_steps = 60
 """
+)
 
 STAND = """\
 seed = {seed}

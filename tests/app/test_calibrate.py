@@ -19,28 +19,23 @@ from bwbayes.errors import InputError
 from bwbayes.prediction.bands import KINDS, LEVELS
 from tests.app import small
 from tests.app.conftest import Type
+from tests.app.specimens import MODEL
 
-# Three free parameters: a replicate takes a fraction of a second.
-TEXT = """\
+# A replicate takes a fraction of a second.
+TEXT = (
+    f"""\
 seed = 3
 name = "<b>small</b>"
 
 [record]
-signal = { amplitude = 100.0, frequency = 1.0, duration = 2.0, decay = 0.2 }
+signal = {{ amplitude = 100.0, frequency = 1.0, duration = 2.0, decay = 0.2 }}
 train = [[0.0, 1.5]]
 
 [stand]
 sample_rate = 40.0
 
-[model]
-dynamics = "none"
-noise = "white"
-
-[parameters]
-initial = { fixed = 0.0 }
-offset = { fixed = 0.0 }
-beta = { fixed = 0.0272 }
-gamma = { fixed = 0.0172 }
+{MODEL}"""
+    + """\
 d = { prior = { distribution = "normal", mean = 0.7, sd = 0.05 } }
 alpha = { prior = { distribution = "normal", mean = 0.3, sd = 0.05 } }
 sensor_sd = { prior = { distribution = "lognormal", median = 0.5, sigma = 0.3 } }
@@ -59,6 +54,7 @@ window = [1.5, 2.0]
 signal = { amplitude = 60.0, frequency = 2.0, duration = 1.5 }
 lead_in = 0.5
 """
+)
 
 FILES = ("calibration.json", "calibration.html", "config.toml")
 
@@ -259,6 +255,3 @@ def test_what_no_replicate_can_use_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="hardly any draw has"):
         begun(tmp_path / "a", text=TEXT.replace(old, new))
     assert [] == list(tmp_path.iterdir())
-
-
-# Progress
