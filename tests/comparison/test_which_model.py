@@ -93,11 +93,6 @@ def plant(model: str, seed: int) -> tuple[Record, Record]:
     )
 
 
-def candidates_for(operator: str, extras: str) -> list[str]:
-    others = [f"{other}{extras}" for other in NINE if other != operator]
-    return [*(f"{operator}{parts}" for parts in EXTRAS), *others]
-
-
 def compared(record: Record, names: list[str], folder: Path, **keys: Any) -> Comparison:
     config, records = config_for(record, **keys)
     models = models_of("; ".join(names), config.model)
@@ -105,11 +100,6 @@ def compared(record: Record, names: list[str], folder: Path, **keys: Any) -> Com
     return compare_models(
         config, Path(), models, folder, quiet, in_memory=records, files=False, workers=1
     )
-
-
-def right(model: str, comparison: Comparison) -> bool:
-    """Whether the truth is recommended, or left open with what is recommended."""
-    return model == comparison.recommended or model in comparison.tied
 
 
 def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, float]:
@@ -144,10 +134,12 @@ def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(
         model = f"{operator}{extras}"
         record, fresh = plant(model, number)
         folder = tmp_path / str(number)
-        comparison = compared(record, candidates_for(operator, extras), folder)
+        others = [f"{other}{extras}" for other in NINE if other != operator]
+        candidates = [*(f"{operator}{parts}" for parts in EXTRAS), *others]
+        comparison = compared(record, candidates, folder)
         assert comparison.recommended is not None
         missed = errors(comparison, folder, fresh)
-        named.append(right(model, comparison))
+        named.append(model in (comparison.recommended, *comparison.tied))
         alone.append(model == comparison.recommended and not comparison.tied)
         ratios.append(missed[comparison.recommended] / min(missed.values()))
         near.append(ratios[-1] < 1.1)

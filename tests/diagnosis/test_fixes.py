@@ -20,7 +20,6 @@ import pytest
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.explaining import explained
-from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.inference import map_estimate as pointfit
@@ -64,11 +63,6 @@ def put(records: Sequence[Record], folder: Path) -> None:
         write_record(record, folder / name)
 
 
-def reading(record: Record) -> FloatArray:
-    assert record.displacement is not None
-    return record.displacement
-
-
 def shifted(record: Record, delay: float) -> Record:
     """Move the voltage of a record by so many s."""
     voltage = np.interp(record.time - delay, record.time, record.voltage)
@@ -97,7 +91,7 @@ def followed(
         later = config.validation["next"].model_copy(update={"own_offset": True, "lead_in": 5.0})
         return config.model_copy(update={"record": changed, "validation": {"next": later}})
     if cause.kind == "sign":
-        records = [replace(each, displacement=-reading(each)) for each in records]
+        records = [replace(each, displacement=-np.array(each.displacement)) for each in records]
     elif found := re.match(r"delay of (\S+) ms", cause.text):
         records = [shifted(each, float(found[1]) / 1000) for each in records]
     elif cause.kind in ("saturation", "slew limit"):
