@@ -18,7 +18,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
 from bwbayes.app.running.folder import RunFolder
@@ -28,13 +28,14 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
+from tests.stand import autoregressive
 from tests.test_sampling_rates import records
 
 QUIET = Console(quiet=True)
 
 
-def config_of(kind: str, folder: Path, seed: int = 1) -> Config:
-    write_record(plant(kind, (8, seed), 8.0), folder / "record.h5")
+def config_of(kind: str, folder: Path) -> Config:
+    write_record(plant(kind, (8, 1), 8.0), folder / "record.h5")
     return Config(record=RecordConfig(file="record.h5", from_rest=True, train=[[0.0, 6.0]]))
 
 
@@ -104,17 +105,9 @@ def plain(sensor: float, rough: float) -> Record:
     """Return a record of a gain of 0.5 um/V, with a rough discrepancy or none."""
     rng = np.random.default_rng(3)
     record = thinned(records(2)[0])
-    state, slow = 0.0, np.empty(record.samples)
-    for number in range(record.samples):
-        state = 0.98 * state + np.sqrt(1 - 0.98**2) * rng.standard_normal()
-        slow[number] = state
+    slow = autoregressive(0.98, record.samples, (), rng)
     noise = rough * slow + sensor * rng.standard_normal(record.samples)
     return replace(record, displacement=0.5 * record.voltage + noise)
-
-
-def problem_of(folder: Path, record: Record, noise: str = "auto") -> Problem:
-    write_record(record, folder / "record.h5")
-    return resolve(parse(f'{CONFIG}[model]\nnoise = "{noise}"\n', "config"), folder)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +123,8 @@ def problem_of(folder: Path, record: Record, noise: str = "auto") -> Problem:
 def test_the_noise_is_chosen_by_evidence(
     record: Record, expected: set[str], tmp_path: Path
 ) -> None:
-    problem = problem_of(tmp_path, record)
+    write_record(record, tmp_path / "record.h5")
+    problem = resolve(parse(CONFIG, "config"), tmp_path)
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     noise, why = chosen_noise(problem, point)
     assert noise in expected
