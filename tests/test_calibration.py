@@ -81,13 +81,13 @@ def test_five_hundred_replicates_pass_and_find_small_defects() -> None:
             "unconverged": len(outcome.unconverged),
             "tests": len(outcome.statistics),
             "shortcomings": len(outcome.shortcomings),
-            "power": round(outcome.power["20 % too small"], 3),
+            "power": round(outcome.power["20% too small"], 3),
             "bands": {name: round(band.mean, 4) for name, band in outcome.bands.items()},
         },
     )
     assert () == outcome.shortcomings
     assert () == outcome.unconverged
-    assert outcome.power["20 % too small"] > 0.98
+    assert outcome.power["20% too small"] > 0.98
     assert {} == {name: errors for name, errors in off.items() if not abs(errors) < LIMIT}
     assert together_test(sound, prior) > LEVEL
     for defect in (narrowed, narrowed_a_tenth, widened, shifted):

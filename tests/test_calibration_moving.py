@@ -221,7 +221,7 @@ def test_twin_planted_defect_is_found(sound: Sound, defect: Plant) -> None:
 
 # Where the discrepancy is nearly all of the noise, the held-out part of a record begins with what
 # the fitted part leaves of it, and its bands take the discrepancy as a new record would have it:
-# they cover more than they promise, 93 % for 90 and 97 % for 95.
+# they cover more than they promise, 93% for 90 and 97% for 95.
 TOO_WIDE = pytest.mark.xfail(strict=True, reason="bands of the held-out part cover too much")
 
 

@@ -44,7 +44,7 @@ def campaign(seed: int) -> Problem:
 
 
 def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:
-    """Return the 95 % interval of each judged parameter."""
+    """Return the 95% interval of each judged parameter."""
     plan = replace(problem.plan, walkers=max(64, 2 * posterior.prior.dimensions + 6))
     outcome, chain = sampled(replace(problem, posterior=posterior, plan=plan))
     assert outcome.converged
@@ -56,7 +56,7 @@ def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:
 
 @pytest.mark.slow
 def test_joint_intervals_cover_the_truth_and_are_narrower_than_from_the_loops_alone() -> None:
-    """Over the seeds: coverage within three standard errors of 95 %, each interval narrower.
+    """Over the seeds: coverage within three standard errors of 95%, each interval narrower.
 
     The damping's by at least a half. Each of eight coverages fails by chance once in 200 times.
     """

@@ -149,7 +149,7 @@ def test_a_campaign_covers_and_reports_what_is_malformed(tmp_path: Path) -> None
         assert result[name]["width"] < 1.02
         told = ended.population.parameters[name]
         for draws, truth in ((told.mean, median), (told.spread, spread)):
-            # 99.9 %, for there is one population.
+            # 99.9%, for there is one population.
             assert np.quantile(draws, 0.0005) < truth < np.quantile(draws, 0.9995), name
     for level in ("50", "90", "95"):
         inside = [

@@ -63,7 +63,7 @@ def on_the_stand(fit: bw.Fit) -> Tracking:
 
 @pytest.mark.slow
 def test_feedback_with_feed_forward_is_best_up_to_20_hz() -> None:
-    """On every signal and at every frequency, for at least 95 % of the draws.
+    """On every signal and at every frequency, for at least 95% of the draws.
 
     On the stand's own actuator the mean error of many runs is less; in how many single runs it is,
     where steps come so fast that the two hardly differ, is kept as a figure.

@@ -87,7 +87,7 @@ def test_the_held_out_mean_misses_by_less_than_085_percent_of_the_range(honest: 
 def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any, folder: Path) -> None:
     """Within two block-bootstrap errors of nominal, at a mean width of at most 1.6 um.
 
-    The mean over eight sets of draws: a band of one set has a coverage that is off by 0.8 % (sd),
+    The mean over eight sets of draws: a band of one set has a coverage that is off by 0.8% (sd),
     which the bootstrap of readings does not see.
     """
     held_out = honest["validation"]["held_out"]
@@ -122,7 +122,7 @@ def parts(parts_folder: Path) -> Any:
 
 @pytest.mark.slow
 def test_parts_halve_the_error_and_narrow_the_bands(honest: Any, parts: Any) -> None:
-    """NRMSE at most 0.42 %, every sensor band within two errors, at least 35 % narrower."""
+    """NRMSE at most 0.42%, every sensor band within two errors, at least 35% narrower."""
     assert parts["converged"]
     held_out = parts["validation"]["held_out"]
     assert held_out["nrmse"] <= 0.0042
@@ -172,7 +172,7 @@ def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
 def test_the_voltage_computed_for_the_held_out_displacement_is_the_applied_one(
     name: str, limit: float, request: pytest.FixtureRequest
 ) -> None:
-    """At most 0.85 % of the range with Bouc-Wen, 0.45 % with elements that slip and a gain.
+    """At most 0.85% of the range with Bouc-Wen, 0.45% with elements that slip and a gain.
 
     The smoothing is the one whose voltages are nearest on the window that was fitted; the other
     window has no say in it.
@@ -204,7 +204,7 @@ def cut(record: Record, number: int, transient: float = 0.0) -> Record:
     return Record(record.voltage[part], reading, record.interval, origin="cut from the file")
 
 
-# Mean coverage of the 95 % sensor band, largest NRMSE, mean width in um.
+# Mean coverage of the 95% sensor band, largest NRMSE, mean width in um.
 Judged = tuple[float, float, float]
 
 
@@ -245,7 +245,7 @@ def on_cuts(posterior: Posterior, drawn: FloatArray) -> tuple[Judged, Judged]:
 def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     parts_folder: Path, parts: Any, plain_on_cuts: tuple[Judged, Judged]
 ) -> None:
-    """Their 95 % bands cover 88 to 99 %, and are at least 35 % narrower than plain Bouc-Wen's."""
+    """Their 95% bands cover 88 to 99%, and are at least 35% narrower than plain Bouc-Wen's."""
     assert parts["converged"]
     fit = finished(RunFolder.open(parts_folder))
     # So many draws are enough: most of their band is the discrepancy.

@@ -160,7 +160,7 @@ FIGURES: dict[str, list[str]] = {
     ],
     "-m slow tests/prediction/test_forecast.py": [
         "forecasts from posteriors/records",
-        "extent 100 forecasts from posteriors/95 % bands cover/*",
+        "extent 100 forecasts from posteriors/95% bands cover/*",
     ],
     "-m slow tests/test_campaign_of_records.py": [
         f"{JOINT}/seeds",
@@ -170,7 +170,7 @@ FIGURES: dict[str, list[str]] = {
     ],
     "-m slow tests/diagnosis/test_consistency.py": [
         "joint fits: records that agree/named",
-        "100 joint fits: records that agree/named with 10 % more gain",
+        "100 joint fits: records that agree/named with 10% more gain",
     ],
     "times | `python -m tests.benchmarks` |": ["extent inverse over simulation/*"],
     "-m slow tests/control/test_compensation.py": of_errors("compensation"),

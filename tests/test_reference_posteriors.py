@@ -4,10 +4,10 @@
 prior is a number, the posterior written a second time, slowly and plainly, and what dynesty found
 of it (``make.py``, more than 20,000 effective draws). First both likelihoods and both priors must
 agree; then a run by the normal path, of 5,000 effective draws or more of every parameter, must give
-means within 0.1 sd, sds within 5 %, and 5 and 95 % quantiles within 0.15 sd.
+means within 0.1 sd, sds within 5%, and 5 and 95% quantiles within 0.15 sd.
 
 These limits are 3.3 or more standard errors of the difference, most of them above five: over seeds,
-a right sampler would fail once in some 200 runs. A wrong one does not pass with sds that are 10 %
+a right sampler would fail once in some 200 runs. A wrong one does not pass with sds that are 10%
 off, nor with a noise whose correlation is half as long again, as the twins show.
 """
 

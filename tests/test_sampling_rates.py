@@ -41,7 +41,7 @@ class Answer(NamedTuple):
     """Means and sds (parameters,) of :data:`SHAPE`, the sensor's sd, and of another record.
 
     ``noise`` is what was fitted; ``error`` the mean's root mean square, um; ``coverage`` the sensor
-    bands' by level, and ``width`` the 95 % one's, um.
+    bands' by level, and ``width`` the 95% one's, um.
     """
 
     noise: str
@@ -140,14 +140,14 @@ def judged(seeds: Iterable[int], noise: str, folder: Path) -> dict[str, Any]:
 
 
 def coverage(answers: Sequence[Answer]) -> dict[str, float]:
-    """Return the mean coverage by level, and the lowest of the 95 % bands."""
+    """Return the mean coverage by level, and the lowest of the 95% bands."""
     means = {str(v): float(np.mean([one.coverage[v] for one in answers])) for v in LEVELS}
     return means | {"lowest": min(one.coverage[95] for one in answers)}
 
 
 @pytest.mark.slow
 def test_one_answer_at_any_rate(tmp_path: Path) -> None:
-    """Asked: 90 % within one sd and a factor of 1.5, errors within 1.1 times, coverage 90 to 99 %.
+    """Asked: 90% within one sd and a factor of 1.5, errors within 1.1 times, coverage 90 to 99%.
 
     One plant's error is 1.12 times as large. The sensor's sd is right from 200 Hz on: fewer
     readings hardly show it.

@@ -51,10 +51,10 @@ def test_a_steady_sine_converges_within_hundreds_of_steps(seed: int, tmp_path: P
 
 @pytest.mark.slow
 def test_forty_steady_sines_converge_and_their_intervals_cover(tmp_path: Path) -> None:
-    """All converge within two minutes; each parameter's 95 % interval covers 33 times or more.
+    """All converge within two minutes; each parameter's 95% interval covers 33 times or more.
 
-    Of intervals that cover 95 % that is missed once in 1,000 by one parameter, once in 100 by one
-    of eight; of those that cover 70 % it is missed in 94 of 100.
+    Of intervals that cover 95% that is missed once in 1,000 by one parameter, once in 100 by one
+    of eight; of those that cover 70% it is missed in 94 of 100.
     """
     both = np.zeros((2, RECORDS, len(PHYSICAL)))
     steps, seconds = [], []

@@ -117,7 +117,7 @@ class Calibration:
             if not abs(coverage.mean - int(level) / 100) <= LIMIT * coverage.error:
                 samples = f"the record {' '.join(record)}" if record else "held-out samples"
                 reasons.append(
-                    f"the {level} % {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} "
+                    f"the {level}% {kind} band covers {coverage.mean:.1%} ± {coverage.error:.1%} "
                     f"of {samples}"
                 )
         return tuple(reasons)
@@ -220,8 +220,8 @@ def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibrati
         },
         bands=bands,
         power={
-            "20 % too small": smooth_power(count, level, 0.8),
-            "10 % too small": smooth_power(count, level, 0.9),
+            "20% too small": smooth_power(count, level, 0.8),
+            "10% too small": smooth_power(count, level, 0.9),
         },
     )
 

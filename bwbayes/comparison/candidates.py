@@ -93,8 +93,8 @@ class Candidate:
     def mean(self) -> dict[str, float] | None:
         """What all held-out readings say together, each counting the same; None without any.
 
-        ``log_score`` in nats per reading, ``crps_um`` and ``width_um`` of the 95 % sensor band in
-        um, ``nrmse`` over the range of the readings; ``coverage`` of the 95 % sensor band with its
+        ``log_score`` in nats per reading, ``crps_um`` and ``width_um`` of the 95% sensor band in
+        um, ``nrmse`` over the range of the readings; ``coverage`` of the 95% sensor band with its
         error.
         """
         counts = np.array([np.sum(b.scored(b.measured)) for b in self.held_out], dtype=np.float64)

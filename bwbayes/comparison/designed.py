@@ -176,7 +176,7 @@ class Design(Product, Sequence[Promise]):
                     "promises",
                     "What each candidate would leave",
                     "The part that is expected to be left after one more record, with two Monte "
-                    "Carlo errors to either side; at 100 % a signal teaches nothing new.",
+                    "Carlo errors to either side; at 100% a signal teaches nothing new.",
                     partial(draw_promises, names, remaining, error, self.left),
                 ),
                 replace(signal, name="best", title=f"The best signal: {best.name}", caption=shown),

@@ -212,14 +212,14 @@ class Compensation(Product):
                 Picture(
                     "tracking",
                     "Reference and prediction",
-                    "The command, the displacement that it will give with its 95 % bands, and the "
+                    "The command, the displacement that it will give with its 95% bands, and the "
                     "error; beside it what a linear command would do.",
                     partial(figures.draw_command, name, *shown, self.limit),
                 ),
                 Picture(
                     "error",
                     "Error",
-                    "Left: the tracking error, to the reference as requested, with its 95 % bands; "
+                    "Left: the tracking error, to the reference as requested, with its 95% bands; "
                     "dotted, the limit. Right: what its rms may be, with the discrepancy, over the "
                     "draws.",
                     partial(figures.draw_error, *shown, self.limit),
@@ -246,7 +246,7 @@ class Compensation(Product):
         after, before = (played.numbers(self.limit) for played in (self.compensated, self.linear))
         low, high = after["rms_um"]["95"]
         text = (
-            f"rms error {after['rms_um']['mean']:.3g} µm (95 %: {low:.3g} to {high:.3g}), without "
+            f"rms error {after['rms_um']['mean']:.3g} µm (95%: {low:.3g} to {high:.3g}), without "
             f"compensation {before['rms_um']['mean']:.3g} µm"
         )
         if self.limit is not None:
@@ -272,7 +272,7 @@ class Compensation(Product):
             rows.append((f"{title}{reference}, mean", *means, "µm"))
             for level in LEVELS:
                 spans = (_span(error[str(level)]) for error in errors)
-                rows.append((f"{title}{reference}, {level} % interval", *spans, "µm"))
+                rows.append((f"{title}{reference}, {level}% interval", *spans, "µm"))
         return Table(
             "error",
             "Error",

@@ -163,7 +163,7 @@ class Tracking(Product):
             "track",
             "Error against frequency",
             "Rms error of the actuator itself, not of the readings: the mean over the draws, and "
-            "where 95 % of them lie.",
+            "where 95% of them lie.",
             partial(draw_tracking, table, CONTROLLERS),
         )
         return Report(
@@ -187,14 +187,14 @@ class Tracking(Product):
         )
 
     def _comparison(self) -> Banner:
-        """Say whether feedback and feed-forward together are best in 95 % of the draws or more."""
+        """Say whether feedback and feed-forward together are best in 95% of the draws or more."""
         highest, required = 20.0, 0.95  # Hz, and a share
         shares = [self.best[at] for _, frequency, at in self._cases if frequency <= highest]
         if not shares:
             line = f"no frequency up to {highest:g} Hz was simulated"
             return Banner("note", "Feedback and feed-forward are not compared", [line])
         lowest = min(shares)
-        share = "all" if lowest == 1 else f"at least {100 * lowest:.0f} % of the"
+        share = "all" if lowest == 1 else f"at least {100 * lowest:.0f}% of the"
         is_best = bool(lowest >= required)
         line = (
             "PID with feed-forward has less rms error than PID alone and feed-forward alone in "
@@ -255,7 +255,7 @@ class Tracking(Product):
 
 
 def _mean_and_interval(name: str, values: FloatArray) -> dict[str, float]:
-    """Return mean and 95 % interval over the draws."""
+    """Return mean and 95% interval over the draws."""
     low, high = np.quantile(values, [0.025, 0.975])
     return {name: float(values.mean()), f"{name}_low": float(low), f"{name}_high": float(high)}
 
@@ -284,9 +284,9 @@ def track(
         The test stand, the source of discrepancy and sensor noise, and the margins to keep.
     frequencies
         Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
-        leave 71 % of a sine, or to a tenth of the samples.
+        leave 71% of a sine, or to a tenth of the samples.
     amplitude
-        Of the references, um; by default 80 % of what the mean model reaches.
+        Of the references, um; by default 80% of what the mean model reaches.
     all_theta
         (draws, parameters): all draws that the controller must be stable with, and whose mean is
         the model; by default those that are simulated.
@@ -315,7 +315,7 @@ def track(
     center = ends.middle if abs(ends.middle) > 1e-3 * amplitude else 0.0
     # How many samples a jump of a reference is to take. A lag τ needs w = x + τ x′. A jump by two
     # amplitudes that takes four times τ, with a speed that is a Hann window, stays within the reach
-    # that the amplitude is 80 % of.
+    # that the amplitude is 80% of.
     turns = np.geomspace(1e-4, np.pi, 400)
     slow = turns[np.abs(mean.frequency_response(turns))[0] < LEFT]
     rise = max(round(4 / float(slow[0])), 1) if slow.size else 1

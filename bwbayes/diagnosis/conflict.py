@@ -23,7 +23,7 @@ DRAWS = 4000
 
 
 def effective(prior: JointPrior, generator: np.random.Generator) -> FloatArray:
-    """Return the 2.5 %, 50 % and 97.5 % quantiles of the joint prior, (3, free).
+    """Return the 2.5%, 50% and 97.5% quantiles of the joint prior, (3, free).
 
     The physical constraints cut the joint prior, so they are not those of the stated priors: where
     |γ| ≤ β, small β become less probable, and an initial state inside the hysteresis ceiling makes

@@ -23,7 +23,7 @@ from bwbayes.record.io.grid import clock
 # Above the first a failure may be luck, and below the second a success may be none.
 ALARM, DOUBT = 2e-4, 0.01
 
-# Coverage counts as off only where its odds are off by this factor: 95 % is not 92.6 %, but 94.
+# Coverage counts as off only where its odds are off by this factor: 95% is not 92.6%, but 94.
 ODDS = 1.5
 
 
@@ -225,7 +225,7 @@ class Standardized:
     def _misfit(self, extent: float) -> Iterator[str]:
         """Find a fit that misses its own readings by more than a sensor's noise would.
 
-        By 5 % of the range: a Bouc-Wen model misses one or two percent of an actuator's
+        By 5% of the range: a Bouc-Wen model misses one or two percent of an actuator's
         displacement. The range is that of all that was fitted: a short window's may be small.
         """
         assert self.bands.measured is not None

@@ -18,7 +18,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import fastest, time_between_turns
 
 # Part of the time between turning points over which a speed is taken: a sine's peak speed is then
-# 0.4 % too low, and noise of 1 % of its range adds a tenth.
+# 0.4% too low, and noise of 1% of its range adds a tenth.
 PART = 0.1
 
 # Times that are longer than the fitted ones by more than this factor leave creep that the record

@@ -29,7 +29,7 @@ STATISTICS: Mapping[str, tuple[str, str]] = {
     "residual_slow": ("Power of the residuals below 0.01 of the highest frequency", "-"),
     "residual_fast": ("Power of the residuals above 0.1 of the highest frequency", "-"),
     "pit_mean": ("Mean place in the band", "-"),
-    "pit_outside": ("Readings outside of the 90 % band", "-"),
+    "pit_outside": ("Readings outside of the 90% band", "-"),
 }
 
 
@@ -37,7 +37,7 @@ STATISTICS: Mapping[str, tuple[str, str]] = {
 class Statistic:
     """A number of the real readings among those of the replicated ones.
 
-    ``lower`` and ``upper`` hold 95 % of the replicated ones; ``p`` is the part of them that is
+    ``lower`` and ``upper`` hold 95% of the replicated ones; ``p`` is the part of them that is
     larger, equal ones counted half.
     """
 

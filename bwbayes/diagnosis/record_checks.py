@@ -124,7 +124,7 @@ def _plausibility(record: Record) -> Iterator[Finding]:
 
 
 def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
-    """Return the samples whose readings are isolated outliers; none if they are more than 5 %.
+    """Return the samples whose readings are isolated outliers; none if they are more than 5%.
 
     Ranges are measured anew without those that are found, until none is. With `ends` also a first
     or last reading that may as well belong to a transient: one that is no more than twice the range

@@ -84,9 +84,9 @@ class Stuck(NamedTuple):
 def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     """Return where values (samples,) stay at their largest while the other column moves on.
 
-    A sensor whose steps are finer than its noise hardly ever repeats itself, in 2 % of its
+    A sensor whose steps are finer than its noise hardly ever repeats itself, in 2% of its
     readings at most: then all readings of the largest value count. A coarse one repeats it at rest,
-    where the other column stands still: only runs count in which its quartiles lie apart, by 1 % of
+    where the other column stands still: only runs count in which its quartiles lie apart, by 1% of
     its range and by what three steps of the sensor are worth. And at a smooth peak: a parabola
     stays at its top level up to 2.4 times as long as at the next, a clipped one longer.
     """

@@ -219,7 +219,7 @@ def assess(
 ) -> Verdict | None:
     """Judge bands by the readings after ``scored_from``; None if there are none.
 
-    A good record, one that the fitted model describes, fails with a probability below 1 %.
+    A good record, one that the fitted model describes, fails with a probability below 1%.
 
     Parameters
     ----------

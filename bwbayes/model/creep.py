@@ -100,7 +100,7 @@ class Creep:
         decades = 1.0
         if len(self.times) > 1:
             decades = math.log10(self.times[-1] / self.times[0]) / (len(self.times) - 1)
-        # Published are 0.5 to 3 % a decade. A normal prior, of which one in twenty-five is below
+        # Published are 0.5 to 3% a decade. A normal prior, of which one in twenty-five is below
         # zero: strengths are linear in the displacement, and so their posterior is nearly normal.
         return normal(0.0175 * decades, 0.01 * decades)
 

@@ -44,7 +44,7 @@ DRAWS = 1000
 class SpecimenEstimate:
     """One specimen's parameter among the others.
 
-    ``lower``, ``median`` and ``upper`` are the 95 % interval with the population for a prior, and
+    ``lower``, ``median`` and ``upper`` are the 95% interval with the population for a prior, and
     ``own_lower``, ``own_median``, ``own_upper`` that of the record alone, both in the parameter's
     unit. ``p`` is how likely the record would be as far off, either way, from the population that
     all others show; ``outlier`` whether that is so unlikely that a sound campaign has one such

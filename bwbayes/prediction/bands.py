@@ -94,7 +94,7 @@ class Bands:
         return [slice(*edge) for edge in edges.reshape(-1, 2).tolist()]
 
     def sd(self, kind: Kind) -> FloatArray:
-        """Sd (samples,) of a normal distribution whose 90 % band is as wide, um."""
+        """Sd (samples,) of a normal distribution whose 90% band is as wide, um."""
         width: FloatArray = self.upper[kind, 90] - self.lower[kind, 90]
         return width / float(2 * scipy.special.ndtri(0.95))
 

@@ -36,7 +36,7 @@ MEASURES: Mapping[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean, sd and equal-tailed 95 % interval of a number over the posterior."""
+    """Mean, sd and equal-tailed 95% interval of a number over the posterior."""
 
     mean: float
     sd: float
@@ -58,7 +58,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Curve:
-    """A displacement along a voltage: mean and 95 % band, each (points,), um."""
+    """A displacement along a voltage: mean and 95% band, each (points,), um."""
 
     __repr__ = brief
 

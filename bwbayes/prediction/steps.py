@@ -27,7 +27,7 @@ CREEP_FROM = 0.1
 # What is measured of a step response: its name in a summary, title and unit for people.
 STEP_MEASURES: Mapping[str, tuple[str, str]] = {
     "level_um": ("Displacement, without creep", "um"),
-    "rise_s": ("Rise time, 10 to 90 %", "s"),
+    "rise_s": ("Rise time, 10 to 90%", "s"),
     "overshoot_percent": ("Overshoot", "%"),
     "creep_percent": ("Creep per decade of time", "%"),
 }
@@ -97,7 +97,7 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     ``level_um``
         x_∞.
     ``rise_s``
-        From the first time at which x_d passes 10 % of x_∞ to the first at which it passes 90 %;
+        From the first time at which x_d passes 10% of x_∞ to the first at which it passes 90%;
         None without dynamics.
     ``overshoot_percent``
         By how much the largest x_d exceeds x_∞, zero if it does not; None without dynamics.

@@ -150,7 +150,7 @@ class VirtualTestStand:
         a stationary Ornstein-Uhlenbeck process, sd 1.5 um, correlation time 0.5 s: peaks of about
         5 um, as in the paper's Fig. 8;
     ``"structural"``
-        :func:`creep` of 1 % of the displacement per decade of time, an even term of
+        :func:`creep` of 1% of the displacement per decade of time, an even term of
         1 um (V / 100 V)^2 that goes through the same dynamics, and a steady drift of 0.5 um from
         the first sample to the last.
 
@@ -312,12 +312,12 @@ class VirtualTestStand:
 
 
 def creep(displacement: FloatArray, interval: float) -> FloatArray:
-    """Creep, (samples,), um, of 1 % of a displacement, (samples,), um, per decade of time.
+    """Creep, (samples,), um, of 1% of a displacement, (samples,), um, per decade of time.
 
     By Kelvin-Voigt elements: each is a lag, ``tau_i c_i' + c_i = 0.005 x``, at rest at zero before
     the first sample, and the creep is their sum. The times tau_i are two per decade from 0.01 s to
-    10,000 s, so that after a step the creep rises by 1 % of it per decade within a hundredth of
-    that (their ripple is 0.3 %), from 0.1 s to 100 s after the step. The displacement is taken as
+    10,000 s, so that after a step the creep rises by 1% of it per decade within a hundredth of
+    that (their ripple is 0.3%), from 0.1 s to 100 s after the step. The displacement is taken as
     linear between samples, an interval, s, apart.
     """
     times = 10.0 ** np.arange(-2.0, 4.5, 0.5)  # s

@@ -73,13 +73,13 @@ def _statistics(calibration: Calibration) -> Table:
         covered = (f"{uniformity.covered[level]:.1%}" for level in LEVELS)
         rows.append((name, description, unit_text(unit), *tests, *covered))
     limits = ("{:.1%} to {:.1%}".format(*calibration.limits[level]) for level in LEVELS)
-    rows.append(("", "99 % binomial limits", "", "", "", "", *limits))
+    rows.append(("", "99% binomial limits", "", "", "", "", *limits))
     columns: list[str | TableColumn] = [
         TableColumn("Name", on="screen"),
         TableColumn("Statistic", on="page"),
         TableColumn("Unit", on="page"),
     ]
-    columns += ["p", "p adjusted", "ECDF", *(f"{level} %" for level in LEVELS)]
+    columns += ["p", "p adjusted", "ECDF", *(f"{level}%" for level in LEVELS)]
     return Table(
         "statistics",
         "Ranks and intervals",
@@ -102,7 +102,7 @@ def _bands(calibration: Calibration) -> Table:
     return Table(
         "bands",
         "Coverage of the bands",
-        ("Band", "Of", *(f"{level} %" for level in LEVELS)),
+        ("Band", "Of", *(f"{level}%" for level in LEVELS)),
         rows,
         note=f"Mean over replicates, and its standard error from the spread between them; from "
         f"{JUDGED_FROM} replicates on, each must be within 3 of what the band promises (by chance, "

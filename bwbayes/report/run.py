@@ -123,7 +123,7 @@ def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:
 
 def _sampled(result: Result) -> str:
     check = result.outcome.check
-    return f"{check.steps} steps, {100 * check.acceptance:.0f} % of the moves accepted."
+    return f"{check.steps} steps, {100 * check.acceptance:.0f}% of the moves accepted."
 
 
 def _results(result: Result) -> list[Text]:
@@ -215,7 +215,7 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
         note = (
             "Each number of the fitted readings, among those of records that posterior draws make "
             "anew with their own noise; p: the part of these that is larger. Extreme: among "
-            "the outermost 1 %."
+            "the outermost 1%."
         )
         checks = tables.replicated_tables(result)
         yield Section("Posterior predictive checks", [*checks, Text(note, note=True)])

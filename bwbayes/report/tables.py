@@ -117,7 +117,7 @@ def replicated_tables(result: Result) -> list[Table]:
     columns = {
         "Number": "{words}",
         "Observed": "{observed:.4g}",
-        "95 % of replicated": "{lower:.4g} to {upper:.4g}",
+        "95% of replicated": "{lower:.4g} to {upper:.4g}",
         "Unit": "{unit}",
         "p": "{p:.3f}",
         "Extreme": "{extreme}",
@@ -198,11 +198,11 @@ def other_scores_table(
     for level in sorted(LEVELS, reverse=True):
         covers = [covered(score, "displacement", level) for score in judged]
         if any(covers):
-            title = f"{level} % displacement band covers displacement"
+            title = f"{level}% displacement band covers displacement"
             rows.append([title, *(text or UNKNOWN for text in covers)])
-        sensor = f"{level} % sensor band:"
+        sensor = f"{level}% sensor band:"
         rows += [
-            [f"{sensor} worst second", *(f"{100 * s.worst_second[level]:.1f} %" for s in judged)],
+            [f"{sensor} worst second", *(f"{100 * s.worst_second[level]:.1f}%" for s in judged)],
             [f"{sensor} mean width", *(length_text(s.width_um[level]) for s in judged)],
             [
                 f"{sensor} interval score",
@@ -241,7 +241,7 @@ def steps_table(steps: Mapping[str, StepResponse]) -> Table:
     }
     note = (
         "To an ideal step from zero, demagnetized and at rest, from the posterior of the "
-        "parameters alone. The rise goes from 10 to 90 % of where the displacement settles without "
+        "parameters alone. The rise goes from 10 to 90% of where the displacement settles without "
         "creep; overshoot is what goes beyond that. Creep is the growth from 0.1 s to the end of "
         "the step, of the displacement at 0.1 s, a decade of time."
     )
@@ -298,7 +298,7 @@ def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str,
 def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) -> Table:
     """Return each parameter's prior, stated and in effect, or its fixed value.
 
-    The prior in effect is what the physical constraints leave of the stated one: median and 95 %
+    The prior in effect is what the physical constraints leave of the stated one: median and 95%
     interval under the joint prior. On the screen it stands below the stated one where it differs.
     ``point`` has the parameters of a point fit, if there is one.
     """
@@ -342,7 +342,7 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
         TableColumn("Unit", text="{unit}"),
     )
     note = Markup(
-        "Effective: median, with the 2.5 % and 97.5 % quantiles, of each prior once the {}. The "
+        "Effective: median, with the 2.5% and 97.5% quantiles, of each prior once the {}. The "
         "scales of default priors come from the training data's ranges of voltage and displacement "
         "and from the drive's times."
     ).format(cut)

@@ -91,7 +91,7 @@ def covered(scores: Scores, kind: str, level: int) -> str:
     if share is None:
         return ""
     text = f"{100 * share[level]:.1f}"
-    return f"{text} %" if error is None else f"{text} ± {100 * error[level]:.1f} %"
+    return f"{text}%" if error is None else f"{text} ± {100 * error[level]:.1f}%"
 
 
 def error_text(scores: Scores) -> str:

@@ -97,7 +97,7 @@ class StudentMixture:
         if log_density is not None:
             draws = draws[:count]
             log_ratio = log_density - mixture.log_density(draws)
-            # The 2 % of draws with the largest log p − log q.
+            # The 2% of draws with the largest log p − log q.
             worst = log_ratio >= np.quantile(log_ratio, 0.98)
             added = _of_shares(draws, np.stack([worst, ~worst]))
             mixture = StudentMixture(

@@ -102,7 +102,7 @@ def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:
         result[key] for key in ("passed", "telling", "replicates", "unconverged", "tests")
     )
     assert 3 == result["seed"]
-    assert {"20 % too small", "10 % too small"} == set(result["power_of_one_smooth_test"])
+    assert {"20% too small", "10% too small"} == set(result["power_of_one_smooth_test"])
     first, *lines = (whole / "replicates.jsonl").read_text().splitlines()
     assert 3 == json.loads(first)["replicates"]
     assert [0, 1, 2] == [json.loads(line)["number"] for line in lines]
@@ -164,7 +164,7 @@ def test_request_to_stop_is_answered_with_how_to_go_on(
         file.write(b'{"number": 2, "ra')  # cut off
     done = bwbayes("calibrate", "--resume", "a", "--workers", "2", "--executor", "threads")
     assert 0 == done.status, done.err
-    texts = ("log_likelihood", "loop_area", "95 %", "sensor", "power", "3 replicates, 0 not")
+    texts = ("log_likelihood", "loop_area", "95%", "sensor", "power", "3 replicates, 0 not")
     for text in (*texts, "low power: more replicates are needed"):
         assert text in done.out
     assert "judging" in done.err

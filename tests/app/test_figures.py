@@ -77,7 +77,7 @@ def test_outer_axes_are_named_with_their_units(figures: Mapping[str, Figure]) ->
         labels = {p.get_xlabel() for p in figure.axes} | {p.get_ylabel() for p in figure.axes}
         if name in ("corner", "trace", "ranks"):
             labels |= {label for panel in figure.axes for label in names(panel)}
-        for label in labels - {"", "step", "$n$", "mean of the walkers, and 90 % of them"}:
+        for label in labels - {"", "step", "$n$", "mean of the walkers, and 90% of them"}:
             assert re.search(r"\((.+)\)$", label), label
             assert "um" not in re.findall(r"\w+", label), label
     known = [r"$d$ (µm/V)", r"$\alpha$ (µm/V)", r"$\tau_\mathrm{lag}$ (s)", "$k$ (N/m)"]

@@ -202,7 +202,7 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
     assert made.plot.trace().axes
     for text in (repr(made), made._repr_html_()):
         assert "NOT CONVERGED: step limit 25 reached; intervals are withheld" in text
-        assert "95 %" not in text
+        assert "95%" not in text
 
 
 def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(

@@ -76,15 +76,15 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
     assert {"held-out (held out)": expected, "training": expected} == rows(text, "validation")
     table = rows(text, "scores")
     assert ["0.817 µm"] * 2 == table["CRPS"]
-    assert ["–", "91.5 ± 2.5 %"] == table["90 % displacement band covers displacement"]
-    assert ["12.1 %"] * 2 == table["50 % sensor band: worst second"]
-    assert ["6.13 µm"] * 2 == table["95 % sensor band: mean width"]
-    assert ["8.22 µm"] * 2 == table["90 % sensor band: interval score"]
+    assert ["–", "91.5 ± 2.5%"] == table["90% displacement band covers displacement"]
+    assert ["12.1%"] * 2 == table["50% sensor band: worst second"]
+    assert ["6.13 µm"] * 2 == table["95% sensor band: mean width"]
+    assert ["8.22 µm"] * 2 == table["90% sensor band: interval score"]
 
 
 def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     cause = Finding("noise", "the noise is not like that", "try another noise")
-    failed = Verdict("held-out", False, False, ("covers 60 %",), cause)
+    failed = Verdict("held-out", False, False, ("covers 60%",), cause)
     held = Verdict("training", True, True)
     run = dataclasses.replace(example.run(), verdicts={"training": held, "held-out": failed})
     text = page(run)

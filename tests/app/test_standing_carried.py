@@ -20,7 +20,7 @@ from bwbayes.app.commands.cli import cli
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import Standing, Verdict
 
-OFF = "95 % bands cover 55 % of 50 readings"
+OFF = "95% bands cover 55% of 50 readings"
 STATUS = {False: 3, None: 5}
 HEADLINE = {False: "VALIDATION FAILED", None: "Validation inconclusive"}
 

@@ -49,7 +49,7 @@ def test_numbers_table_and_picture_agree(
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     assert f"{numbers['table'][0]['rms_um']:.2f}</td>" in page
     least = min(best["share"] for best in numbers["best_share"])
-    share = "all" if least == 1 else f"at least {100 * least:.0f} % of the"
+    share = "all" if least == 1 else f"at least {100 * least:.0f}% of the"
     assert f"in {share} draws, on every signal" in page
     assert numbers["table"] == tracking.numbers()["table"]
     assert 4 == len(fit.plot.tracking(tracking).axes)

@@ -98,7 +98,7 @@ def test_twin_defects_are_found(defect: str) -> None:
         result = judged(entries(spoiled))
         assert not result.passed
         assert result.telling
-        assert result.power["20 % too small"] > 0.98
+        assert result.power["20% too small"] > 0.98
         if defect == "two peaks":
             assert any("leaves its band" in text for text in result.shortcomings)
 

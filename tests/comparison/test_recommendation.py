@@ -104,7 +104,7 @@ def test_a_part_worth_fewer_than_five_independent_readings_has_no_vote() -> None
 def test_errors_cover_differences_of_correlated_blocks() -> None:
     """400 pairs whose difference has a mean of zero, in blocks of twice their correlation time.
 
-    The share of them beyond the 95 % limit is 0.05 for exact errors; the twin, taken for certain
+    The share of them beyond the 95% limit is 0.05 for exact errors; the twin, taken for certain
     to within independent readings, has far more.
     """
     rng = np.random.default_rng(7)
@@ -156,11 +156,11 @@ def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
 def test_what_does_not_hold_is_said_before_what_is_recommended(
     holds: bool | None, status: str
 ) -> None:
-    standing = Standing(holds, ("next: the bands cover 55 %",))
+    standing = Standing(holds, ("next: the bands cover 55%",))
     wide = replace(model("wide", COMMON - 700 + 60 * noise(2)), standing=Standing())
     comparison = recommend([replace(model("good", COMMON), standing=standing), wide])
     first, second, *_ = as_text(comparison.report()).splitlines()
-    assert re.match(rf"{status}.*: next: the bands cover 55 %", first)
+    assert re.match(rf"{status}.*: next: the bands cover 55%", first)
     # No more digits than are known, and no powers of ten.
     assert re.match(
         r"good is recommended: by the log score wide is worse, by \d+0 ± \d+0 nats", second

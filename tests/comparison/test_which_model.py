@@ -1,6 +1,6 @@
 """Records of nine operators, with and without creep and nonlinearity: the right model is named.
 
-The parameters come from the prior of a typical actuator, the noise is white, 0.3 % of the range,
+The parameters come from the prior of a typical actuator, the noise is white, 0.3% of the range,
 and fitted with a discrepancy as any record is: 3,000 readings, of which the last third is held out.
 The candidates have each of the nine operators with the parts that the plant has, and the plant's
 operator with the other parts: twelve. The right model is recommended or left open with what is
@@ -127,7 +127,7 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
 def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(
     tmp_path: Path,
 ) -> None:
-    """Right or tied in 19 of 20; within 10 % of the best candidate's error in 18 of 20."""
+    """Right or tied in 19 of 20; within 10% of the best candidate's error in 18 of 20."""
     named, alone, near, ratios = [], [], [], []
     for number in range(RECORDS):
         operator, extras = NINE[number % len(NINE)], EXTRAS[number % len(EXTRAS)]

@@ -125,7 +125,7 @@ def parts(seed: int) -> dict[tuple[str, int], float]:
 
 @pytest.mark.slow
 def test_forty_fits_to_measured_voltages_are_where_their_commands_say() -> None:
-    """The 95 % bands of the error cover 93 to 97 %; all within three standard errors."""
+    """The 95% bands of the error cover 93 to 97%; all within three standard errors."""
     figures = study("compensation by a DAC", map(parts, range(SEEDS)))
     assert 0.93 <= figures["band 95"][0] <= 0.97, figures
     assert max(abs(error) for _, error in figures.values()) < 3.0, figures

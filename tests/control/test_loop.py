@@ -109,8 +109,8 @@ def test_a_discrepancy_is_an_error_and_sensor_noise_is_none() -> None:
     """At rest: the rms error is that of the process, 400 draws of 100 of its times.
 
     Within five standard errors of the mean square, which for an Ornstein-Uhlenbeck process over
-    N times is sd² sqrt(2 / N): of 40,000 times 0.7 % each, so a false alarm once in a million, and
-    a process with a wrong time or sd 4 % off is noticed. Sensor noise alone leaves none.
+    N times is sd² sqrt(2 / N): of 40,000 times 0.7% each, so a false alarm once in a million, and
+    a process with a wrong time or sd 4% off is noticed. Sensor noise alone leaves none.
     """
     _, _, rows = of("bouc-wen", 1, 400)
     required = np.zeros((1, 1001))

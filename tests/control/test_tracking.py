@@ -38,7 +38,7 @@ def tracking() -> Tracking:
 
 
 def test_feed_forward_and_feedback_together_beat_either_alone(tracking: Tracking) -> None:
-    """At every frequency up to 20 Hz, on all signals, for at least 95 % of the draws."""
+    """At every frequency up to 20 Hz, on all signals, for at least 95% of the draws."""
     assert (3, 4) == tracking.best.shape
     assert (tracking.best >= 0.95).all(), tracking.best
 

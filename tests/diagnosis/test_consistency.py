@@ -63,10 +63,10 @@ def test_a_record_with_another_noise_is_named_and_no_other() -> None:
 
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_they_should_be() -> None:
-    """Of 100 pairs of records of one actuator 5 % lie beyond the 95 % of the chi-square.
+    """Of 100 pairs of records of one actuator 5% lie beyond the 95% of the chi-square.
 
     Of 200 comparisons, which come in pairs that are nearly the same: within three standard errors
-    of 100 independent ones, 0 to 11.5 %, and at most two at the level of an alarm, where 0.2 to 0.4
+    of 100 independent ones, 0 to 11.5%, and at most two at the level of an alarm, where 0.2 to 0.4
     are expected. Fails by chance once in 100 times. Twin: with a tenth more gain nine in ten are
     named.
     """
@@ -78,10 +78,10 @@ def test_false_alarms_are_as_rare_as_they_should_be() -> None:
     keep(
         "joint fits: records that agree",
         {
-            "beyond 95 % of the chi-square": beyond,
+            "beyond 95% of the chi-square": beyond,
             "named": alarms,
             "smallest p": round(float(p.min()), 5),
-            "named with 10 % more gain": np.mean(named),
+            "named with 10% more gain": np.mean(named),
         },
     )
     assert beyond <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)

@@ -137,10 +137,10 @@ def test_a_fix_that_is_followed_is_right_for_the_next_record(kind: str, tmp_path
 
 @pytest.mark.slow
 def test_plants_get_their_cause_and_its_fix_covers_their_next_record(tmp_path: Path) -> None:
-    """Of 20 kinds at least 90 % get their cause and are then covered; of good ones 1 % get one.
+    """Of 20 kinds at least 90% get their cause and are then covered; of good ones 1% get one.
 
-    The right cause may be tied, and 90 to 99 % of readings lie in the next record's 95 % band. No
-    bands pass on the record that was fitted and cover less than 85 % of the next one.
+    The right cause may be tied, and 90 to 99% of readings lie in the next record's 95% band. No
+    bands pass on the record that was fitted and cover less than 85% of the next one.
     """
     kinds: dict[str, dict[str, int]] = {}
     for kind in CAUSES:

@@ -91,7 +91,7 @@ def along(white: FloatArray) -> Innovations:
 
 
 def test_innovations_of_the_right_model_raise_no_remark() -> None:
-    """At most 4 false alarms of 400, 1 %; of 1,000 others there were three."""
+    """At most 4 false alarms of 400, 1%; of 1,000 others there were three."""
     generator = np.random.default_rng(1)
     alarms = 0
     for _ in range(400):

@@ -91,7 +91,7 @@ def missed(kind: str, numbers: range) -> list[int]:
     [(range(30), 0), pytest.param(range(1000, 1400), 4, marks=pytest.mark.slow)],
 )
 def test_good_records_of_all_drives_raise_no_alarm(records: range, most: int) -> None:
-    """None of 30; at a rate of 1 % that happens three times in four, at 10 % in one of 24."""
+    """None of 30; at a rate of 1% that happens three times in four, at 10% in one of 24."""
     assert len(false_alarms(records)) <= most, false_alarms(records)
 
 
@@ -125,7 +125,7 @@ def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not(
 ) -> None:
     """Of 100 records four are not named by chance once in 50 times, of 20 two once in 60.
 
-    Loops are 1 % of the range.
+    Loops are 1% of the range.
     """
     found = [
         [len(findings_of("no hysteresis", without_memory(seed, loop))) for seed in range(records)]

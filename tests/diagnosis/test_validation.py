@@ -47,7 +47,7 @@ def good(generator: np.random.Generator, number: int) -> Verdict:
     ("records", "most"), [(300, 3), pytest.param(10_000, 20, marks=pytest.mark.slow)]
 )
 def test_bands_of_good_records_hold(records: int, most: int) -> None:
-    """At most 1 % false alarms; of 4,000 there was one. Some are too short to tell."""
+    """At most 1% false alarms; of 4,000 there was one. Some are too short to tell."""
     generator = np.random.default_rng(records)
     told = [good(generator, number).holds for number in range(records)]
     assert told.count(False) <= most

@@ -2,7 +2,7 @@
 
 Each run fits one record, predicts the other half of it and another record, which was cut from a
 running drive and has an offset of its own. The records were drawn after all limits were set.
-Limits: at most 1 % of good runs' verdicts say no, and no spoilt record holds; the twins are the
+Limits: at most 1% of good runs' verdicts say no, and no spoilt record holds; the twins are the
 spoilt records, from the same generator.
 """
 
@@ -25,7 +25,7 @@ from tests.stand import Stand
 RATE = 100.0
 GOOD, SPOILT = 400, 50
 
-# A record that holds is right where its 95 % band covers this much of it; a fit, where d and gamma
+# A record that holds is right where its 95% band covers this much of it; a fit, where d and gamma
 # are so few sds from the truth.
 COVERS, CLOSE = 0.85, 4.0
 
@@ -193,7 +193,7 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
 
 @pytest.mark.slow
 def test_good_runs_hold(tmp_path: Path) -> None:
-    """At most 1 % of the verdicts of 400 good runs, three each, say no."""
+    """At most 1% of the verdicts of 400 good runs, three each, say no."""
     counts, lines = good_runs(20261125, GOOD, tmp_path)
     keep("good runs hold", {"runs": GOOD, **counts, "said no": lines})
     assert len(lines) <= 0.01 * 3 * GOOD

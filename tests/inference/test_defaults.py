@@ -96,7 +96,7 @@ def share_below(ranges: Ranges, exponent: float | Distribution, **values: float)
     + [(2.0, 20.0), (20.0, 4.0)],
 )
 def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bias: float) -> None:
-    """Within the central 98 % of the cut prior, and 95 % of the offset's."""
+    """Within the central 98% of the cut prior, and 95% of the offset's."""
     voltage = drive(amplitude, bias=bias * amplitude)
     ranges = ranges_of(voltage, displacement(voltage), 1e-3)
     shares = share_below(ranges, 1.0, d=0.7, alpha=0.3575, beta=0.0272, gamma=0.0172)
@@ -135,7 +135,7 @@ POWERS = {
 
 
 def half_width(name: str, exponent: float, k: float = 1.0, m: float = 1.0) -> float:
-    """Return half of the central 68 % of a default prior, given k and m."""
+    """Return half of the central 68% of a default prior, given k and m."""
     voltage = drive()
     ranges = ranges_of(m * voltage, k * 0.6 * voltage, 1e-3)
     low, high = prior(name, ranges, exponent).frozen.ppf([0.16, 0.84])

@@ -89,7 +89,7 @@ def test_likelihood_is_the_sum_of_the_records_likelihoods(engine: Engine) -> Non
 
 
 def test_halves_with_a_discrepancy_are_the_whole() -> None:
-    """Means to 0.1 sd and sds to 5 %, the halves ten correlation times apart.
+    """Means to 0.1 sd and sds to 5%, the halves ten correlation times apart.
 
     Windows of one record share the discrepancy, too: halves that follow at once on each other lose
     what it remembers over the cut, 0.15 sd of the offset in 20 s. By point fits, which have no

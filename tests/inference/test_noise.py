@@ -110,7 +110,7 @@ def test_a_filter_that_has_settled_goes_on_as_one_that_has_not(quality: float | 
 
 @pytest.mark.parametrize("quality", [None, 0.02, 0.5, 3.0])
 def test_draws_have_the_covariance(quality: float | None) -> None:
-    """800 draws of 40 samples: a variance is known to 5 %, so 20 % too much is seen (4 sds)."""
+    """800 draws of 40 samples: a variance is known to 5%, so 20% too much is seen (4 sds)."""
     theta = parameters(0.3, 0.1, quality)
     generator = np.random.default_rng(3)
     draws = np.array([noise_of(theta).draw(theta[np.newaxis], 40, generator) for _ in range(800)])

@@ -1,11 +1,11 @@
 """Where the posterior is known in closed form, the sampler's draws are draws from it.
 
 The draws come by the normal path with sixteen ensembles, which are independent. So each expected
-value (of every parameter its mean and variance, and the probability below its 5, 50 and 95 %
+value (of every parameter its mean and variance, and the probability below its 5, 50 and 95%
 quantiles; of every two their covariance) gets a t-score with 15 degrees of freedom. A score beyond
 ``ALARM`` = 6 is an alarm: a right sampler gives one in 1,400 tests of all 29 statistics. Variances
-are known to about 1.3 %, so one sd that is 5 % wrong is found six times in seven, and one that is
-7 % wrong 998 times in a thousand.
+are known to about 1.3%, so one sd that is 5% wrong is found six times in seven, and one that is
+7% wrong 998 times in a thousand.
 """
 
 from __future__ import annotations
@@ -87,5 +87,5 @@ def test_the_draws_are_from_the_normal(free: tuple[str, ...], noise: str) -> Non
     assert max(map(abs, off.values())) < ALARM, off
     # The twins: a likelihood that takes the noise for 0.8 times what it is ...
     assert worst(Linear(free, noise, 1.25).exact, result) > 2 * ALARM
-    # ... and the same draws, 7 % nearer to their mean.
+    # ... and the same draws, 7% nearer to their mean.
     assert worst(known, known.mean + 0.93 * (result - known.mean)) > ALARM

@@ -1,7 +1,7 @@
 """Creep that a record cannot show: bands grow with what was not tried, and no others do.
 
 The plants creep with the logarithm of the time, made by a convolution with log₁₀(1 + t/t₀) that
-knows no lags; 0 to 3 % of the displacement a decade, fitted 16 s at 1 to 5 Hz.
+knows no lags; 0 to 3% of the displacement a decade, fitted 16 s at 1 to 5 Hz.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def fit() -> tuple[Posterior, FloatArray, float, float, np.random.Generator]:
 def test_a_hold_is_covered_that_was_not_before(
     fit: tuple[Posterior, FloatArray, float, float, np.random.Generator],
 ) -> None:
-    """The quick twin of the study: a plant of 1.9 % a decade, 100 s after a record of 16 s."""
+    """The quick twin of the study: a plant of 1.9% a decade, 100 s after a record of 16 s."""
     posterior, draws, strength, _, source = fit
     _, voltage, interval = list(plans())[1]
     plan, truth = Record(voltage, None, interval), plant(voltage, interval, strength, source)
@@ -156,7 +156,7 @@ def test_a_model_that_creeps_stays_as_it_is() -> None:
 
 @pytest.mark.slow
 def test_slow_plans_are_covered_over_forty_plants() -> None:
-    """95 % displacement bands cover 88 to 99 % on the mean, no plan is covered below 70 %.
+    """95% displacement bands cover 88 to 99% on the mean, no plan is covered below 70%.
 
     Ordinary bands are as wide as before.
     """
@@ -176,7 +176,7 @@ def test_slow_plans_are_covered_over_forty_plants() -> None:
     means = {name: float(np.mean(values)) for name, values in covered.items()}
     worst = {name: min(values) for name, values in covered.items()}
     below = int(np.sum(np.array([*covered.values()]) < 0.7))
-    figures = {"coverage": means, "worst": worst, "below 70 %": below}
+    figures = {"coverage": means, "worst": worst, "below 70%": below}
     measured.keep("untried", {**figures, "wider": float(np.mean(wider))})
     assert 0.88 <= np.mean(list(means.values())) <= 0.99
     assert not below

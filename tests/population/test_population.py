@@ -65,7 +65,7 @@ def drawn(
 
 
 def covered(draws: FloatArray, truth: float) -> bool:
-    """Tell whether the central 95 % interval of draws holds the truth."""
+    """Tell whether the central 95% interval of draws holds the truth."""
     lower, upper = np.quantile(draws, [0.025, 0.975])
     return bool(lower < truth < upper)
 
@@ -80,7 +80,7 @@ def misses(level: float, count: int) -> float:
 
 
 def calibrated(count: int, seed: int) -> dict[str, float]:
-    """Draw so many populations from the prior, and say how often 95 % intervals hold the truth."""
+    """Draw so many populations from the prior, and say how often 95% intervals hold the truth."""
     generator = np.random.default_rng(seed)
     names = ("mean", "spread", "new", "shrunk", "width")
     inside: dict[str, list[float]] = {name: [] for name in names}

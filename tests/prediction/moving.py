@@ -139,7 +139,7 @@ def alarms(every: list[Bands]) -> int:
 
 
 def width(bands: Bands, kind: Kind) -> float:
-    """Mean width of the 95 % band where it is judged, um."""
+    """Mean width of the 95% band where it is judged, um."""
     return float(np.mean((bands.upper[kind, 95] - bands.lower[kind, 95])[bands.scored_from :]))
 
 

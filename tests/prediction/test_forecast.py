@@ -142,7 +142,7 @@ def replicate(seed: int) -> Replicate:
 
 
 def ranks(replicates: Iterable[Replicate]) -> IntArray:
-    """Where readings lie in their bands, (replicates, samples): 0 below 95 %, ... 6 above it."""
+    """Where readings lie in their bands, (replicates, samples): 0 below 95%, ... 6 above it."""
     places = []
     for posterior, draws, record, voltage, reading in replicates:
         bands = forecast(posterior, draws, record, voltage, np.random.default_rng(1))
@@ -153,7 +153,7 @@ def ranks(replicates: Iterable[Replicate]) -> IntArray:
 
 
 def smallest_p(of: IntArray) -> float:
-    """Return the smallest p-value of all distances, for both tails of 95 % and for the quartiles.
+    """Return the smallest p-value of all distances, for both tails of 95% and for the quartiles.
 
     Two tests of each of five distances: binomial, chi-square with two degrees of freedom.
     """
@@ -178,13 +178,13 @@ def test_parameters_taken_for_known_are_noticed() -> None:
 
 @pytest.mark.slow
 def test_forecasts_from_many_posteriors_are_calibrated() -> None:
-    """Of 300 records: a coverage of 88 % instead of 95 would be noticed in three of four."""
+    """Of 300 records: a coverage of 88% instead of 95 would be noticed in three of four."""
     of = ranks(replicate(seed) for seed in range(1000, 1300))
     inside = {f"{at + 1} samples later": np.mean((of[:, at] > 0) & (of[:, at] < 6)) for at in AT}
     figures = {name: float(part) for name, part in inside.items()}
     p = smallest_p(of)
     keep(
         "forecasts from posteriors",
-        {"records": len(of), "95 % bands cover": figures, "smallest p of ten": p},
+        {"records": len(of), "95% bands cover": figures, "smallest p of ten": p},
     )
     assert p > 1e-4

@@ -113,7 +113,7 @@ def level_error(seed: int) -> tuple[float, float]:
     """Predict a record that goes less far than the irregular drive before it, by one offset.
 
     Return the mean error of its displacement after the lead-in, in sds that the bands have for what
-    all of it has in common, and the part of the readings in the 95 % sensor band.
+    all of it has in common, and the part of the readings in the 95% sensor band.
     """
     rng = np.random.default_rng(seed)
     second = round(RATE)

@@ -8,13 +8,13 @@ extrema in states that no sweep through the whole range leaves. Twins take the d
 rest, and all earlier drives for as large as the range, and fail.
 
 ``-m slow`` goes through 72 cases of 200 records each, 24 for each kind of dynamics. Each case gives
-three t-values, of the 50, 90 and 95 % bands. By chance alone one in 330 of the 216 is beyond three
+three t-values, of the 50, 90 and 95% bands. By chance alone one in 330 of the 216 is beyond three
 standard errors, so all are held to three by a rule that is right for the whole family: none may be
 beyond the limit that 216 pass once in 100 times (Bonferroni), and for no kind of dynamics may more
 cases have one beyond three than happens once in 300 times, if every t-value were a case of its own.
 As coverages of a case go together, both are on the safe side; as they are skewed, t-values are not
-quite Student's. It also makes 200 records for every operator, whose 95 % band must cover 93 to
-97 %.
+quite Student's. It also makes 200 records for every operator, whose 95% band must cover 93 to
+97%.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ RECORDS = 200
 LIMIT = 3.0
 FALSE_ALARM = 0.01
 
-# What the 95 % band of any operator covers, at least and at most.
+# What the 95% band of any operator covers, at least and at most.
 LEAST, MOST = 0.93, 0.97
 
 # Part of good records whose lead-in may be taken for one that does not fit.

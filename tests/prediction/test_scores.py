@@ -37,7 +37,7 @@ def inside(values: FloatArray, level: int) -> BoolArray:
 
 
 def test_errors_width_and_interval_score_are_those_of_the_definition() -> None:
-    """A reading at 3 lies 3 - 1.645 above the 90 % band: 20 times that on top of the width."""
+    """A reading at 3 lies 3 - 1.645 above the 90% band: 20 times that on top of the width."""
     scores = score(bands_around(np.zeros(4), np.array([0.0, 3.0, -1.0, 0.0])))
     assert np.sqrt(10 / 4) / 4 == pytest.approx(scores.nrmse)
     assert (3.0, 1.0) == (scores.max_error_um, scores.crps_um)
@@ -79,10 +79,10 @@ def test_bands_without_a_measurement_are_refused() -> None:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_error_of_coverage_is_its_spread_over_records(level: int) -> None:
-    """The mean error of coverage agrees with the spread of coverage over records within 25 %.
+    """The mean error of coverage agrees with the spread of coverage over records within 25%.
 
     Over 40 seeds the ratio was 0.90, 0.92 and 0.97 at the three levels, with an sd of 0.04 or
-    less: a false alarm is a matter of 1 seed in 10,000, and an error made 30 % smaller or 50 %
+    less: a false alarm is a matter of 1 seed in 10,000, and an error made 30% smaller or 50%
     larger is found in 98 of 100.
     """
     series = correlated(np.random.default_rng(5), 400)

@@ -138,7 +138,7 @@ def test_a_slow_clock_is_named_and_samples_may_be_missing_beside_it() -> None:
 def test_a_short_gap_in_a_smooth_output_is_bridged_and_a_long_one_refused(
     missing: int, period: int, accepted: bool
 ) -> None:
-    """A line across the gap is accepted where it can hide no extremum of 1 % of the range."""
+    """A line across the gap is accepted where it can hide no extremum of 1% of the range."""
     index = np.delete(np.arange(2000), np.arange(1000, 1000 + missing))
     voltage = 50 * np.sin(2 * np.pi * np.arange(2000) / period)
     arrays = voltage[index], voltage[index] * 0.4

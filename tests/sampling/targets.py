@@ -4,9 +4,9 @@
 right move keeps them so: the expected mean and mean square of every coordinate stay what they are
 at every step. Twelve independent ensembles give each an error, so a t-score with 11 degrees of
 freedom; |t| > ``ALARM`` = 7 is an alarm, which a right move gives in one of 2,000 tests of 18
-statistics. For the Gaussian the standard errors are 0.5 % (Student-t) and 3 % (snooker) of a
-variance, so a variance that is wrong by 6 or 30 % is found nearly always; the banana's tails are
-known only 14 % well.
+statistics. For the Gaussian the standard errors are 0.5% (Student-t) and 3% (snooker) of a
+variance, so a variance that is wrong by 6 or 30% is found nearly always; the banana's tails are
+known only 14% well.
 """
 
 from __future__ import annotations

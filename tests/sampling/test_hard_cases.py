@@ -7,7 +7,7 @@ one. Each chain fails by a wide margin, whatever its seed.
 
 The good runs are a hundred, on three targets that differ in shape, in short blocks, where walkers
 often rest for all of one. They need 100 to 300 steps and have a budget of 1,500. None may fail;
-so the rate of false alarms is below 3 % (at 95 % confidence). One in ten is in the default suite,
+so the rate of false alarms is below 3% (at 95 % confidence). One in ten is in the default suite,
 all with ``-m slow``.
 """
 
@@ -58,7 +58,7 @@ def point_at(*optima: list[float], width: float = 1.0) -> PointFit:
 
 
 def two_far_modes(x: FloatArray) -> FloatArray:
-    """Give 80 % of the probability to the second of them."""
+    """Give 80% of the probability to the second of them."""
     first, second = (-0.5 * np.sum((x - m) ** 2, axis=1) for m in (-30.0, 30.0))
     density: FloatArray = np.logaddexp(np.log(0.2) + first, np.log(0.8) + second)
     return density

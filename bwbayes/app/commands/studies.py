@@ -59,7 +59,7 @@ def calibrate(
     """Simulation-based calibration of CONFIG: fit records simulated from its prior.
 
     Each replicate draws parameters from the config's prior, simulates its record and fits it
-    as a run does. Exit status 4: the posteriors are not what they say, or more than 1 % of the
+    as a run does. Exit status 4: the posteriors are not what they say, or more than 1% of the
     replicates did not converge.
 
     Example: bwbayes calibrate runs/calibration.toml --replicates 500

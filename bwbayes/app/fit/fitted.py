@@ -216,7 +216,7 @@ class Fit(Shown):
     def summary(self) -> Any:
         """A pandas.DataFrame with a row for each free parameter.
 
-        Mean, sd, median, 95 % interval, effective draws, R-hat, Monte Carlo error, unit, and the
+        Mean, sd, median, 95% interval, effective draws, R-hat, Monte Carlo error, unit, and the
         truth of a simulated record.
 
         Raises

@@ -279,7 +279,7 @@ def track(
         Frequency of the references, Hz; may be given again; default: 0.1 Hz to where dynamics
         matter.
     amplitude
-        Amplitude of the references, um; default: 80 % of the mean model's reach.
+        Amplitude of the references, um; default: 80% of the mean model's reach.
     voltage
         Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
     rate

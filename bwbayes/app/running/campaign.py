@@ -255,9 +255,9 @@ class Campaign(Product):
         picture = Picture(
             "parameters",
             "Parameters side by side",
-            "Median and 95 % interval of every record that has converged: gray, by itself; blue, "
+            "Median and 95% interval of every record that has converged: gray, by itself; blue, "
             "with the population for a prior; red, if it lies off the population that all others "
-            "show. Line and band: the population's middle, and where 95 % of specimens not "
+            "show. Line and band: the population's middle, and where 95% of specimens not "
             "measured yet lie.",
             self._draw,
         )
@@ -347,7 +347,7 @@ class Campaign(Product):
         labels = [label_with_unit(name, unit) for name, unit in self._units.items()]
         return Table(
             "records",
-            "Records, 95 % intervals of each by itself",
+            "Records, 95% intervals of each by itself",
             ["Record", "Status", *labels],
             rows,
             records=self.table.reset_index().to_dict("records"),
@@ -365,7 +365,7 @@ class Campaign(Product):
             TableColumn("Middle", text=lambda spread: _estimate(spread.mean)),
             TableColumn("Spread", text=lambda s: _estimate(s.spread, percent=s.logarithmic)),
             TableColumn(
-                "A specimen not measured yet, 95 %",
+                "A specimen not measured yet, 95%",
                 text=lambda spread: _range(*np.quantile(spread.new, [0.025, 0.975])),
             ),
             TableColumn("Outliers", on="screen", text=lambda spread: ", ".join(spread.outliers)),
@@ -377,7 +377,7 @@ class Campaign(Product):
             "Population",
             self._spreads.values(),
             columns,
-            note="Medians, and 95 % intervals. A parameter above zero has a population that is "
+            note="Medians, and 95% intervals. A parameter above zero has a population that is "
             "normal in the logarithm: its middle is the median, its spread relative, in percent. "
             "Each parameter by itself. The records' own posteriors were reweighted; where Pareto k "
             "is above 0.7, or few draws count, a record's likelihood was taken for normal.",
@@ -386,7 +386,7 @@ class Campaign(Product):
 
 
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
-    """Write a median and a 95 % interval; a relative spread in percent."""
+    """Write a median and a 95% interval; a relative spread in percent."""
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975]) * (100 if percent else 1)
     return f"{median:.3g}{' %' if percent else ''} ({_range(low, high)})"
 

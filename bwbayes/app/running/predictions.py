@@ -114,7 +114,7 @@ class Prediction(Shown, Bands):
         )
         return (
             f"prediction {self.name}: {self.time.size} samples from {first} to {last} s; "
-            f"the 95 % sensor band is {width:.3g} um wide"
+            f"the 95% sensor band is {width:.3g} um wide"
         )
 
 

@@ -264,7 +264,7 @@ def _exp(logarithm: float) -> float:
 
 
 def _likely(context: Context) -> tuple[float, float, float]:
-    """Return the exponent's 2.5 %, 50 % and 97.5 % quantiles above one."""
+    """Return the exponent's 2.5%, 50% and 97.5% quantiles above one."""
     exponent = context.stated.get("exponent", 1.0)
     if not isinstance(exponent, Distribution):
         return exponent, exponent, exponent

@@ -81,7 +81,7 @@ def field_at(spins: bool, level: Any) -> Any:
     if spins:
         return np.arctanh(level)
     size = np.abs(level)
-    y = size * (3.0 - size * size) / (1.0 - size * size)  # within 5 %
+    y = size * (3.0 - size * size) / (1.0 - size * size)  # within 5%
     for _ in range(4):
         reached, slope = curve(spins, y)
         y = y - (reached - size) / slope

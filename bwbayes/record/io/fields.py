@@ -158,7 +158,7 @@ def _without_gaps(
     ------
     InputError
         It is interpolated, and the longest gap may hide an extremum: between others that are as
-        far apart is a value beyond both, by more than 1 % of the range.
+        far apart is a value beyond both, by more than 1% of the range.
     """
     positions, sources = grid.positions, grid.sources
     if positions is None or sources is None:

@@ -127,7 +127,7 @@ def _uniform_interval(
 ) -> float | None:
     """Return the interval, s, of a grid on which samples are at these positions, if they are."""
     interval = float(elapsed[-1] / positions[-1])
-    # A time may be off the grid by 1 % of the interval, or by what printing rounds off, which moves
+    # A time may be off the grid by 1% of the interval, or by what printing rounds off, which moves
     # a time and the grid's ends by half a unit of the last decimal each. A whole unit is already an
     # uneven sample, and 0.4 intervals keep a missing sample apart from rounding.
     printed = 0.0

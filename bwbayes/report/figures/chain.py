@@ -49,7 +49,7 @@ def pair_contours() -> Callable[..., None]:
 
 
 def draw_corner(result: Result) -> Figure:
-    """Draw every pair of free parameters, with contours that hold 50 and 90 % of the draws.
+    """Draw every pair of free parameters, with contours that hold 50 and 90% of the draws.
 
     The true values, where they are known, are lines. All is in one panel, where each parameter has
     a cell of side one in each direction: panels of their own would take many times as long.
@@ -128,7 +128,7 @@ def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
 
 
 def draw_trace(result: Result) -> Figure:
-    """Draw, step by step, each ensemble's mean over its walkers and where 90 % of them are.
+    """Draw, step by step, each ensemble's mean over its walkers and where 90% of them are.
 
     All parameters, and the log density. Ensembles that stay apart or drift have not converged.
     """
@@ -152,7 +152,7 @@ def draw_trace(result: Result) -> Figure:
             edges, look = (lower[:, ensemble], upper[:, ensemble]), _look(ensemble)
             panel.fill_between(ends + 1, *edges, color=look["color"], alpha=0.15, lw=0, step="post")
             panel.plot(steps + 1, middle[:, ensemble], **look)
-    figure.axes[0].set_ylabel("mean of the walkers, and 90 % of them")
+    figure.axes[0].set_ylabel("mean of the walkers, and 90% of them")
     style.share_legend(figure)
     return figure
 

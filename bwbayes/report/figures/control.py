@@ -99,7 +99,7 @@ def _draw_errors(
 
 
 def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
-    """Draw the rms errors of the controllers: mean over the draws, and where 95 % of them lie.
+    """Draw the rms errors of the controllers: mean over the draws, and where 95% of them lie.
 
     The table is a pandas.DataFrame with a row for each signal, frequency and controller.
     """
@@ -125,7 +125,7 @@ def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
 def draw_promises(
     names: Sequence[str], remaining: FloatArray, error: FloatArray, label: str
 ) -> Figure:
-    """Draw a dot with two standard errors for each candidate; nothing new at 100 %.
+    """Draw a dot with two standard errors for each candidate; nothing new at 100%.
 
     ``remaining`` and ``error`` (candidates,) are parts, the best first.
     """

@@ -18,11 +18,11 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import CREEP_FROM, StepResponse
 from bwbayes.report.figures import style
 
-BAND = "95 % parameters"
+BAND = "95% parameters"
 
 
 def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) -> Figure:
-    """Draw the coverage of the 50, 90 and 95 % bands, and the histogram of the PIT.
+    """Draw the coverage of the 50, 90 and 95% bands, and the histogram of the PIT.
 
     Whiskers are one block-bootstrap standard error either way. Where the sensor's distribution is
     right the PIT, its probability below each reading, is spread evenly: a hump tells of bands that
@@ -58,7 +58,7 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
             judged = bands.pit[bands.scored_from :]
             heights, edges = np.histogram(judged, 20, range=(0, 1), density=True)
             pit.stairs(heights, edges, baseline=None, color=color, lw=1.4, label=name)
-    nominal.set_xticks(x, [f"{level} %" for level in LEVELS])
+    nominal.set_xticks(x, [f"{level}%" for level in LEVELS])
     nominal.set(xlabel="nominal coverage (%)", ylabel="measured coverage (%)")
     nominal.legend(loc="lower right")
     pit.axhline(1.0, **expected)
@@ -83,7 +83,7 @@ def _draw_correlation(panel: Axes, innovations: Innovations) -> None:
     correlation = innovations.correlation
     bound = 1.96 / np.sqrt(innovations.white.size)
     lags = np.arange(1, correlation.size + 1)
-    label = "95 % of independent ones"
+    label = "95% of independent ones"
     panel.axhspan(-bound, bound, color=style.Color.CHANCE, lw=0, label=label)
     panel.vlines(lags, 0, correlation, color=style.COLORS[0], lw=2)
     panel.axhline(0, color=style.Color.MEASURED, lw=0.8)
@@ -104,7 +104,7 @@ def _draw_quantiles(panel: Axes, white: FloatArray) -> None:
         scipy.special.ndtri(scipy.special.betaincinv(at + 1, size - at, level))
         for level in (0.025, 0.975)
     )
-    label = "95 % of normal ones"
+    label = "95% of normal ones"
     panel.fill_between(expected, low, high, color=style.Color.CHANCE, lw=0, label=label)
     panel.plot(expected, expected, color=style.Color.MEAN, lw=1)
     panel.plot(expected, np.sort(white)[at], ".", color=style.COLORS[0], ms=3, mew=0)

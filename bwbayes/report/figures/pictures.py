@@ -66,14 +66,14 @@ PICTURES = {
         "Hysteresis loop",
         "Displacement against voltage. New readings lie in the sensor band, the model in the "
         "parameter band.",
-        "Displacement against voltage: readings, their mean, and the 95 % bands around it",
+        "Displacement against voltage: readings, their mean, and the 95% bands around it",
     ),
     "loops": (
         "fit",
         "Major loop, minor loop and initial curve",
         "The model driven slowly, without dynamics, creep and offset. Left: displacement against "
         "voltage. Right: the same minus the straight line between the major loop's turning "
-        "points, where the 95 % bands of the parameters can be seen.",
+        "points, where the 95% bands of the parameters can be seen.",
         "Displacement against voltage of major loop, minor loop and initial curve, with bands",
     ),
     "agreement": (
@@ -88,18 +88,18 @@ PICTURES = {
         "fit",
         "Step responses",
         "Displacement after a voltage step from zero, over the logarithm of time; on the right its "
-        "growth from 0.1 s on. The step is ideal, whatever the amplifier did. Bands: 95 %, of the "
+        "growth from 0.1 s on. The step is ideal, whatever the amplifier did. Bands: 95%, of the "
         "parameters.",
         "Displacement since a step, against the logarithm of time, with its band",
     ),
     "bands": (
         "series",
         "Over time",
-        "Voltage, displacement, and readings minus mean. Of all readings, 95 % should lie inside "
+        "Voltage, displacement, and readings minus mean. Of all readings, 95% should lie inside "
         "the sensor band; those of a lead-in, if any, served to estimate the sensor's offset and "
         "are not judged. In the plot, the dots of a long record are the extremes of each short "
         "stretch: more of them lie outside than of all readings.",
-        "Voltage, displacement with its 95 % bands, and readings minus mean, against time",
+        "Voltage, displacement with its 95% bands, and readings minus mean, against time",
     ),
     "coverage": (
         "fit",
@@ -117,7 +117,7 @@ PICTURES = {
         "Innovations",
         "One-step prediction errors, standardized: each fitted reading's residual minus what those "
         "before it predict. For a correct model they are independent standard normal, of one size "
-        "from the start on and at any input voltage. Whiskers: 95 % intervals of chance.",
+        "from the start on and at any input voltage. Whiskers: 95% intervals of chance.",
         "Autocorrelation, normal quantiles, course in time and size by drive of the innovations",
     ),
     "spectrum": (
@@ -130,7 +130,7 @@ PICTURES = {
     "corner": (
         "chain",
         "Posterior",
-        "Each parameter, and each pair of parameters; contours hold 50 and 90 % of the draws. "
+        "Each parameter, and each pair of parameters; contours hold 50 and 90% of the draws. "
         "Crossing lines, if any, are the true values.",
         "Histogram of each parameter and contours of each pair of parameters",
     ),

@@ -156,7 +156,7 @@ def path(bands: Bands, density: int = 300) -> Bands:
 
 
 def polygons(bands: Bands, kind: Kind) -> Iterator[FloatArray]:
-    """Yield the corners (corners, 2) of a 95 % band along a path, from each turn to the next."""
+    """Yield the corners (corners, 2) of a 95% band along a path, from each turn to the next."""
     voltage, lower, upper = bands.voltage, bands.lower[kind, 95], bands.upper[kind, 95]
     rising = np.diff(voltage) > 0
     turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1

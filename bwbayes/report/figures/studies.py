@@ -21,14 +21,14 @@ from bwbayes.report.words import label_with_unit
 def draw_histograms(calibration: Calibration, bins: int = 20) -> Figure:
     """Draw how the ranks of each statistic are spread, over what is expected.
 
-    The gray band holds each bar of an even statistic with a probability of 99 %.
+    The gray band holds each bar of an even statistic with a probability of 99%.
     """
     count = calibration.positions.shape[0]
     low, high = (x * bins / count for x in scipy.stats.binom.interval(0.99, count, 1 / bins))
     figure, panels = _rank_panels(calibration, "replicates\n(expected: 1)")
     for panel, column in zip(panels, calibration.positions.T, strict=True):
         heights, edges = np.histogram(column, bins, range=(0, 1))
-        panel.axhspan(low, high, color=style.Color.CHANCE, lw=0, label="99 % of even bars")
+        panel.axhspan(low, high, color=style.Color.CHANCE, lw=0, label="99% of even bars")
         panel.axhline(1.0, color=style.Color.EXPECTED, lw=0.8)
         look: style.Look = {"color": style.COLORS[0], "lw": 1.2, "label": "replicates"}
         panel.stairs(heights * bins / count, 100 * edges, **look)
@@ -72,12 +72,12 @@ def draw_coverage(calibration: Calibration) -> Figure:
         intervals.axvspan(100 * low, 100 * high, color=color, alpha=0.13, lw=0)
         intervals.axvline(level, color=color, lw=0.8, ls="--")
         covered = [100 * ranks.covered[level] for ranks in calibration.statistics.values()]
-        intervals.plot(covered, range(len(labels)), "o", color=color, ms=4.5, label=f"{level} %")
+        intervals.plot(covered, range(len(labels)), "o", color=color, ms=4.5, label=f"{level}%")
     intervals.set_yticks(range(len(labels)), labels)
     figure.set_layout_engine("constrained")
     intervals.invert_yaxis()
     intervals.set_xlabel("truths inside the interval (%)")
-    intervals.set_title("posterior intervals (shaded: 99 % binomial limits)")
+    intervals.set_title("posterior intervals (shaded: 99% binomial limits)")
     intervals.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=len(LEVELS))
     x = np.arange(len(LEVELS))
     for panel, other in zip(panels, others, strict=True):
@@ -88,7 +88,7 @@ def draw_coverage(calibration: Calibration) -> Figure:
             look: style.Look = {"fmt": "os^"[i], "ms": 5, "capsize": 3, "color": style.COLORS[i]}
             panel.errorbar(x + 0.15 * (i - 1), off, error, label=f"{kind} band", **look)
         panel.axhline(0.0, color=style.Color.EXPECTED, lw=0.8, ls="--")
-        panel.set_xticks(x, [f"{level} %" for level in LEVELS])
+        panel.set_xticks(x, [f"{level}%" for level in LEVELS])
         panel.set(xlabel="nominal coverage (%)", ylabel="measured less nominal coverage (%)")
         panel.set_title(f"bands on {other or 'held-out samples'} (whiskers: 3 standard errors)")
         panel.legend(loc="best")
@@ -116,11 +116,11 @@ def _rank_panels(calibration: Calibration, ylabel: str) -> tuple[Figure, list[Ax
 def draw_parameters(
     records: Mapping[str, Mapping[str, Mapping[str, Any]]], new: Mapping[str, FloatArray]
 ) -> Figure:
-    """Draw a panel for each parameter: the records' 95 % intervals in the order of their names.
+    """Draw a panel for each parameter: the records' 95% intervals in the order of their names.
 
     ``records`` are the records' estimates by parameter, as ``campaign.json`` has them, ``new`` the
     draws of a specimen not measured yet. Gray alone and blue with the population for a prior, the
-    population's median and where 95 % of specimens not measured yet lie. Outliers are red.
+    population's median and where 95% of specimens not measured yet lie. Outliers are red.
     """
     units = {
         name: estimate["unit"]

@@ -69,9 +69,9 @@ BAND_COLORS: Mapping[Kind, str] = {
     "parameter": "#6FAAD6",
 }
 BAND_NAMES: Mapping[Kind, str] = {
-    "sensor": "95 % sensor reading",
-    "displacement": "95 % displacement",
-    "parameter": "95 % parameters alone",
+    "sensor": "95% sensor reading",
+    "displacement": "95% displacement",
+    "parameter": "95% parameters alone",
 }
 
 
@@ -201,7 +201,7 @@ def draw_ribbons(
     about: float | FloatArray = 0.0,
     kinds: Sequence[Kind] = tuple(BAND_COLORS),
 ) -> None:
-    """Draw 95 % bands along time less something, the widest first, the sensor's with an edge."""
+    """Draw 95% bands along time less something, the widest first, the sensor's with an edge."""
     for kind in kinds:
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
         edge: Look = {"ec": Color.EDGE, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
