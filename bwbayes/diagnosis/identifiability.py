@@ -28,7 +28,7 @@ from bwbayes.diagnosis.conflict import normal_scores
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.reversals import monotone_stretches, turning_points
 from bwbayes.shown import brief
@@ -84,14 +84,18 @@ def percent(share: float) -> str:
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
     """Return the part of the prior sd that is left along each principal direction of the loop.
 
-    The parts (loop parameters,), the largest first, and the directions as columns, in the
-    coordinates of the sampling, in which every parameter's prior is standard normal.
+    The parts (loop parameters,), the largest first, and the directions as columns, in units of
+    each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
     """
     prior, columns = posterior.prior, _columns(posterior, posterior.table.physical)
+    free, _ = prior.constrain(point.mode[np.newaxis])
+    theta = prior.theta(free)
+    values = dict(zip(prior.names, theta[0], strict=True))
     # Each parameter a step above and below the mode.
-    steps = STEP * np.eye(point.mode.size)[columns]
-    places = point.mode + np.concatenate([0 * steps[:1], steps, -steps])
-    theta, stepped = np.split(prior.theta(prior.constrain(places)[0]), [1])
+    steps = np.zeros((len(columns), free.shape[1]))
+    steps[np.arange(len(columns)), columns] = STEP
+    steps[:, columns] *= [_prior_sd(prior, prior.free[column], values) for column in columns]
+    stepped = prior.theta(np.concatenate([free + steps, free - steps]))
     information = sum(_information(posterior, data, theta, stepped) for data in posterior.datasets)
     remaining = scipy.linalg.inv(np.eye(len(columns)) + information)
     loop = [columns.index(column) for column in _columns(posterior, posterior.table.loop)]
@@ -101,6 +105,20 @@ def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatAr
 
 def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
     return [i for i, name in enumerate(posterior.names) if name in names]
+
+
+def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float]) -> float:
+    """Return a parameter's prior sd around its value in ``values``."""
+    columns = {name: np.array([value]) for name, value in values.items()}
+    lower, upper = parameter.declared.limits(prior.seen(columns, parameter.record))
+    if np.isfinite(lower).all() and np.isfinite(upper).all():
+        # What the bounds leave to a parameter of which nothing else is known.
+        return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))
+    # Half of the central 68 % stands for the sd: some distributions have none.
+    low, high = (float(v) for v in parameter.distribution.frozen.ppf([0.16, 0.84]))
+    if parameter.positive:
+        return float(values[parameter.name] * np.log(high / low) / 2)
+    return (high - low) / 2
 
 
 def _information(
