@@ -105,14 +105,14 @@ def _scale(values: Any, limits: tuple[float, float]) -> Any:
     return (values - low) / (high - low)
 
 
-def _label(axis: Axis, places: Iterable[int], ranges: Sequence[tuple[float, float]]) -> None:
+def _label(axis: Axis, starts: Iterable[int], ranges: Sequence[tuple[float, float]]) -> None:
     """Label the cells along an axis with their values, away from where they meet."""
     ticks, texts = [], []
-    for place, (low, high) in zip(places, ranges, strict=True):
+    for start, (low, high) in zip(starts, ranges, strict=True):
         for value in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high):
             at = _scale(value, (low, high))
             if abs(at - 0.5) < 0.4:
-                ticks.append(place + at)
+                ticks.append(start + at)
                 texts.append(f"{value:.10g}".replace("-", "\N{MINUS SIGN}"))
     axis.set_ticks(ticks, texts)
 
@@ -146,12 +146,12 @@ def draw_trace(result: Result) -> Figure:
     ends = np.append(steps, result.draws.shape[0])[cuts]
     limits = [_limits(low[..., i], high[..., i], mean[..., i]) for i in range(len(names))]
     figure, cells = _columns_of_cells(names, limits, "step")
-    for i, (panel, place) in enumerate(cells):
-        lower, upper, middle = (place + _scale(x[..., i], limits[i]) for x in (low, high, mean))
+    for i, (panel, bottom) in enumerate(cells):
+        lower, upper, center = (bottom + _scale(x[..., i], limits[i]) for x in (low, high, mean))
         for ensemble in range(series.shape[1]):
             edges, look = (lower[:, ensemble], upper[:, ensemble]), _look(ensemble)
             panel.fill_between(ends + 1, *edges, color=look["color"], alpha=0.15, lw=0, step="post")
-            panel.plot(steps + 1, middle[:, ensemble], **look)
+            panel.plot(steps + 1, center[:, ensemble], **look)
     figure.axes[0].set_ylabel("mean of the walkers, and 90% of them")
     style.share_legend(figure)
     return figure
@@ -173,7 +173,7 @@ def _limits(*drawn: FloatArray) -> tuple[float, float]:
 def _columns_of_cells(
     names: Sequence[str], limits: Sequence[tuple[float, float]], xlabel: str
 ) -> tuple[Figure, list[tuple[Axes, int]]]:
-    """Return a figure with named cells in two columns: the panel of each, and its place there.
+    """Return a figure with named cells in two columns: the panel of each, and its bottom there.
 
     A column is one panel, in which the cells, each of height one, have values of their own.
     """
@@ -181,12 +181,12 @@ def _columns_of_cells(
     figure, (panels,) = style.new_figure(11, 1.4 * rows + 0.9, 1, 2)
     for side, panel in enumerate(panels):
         column = slice(side, None, 2)
-        places = range(rows - 1, -1, -1)[: len(names[column])]
-        _label(panel.yaxis, places, limits[column])
+        bottoms = range(rows - 1, -1, -1)[: len(names[column])]
+        _label(panel.yaxis, bottoms, limits[column])
         across = panel.get_yaxis_transform()
-        panel.hlines(places, 0, 1, color="black", lw=0.8, transform=across)
-        for place, name in zip(places, names[column], strict=True):
-            panel.text(0.01, place + 0.96, name, va="top", transform=across)
+        panel.hlines(bottoms, 0, 1, color="black", lw=0.8, transform=across)
+        for bottom, name in zip(bottoms, names[column], strict=True):
+            panel.text(0.01, bottom + 0.96, name, va="top", transform=across)
         panel.set(xlabel=xlabel, ylim=(0, rows))
     return figure, [(panels[i % 2], rows - 1 - i // 2) for i in range(len(names))]
 
@@ -210,12 +210,12 @@ def draw_ranks(result: Result) -> Figure:
     names = [*map(style.axis_label, result.free)]
     figure, cells = _columns_of_cells(names, limits, "rank among all draws (%)")
     edges = np.linspace(0, 100, RANK_BINS + 1)
-    for (panel, place), lines, band, limit in zip(cells, heights, bands, limits, strict=True):
-        panel.axhline(place + _scale(1.0, limit), color=style.Color.EXPECTED, lw=0.8)
+    for (panel, bottom), lines, band, limit in zip(cells, heights, bands, limits, strict=True):
+        panel.axhline(bottom + _scale(1.0, limit), color=style.Color.EXPECTED, lw=0.8)
         label = "what independent draws show"
-        panel.axhspan(*(place + _scale(band, limit)), color=style.Color.CHANCE, lw=0, label=label)
+        panel.axhspan(*(bottom + _scale(band, limit)), color=style.Color.CHANCE, lw=0, label=label)
         for ensemble, line in enumerate(lines):
-            drawn = place + _scale(line, limit)
+            drawn = bottom + _scale(line, limit)
             panel.stairs(drawn, edges, baseline=None, lw=1.2, **_look(ensemble))
     figure.axes[0].set_ylabel("draws per bin (expected: 1)")
     style.share_legend(figure)
