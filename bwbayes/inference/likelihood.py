@@ -180,8 +180,8 @@ class Likelihood:
         end = 1 + sd.shape[1]
         prior = sd[:, :, np.newaxis] * sd[:, np.newaxis, :]
         pull = sd * products[:, 1:end, 0]
-        covariance, log_volume = _inverse(np.eye(end - 1) + prior * products[:, 1:end, 1:end])
-        mean = np.einsum("mij,mj->mi", covariance, pull)
+        matrices = np.eye(end - 1) + prior * products[:, 1:end, 1:end]
+        mean, covariance, log_volume = _solved(matrices, pull)
         squares = products[:, 0, 0] - np.sum(mean * pull, axis=1)
         # Less cannot be told of a difference: where noise is next to none and an unknown without
         # bounds, what rounding left was a place more probable than any that is possible.
@@ -293,21 +293,37 @@ class Likelihood:
         return self.spaced.whiten(noise, series, self.readings.skipped)
 
 
-def _inverse(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Invert 1 + S (models, size, size), S not negative; logarithms of the determinants too."""
+def _solved(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Solve (1 + S) x = pull (models, size), S (models, size, size) not negative.
+
+    Returns x, the inverses of 1 + S, and the logarithms of the determinants.
+    """
     if matrices.shape[1] == 1:
         # Which is most records: the library would take longer over it than over all the readings.
-        return 1 / matrices, np.log(matrices[:, 0, 0])
+        return pull / matrices[:, 0], 1 / matrices, np.log(matrices[:, 0, 0])
     # Beside numbers as large as this the one is next to lost to rounding.
     lost = np.max(matrices, axis=(1, 2), initial=0.0) > 1e12
     if not lost.any():
-        return np.linalg.inv(matrices), np.linalg.slogdet(matrices)[1]
+        inverse = np.linalg.inv(matrices)
+        solution = _times(inverse, pull)
+        # Terms of the inverse times pull may cancel to a millionth, and then its rounding is large:
+        # the solution is refined by what it leaves of the equations.
+        solution += _times(inverse, pull - _times(matrices, solution))
+        return solution, inverse, np.linalg.slogdet(matrices)[1]
     # Eigenvalues that are rounding beside the largest are taken for the one that was lost.
-    inverse, log_determinant = np.empty_like(matrices), np.empty(len(matrices))
-    inverse[~lost], log_determinant[~lost] = _inverse(matrices[~lost])
+    solution, inverse = np.empty_like(pull), np.empty_like(matrices)
+    log_determinant = np.empty(len(matrices))
+    solution[~lost], inverse[~lost], log_determinant[~lost] = _solved(matrices[~lost], pull[~lost])
     values, vectors = np.linalg.eigh(matrices[lost])
     smallest = 4 * matrices.shape[1] * np.finfo(float).eps * values[:, -1:]
     values = np.where(values < np.maximum(smallest, 1.0), 1.0, values)
     inverse[lost] = (vectors / values[:, np.newaxis]) @ np.swapaxes(vectors, 1, 2)
+    solution[lost] = _times(inverse[lost], pull[lost])
     log_determinant[lost] = np.sum(np.log(values), axis=1)
-    return inverse, log_determinant
+    return solution, inverse, log_determinant
+
+
+def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return each matrix (models, size, size) times its vector (models, size)."""
+    product: FloatArray = np.einsum("mij,mj->mi", matrices, vectors)
+    return product

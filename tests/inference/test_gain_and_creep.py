@@ -16,7 +16,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
-from tests.inference.test_likelihood import assert_dense, moving
+from tests.inference.test_likelihood import assert_dense, moving, responses
 
 REFERENCE = Span(-90.0, 80.0)
 GAIN = PolynomialGain(reference=REFERENCE)
@@ -46,6 +46,23 @@ def test_the_unknown_start_is_integrated_out(
         likelihood = replace(posterior.likelihood, engine=cast(Engine, engine), offset_sd=offset)
         theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 3))
         assert_dense(likelihood, theta)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+def test_a_start_is_integrated_out_however_alike_its_responses_and_small_the_noise(
+    engine: str,
+) -> None:
+    """Noise of a few nanometers, an offset, and lags that hardly move in two seconds."""
+    noise = {"sensor_sd": 0.002, "discrepancy_sd": 0.006}
+    slow = Creep((0.1, 1.0, 10.0, 100.0, 1000.0), reference=REFERENCE)
+    posterior = moving("discrepancy", "lag", noise, parts={"creep": slow})
+    likelihood = replace(posterior.likelihood, engine=cast(Engine, engine), offset_sd=3.0)
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 1))
+    model = likelihood.table.actuator(theta)
+    rested = likelihood.actuator.displacement(model, likelihood.voltage)[0]
+    values = rested + likelihood.start_sd(theta)[0] @ responses(likelihood, theta[0])
+    readings = replace(likelihood.readings, values=values)
+    assert_dense(replace(likelihood, readings=readings), theta)
 
 
 @pytest.mark.parametrize("parts", PARTS)
