@@ -152,7 +152,7 @@ def scores_table(
     """
     rows = []
     for name, judged in scores.items():
-        covers = [covered(judged, "sensor", level).removesuffix(" %") for level in LEVELS]
+        covers = [covered(judged, "sensor", level).removesuffix("%") for level in LEVELS]
         shares = (judged.coverage["sensor"] or {}).values()
         row = {
             "title": titles[name],

@@ -388,7 +388,7 @@ class Campaign(Product):
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
     """Write a median and a 95% interval; a relative spread in percent."""
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975]) * (100 if percent else 1)
-    return f"{median:.3g}{' %' if percent else ''} ({_range(low, high)})"
+    return f"{median:.3g}{'%' if percent else ''} ({_range(low, high)})"
 
 
 def _range(low: float, high: float) -> str:
