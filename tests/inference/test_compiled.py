@@ -6,7 +6,11 @@ samples + |log density|.
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,6 +162,26 @@ def test_what_is_rehearsed_simulates_and_whitens_but_needs_no_products(
     posterior = replace(of_operator(name), engine="numba")
     monkeypatch.setattr(compiled.kernels, "sums", None)
     compiled.rehearse(posterior)
+
+
+@pytest.mark.slow
+def test_what_is_compiled_beforehand_is_all_that_the_products_take(tmp_path: Path) -> None:
+    """Another process does it, in which another signature would only be in vain."""
+    script = """if True:
+        from bwbayes.inference.compiled import kernels, products
+        from tests.inference.problems import short_posterior, truth
+
+        posterior = short_posterior(dynamics="lag")
+        kernels.compile_common()
+        products(posterior.likelihoods[0], truth(posterior))
+        common = kernels._begin, kernels._one_by_one, kernels.noise.follow, kernels.displace
+        print(*(len(function.signatures) for function in common))
+    """
+    variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=variables, capture_output=True, check=True
+    )
+    assert done.stdout.split() == [b"1"] * 4
 
 
 def test_twin_a_defect_of_a_millionth_is_found() -> None:

@@ -1,9 +1,9 @@
 """Draw what a page shows, if possible in a process beside this one, which predicts and writes.
 
-That process loads what draws while this one loads what samples, and compiles what simulates while
-this one compiles the likelihood. It begins with each picture as soon as what it shows is known: the
-draws before predictions are made, the bands before they are judged. The pictures are the same as
-drawn in one process.
+That process compiles what every likelihood needs while this one loads what samples, and compiles
+what simulates while this one compiles the rest of the likelihood; then it loads what draws. It
+begins with each picture as soon as what it shows is known: the draws before predictions are made,
+the bands before they are judged. The pictures are the same as drawn in one process.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bwbayes.app.running.workers import processes
+from bwbayes.inference.engine import choose
 
 # All else is loaded where it is used: an artist begins before anything is loaded.
 if TYPE_CHECKING:
@@ -38,15 +39,17 @@ class Artist:
         self.pool = pool
         self.begun: dict[str, Future[Any]] = {}
         if pool is not None:
-            pool.submit(_prepare)
+            pool.submit(_compile_common)
 
     def rehearse(self, posterior: Posterior) -> None:
         """Let the other process compile what this one needs later, while this one does the rest."""
-        if self.pool is None or posterior.engine == "numpy":
+        if self.pool is None:
             return
-        from bwbayes.inference.compiled import rehearse  # noqa: PLC0415
+        if posterior.engine == "numba":
+            from bwbayes.inference.compiled import rehearse  # noqa: PLC0415
 
-        self.pool.submit(rehearse, posterior)
+            self.pool.submit(rehearse, posterior)
+        self.pool.submit(_load)
 
     def draw(self, result: Result) -> None:
         """Begin with all that can be seen of a result, but for what was begun before."""
@@ -77,7 +80,14 @@ class Artist:
         return images, plots
 
 
-def _prepare() -> None:
+def _compile_common() -> None:
+    if choose() == "numba":
+        from bwbayes.inference.compiled.kernels import compile_common  # noqa: PLC0415
+
+        compile_common()
+
+
+def _load() -> None:
     """Load what draws, and what its work is made of."""
     from bwbayes.report import result  # noqa: F401, PLC0415
     from bwbayes.report.figures import prepare  # noqa: PLC0415

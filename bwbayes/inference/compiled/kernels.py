@@ -15,7 +15,7 @@ The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lane
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import float64, int64, njit, none
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import filter as noise
@@ -223,9 +223,9 @@ def sums(
         _copy(models[number], state)
         _copy(groups[number], group)
         _begin(state, offset, free, slow)
-        staying, pending = 0, 0
-        # Not a literal, which numba would compile all that follows for a second time.
-        now, steady = int(np.int64(0)), False
+        # Not literals, for which numba would compile all that follows for a second time.
+        now, pending = int(np.int64(0)), int(np.int64(0))
+        staying, steady = 0, False
         while now < voltage.size:
             # Short until the filter has settled and forgotten the start, as it is asked after each.
             last = min(now + (PIECE if steady else 32), voltage.size)
@@ -268,3 +268,15 @@ def sums(
                 result[pair, lane] = state[PRODUCTS + pair * LANES + i]
             result[LOG_DETERMINANT, lane] = state[LOG + i]
     return result
+
+
+def compile_common() -> None:
+    """Compile what :func:`sums` needs of every operator, with a noise of one state.
+
+    What one process has compiled is there for others, such as one that compiles the operator.
+    """
+    flat, table, integers = float64[::1], float64[:, ::1], int64[::1]
+    _begin.compile((flat, int64, int64, int64))
+    _one_by_one.compile((flat, none, flat, integers, table, flat, table, int64, int64, table))
+    noise.follow.compile((flat, none, flat, flat, flat, integers))
+    displace.compile((flat, table, table, flat, int64, int64, flat))
