@@ -106,7 +106,7 @@ def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # To load libraries and to compile makes hundreds of thousands of objects that stay: to look for
     # garbage among them again and again would take a twentieth of a run.
-    gc.set_threshold(50_000)
+    gc.set_threshold(50_000, 1_000)
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
