@@ -25,6 +25,7 @@ from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.identifiability import information_gain
 from bwbayes.diagnosis.predictive_checks import check_predictions
 from bwbayes.diagnosis.validation import Background
+from bwbayes.inference.map_estimate import distinct
 from bwbayes.prediction.loops import measure_loops
 from bwbayes.prediction.prediction import thinned
 from bwbayes.prediction.scores import score
@@ -89,7 +90,8 @@ def assemble(
     artist.draw(result)
     departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
     failed = any(verdict.holds is False for verdict in unexplained.values())
-    modes = np.concatenate([posterior.prior.unconstrain(best), chain.point.optima])
+    places = [*posterior.prior.unconstrain(best), *chain.point.optima]
+    modes = distinct(places, chain.point.covariance)
     explanations = {
         name: explained(
             problem,
