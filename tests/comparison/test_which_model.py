@@ -163,6 +163,6 @@ def test_a_record_without_hysteresis_is_said_to_have_none(tmp_path: Path) -> Non
     names = ["bouc-wen + white", "linear + white"]
     assert record.displacement is not None
     fewer = Record(record.voltage[::3], record.displacement[::3], 3 * INTERVAL)
-    comparison = compared(fewer, names, tmp_path / "runs", walkers=24)
+    comparison = compared(fewer, names, tmp_path / "runs", walkers=24, steps=500)
     assert comparison.recommended == "linear + white"
     assert any("no hysteresis" in line for line in comparison.lines)
