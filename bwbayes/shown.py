@@ -61,7 +61,13 @@ def _fields(thing: object) -> Iterator[tuple[str, Any]]:
 def _value(value: Any, *, nested: bool = True) -> str:
     """Return a value in a few words; of what is in it, if it is ``nested``."""
     if isinstance(value, np.ndarray):
-        return _array(value)
+        text = f"array {value.shape}"
+        if value.size <= FEW:
+            text = repr(value.tolist())
+        elif value.dtype.kind in "iuf" and np.isfinite(value).any():
+            finite = value[np.isfinite(value)]
+            text += f" from {finite.min():.4g} to {finite.max():.4g}"
+        return _cut(text)
     if isinstance(value, Mapping):
         items = (f"{key!r}: {_value(item, nested=False)}" for key, item in value.items())
         return _joined("{", items, len(value), "}")
@@ -89,17 +95,6 @@ def _joined(opening: str, items: Iterator[str], count: int, closing: str) -> str
         shown.append(item)
     more = [f"... {count - len(shown)} more"] if len(shown) < count else []
     return f"{opening}{', '.join([*shown, *more])}{closing}"
-
-
-def _array(values: np.ndarray[Any, Any]) -> str:
-    """Return the numbers of a small array, or shape and range."""
-    if values.size <= FEW:
-        return _cut(repr(values.tolist()))
-    text = f"array {values.shape}"
-    if values.dtype.kind in "iuf" and np.isfinite(values).any():
-        finite = values[np.isfinite(values)]
-        text += f" from {finite.min():.4g} to {finite.max():.4g}"
-    return text
 
 
 def _cut(text: str) -> str:

@@ -165,28 +165,23 @@ def bridge(at_draws: FloatArray, at_places: FloatArray) -> Bridge:
     for _ in range(2):
         # The effective number is that of what is averaged, which is known once r is.
         share = effective / (effective + places.size)
-        log_r, ends = _fixed_point(draws, places, share, log_r)
+        with np.errstate(divide="ignore"):
+            from_posterior, from_reference = np.log(share), np.log1p(-share)
+        for _ in range(1000):  # some ten where the two distributions overlap at all
+            # The logs of what is averaged at draws and at places.
+            ends = (
+                -np.logaddexp(from_posterior + draws, from_reference + log_r),
+                places - np.logaddexp(from_posterior + places, from_reference + log_r),
+            )
+            means = [scipy.special.logsumexp(end) - np.log(end.size) for end in ends]
+            before, log_r = log_r, float(means[1] - means[0])
+            if not abs(log_r - before) > 1e-10:  # nan too
+                break
         effective = _effective(np.exp(ends[0] - np.max(ends[0])))
     scaled = [np.exp(end - np.max(end)) for end in ends]
     variances = [np.var(end) / np.mean(end) ** 2 for end in scaled]
     error = float(np.sqrt(variances[0] / effective + variances[1] / places.size))
     return Bridge(log_r + shift, error if np.isfinite(error) else np.inf, effective)
-
-
-def _fixed_point(
-    draws: FloatArray, places: FloatArray, share: float, log_r: float
-) -> tuple[float, tuple[FloatArray, FloatArray]]:
-    """Iterate to log r; return it and the logs of what is averaged at draws and at places."""
-    with np.errstate(divide="ignore"):
-        from_posterior, from_reference = np.log(share), np.log1p(-share)
-    for _ in range(1000):  # some ten where the two distributions overlap at all
-        at_draws = -np.logaddexp(from_posterior + draws, from_reference + log_r)
-        at_places = places - np.logaddexp(from_posterior + places, from_reference + log_r)
-        top = scipy.special.logsumexp(at_places) - np.log(places.size)
-        before, log_r = log_r, float(top - (scipy.special.logsumexp(at_draws) - np.log(draws.size)))
-        if not abs(log_r - before) > 1e-10:  # nan too
-            break
-    return log_r, (at_draws, at_places)
 
 
 def _effective(values: FloatArray) -> float:

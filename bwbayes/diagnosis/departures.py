@@ -153,7 +153,19 @@ class Standardized:
                 f"farthest {np.max(np.abs(self.z)):.2g} SDs"
             )
         if self.bands.training:
-            reasons += self._misfit(extent)
+            # A fit that misses its own readings by more than a sensor's noise would, by 5% of the
+            # range: a Bouc-Wen model misses one or two percent of an actuator's displacement. The
+            # range is that of all that was fitted: a short window's may be small.
+            assert self.bands.measured is not None
+            extent = max(extent, float(np.ptp(self.bands.measured[self.scored])))
+            steps = np.diff(self._residual)
+            # The median of a χ² variable of one degree of freedom is 0.4549.
+            fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
+            rms = float(np.sqrt(np.mean(self._residual**2)))
+            # Of a sensor's noise, which no model follows, nothing is the model's fault.
+            slow = np.sqrt(max(rms**2 - fast**2, 0.0))
+            if slow > max(0.05 * extent, fast) and extent:
+                reasons.append(f"NRMSE {percent(rms / extent)} on the training readings")
         square = float(np.mean(self.z**2))
         chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
         if square < 0.25 and chance < ALARM:
@@ -221,24 +233,6 @@ class Standardized:
         correlation = float(np.corrcoef(bands.voltage[scored], bands.measured[scored])[0, 1])
         if correlation < -0.5:
             yield f"the readings fall where the voltage rises (correlation {correlation:.2f})"
-
-    def _misfit(self, extent: float) -> Iterator[str]:
-        """Find a fit that misses its own readings by more than a sensor's noise would.
-
-        By 5% of the range: a Bouc-Wen model misses one or two percent of an actuator's
-        displacement. The range is that of all that was fitted: a short window's may be small.
-        """
-        assert self.bands.measured is not None
-        residual = self._residual
-        extent = max(extent, float(np.ptp(self.bands.measured[self.scored])))
-        steps = np.diff(residual)
-        # The median of a χ² variable of one degree of freedom is 0.4549.
-        fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
-        rms = float(np.sqrt(np.mean(residual**2)))
-        # Of a sensor's noise, which no model follows, nothing is the model's fault.
-        slow = np.sqrt(max(rms**2 - fast**2, 0.0))
-        if slow > max(0.05 * extent, fast) and extent:
-            yield f"NRMSE {percent(rms / extent)} on the training readings"
 
 
 def percent(share: float) -> str:

@@ -273,6 +273,9 @@ def information_gain(
     N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
+    import arviz_base  # noqa: PLC0415  # slow to load
+    from arviz_stats import psense  # noqa: PLC0415
+
     count = 4000  # draws of the prior, and of the posterior, that are looked at
     step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
@@ -282,10 +285,18 @@ def information_gain(
         for every in (prior.draw(generator, count), thin)
     )
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
-    sensitivities = _sensitivities(prior, thin, log_likelihood)
+    # The draws are taken as one chain: weights depend on no order.
+    tree = arviz_base.from_dict(
+        {
+            "posterior": {name: thin[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},
+            "log_prior": {"joint": prior.log_density(thin)[np.newaxis]},
+            "log_likelihood": {"joint": log_likelihood[np.newaxis]},
+        }
+    )
+    to_prior, to_likelihood = (psense(tree, group=group) for group in ("prior", "likelihood"))
     parameters = {
-        name: ParameterInformation(float(contraction[i]), *sensitivities[name])
-        for i, name in enumerate(prior.free_names)
+        name: ParameterInformation(float(share), float(to_prior[name]), float(to_likelihood[name]))
+        for name, share in zip(prior.free_names, contraction, strict=True)
     }
     # The three directions that keep most of their prior sd, in the prior's own normal scores, whose
     # spread the constraints may have changed: the eigenvectors of the posterior's covariance
@@ -299,24 +310,3 @@ def information_gain(
             # How the scores move together along it, and not what picks it out.
             combinations.append((combined(left @ directions[:, i], prior.free_names), sd))
     return InformationGain(parameters, tuple(combinations))
-
-
-def _sensitivities(
-    prior: JointPrior, draws: FloatArray, log_likelihood: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """Return power-scaling sensitivities to prior and likelihood, by parameter.
-
-    From draws (draws, free), taken as one chain: weights depend on no order.
-    """
-    import arviz_base  # noqa: PLC0415  # slow to load
-    from arviz_stats import psense  # noqa: PLC0415
-
-    tree = arviz_base.from_dict(
-        {
-            "posterior": {name: draws[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},
-            "log_prior": {"joint": prior.log_density(draws)[np.newaxis]},
-            "log_likelihood": {"joint": log_likelihood[np.newaxis]},
-        }
-    )
-    by_prior, by_likelihood = (psense(tree, group=group) for group in ("prior", "likelihood"))
-    return {name: (float(by_prior[name]), float(by_likelihood[name])) for name in prior.free_names}

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.distributions import Distribution, Scored
@@ -166,8 +166,15 @@ class JointPrior:
         }
         self._free_rows = [self.names.index(name) for name in self.free_names]
         self._template = np.array([np.nan if p.fixed is None else p.fixed for p in self.parameters])
-        # A formula maps most of the free parameters, and nothing cuts them.
-        self._cut = [(row, p) for row, p in enumerate(self.free) if p.formula is None]
+        # A formula maps most of the free parameters, and nothing cuts them, so that it is done at
+        # once: their rows; and, as columns, whether x = c exp(s z) instead of c + s z, c, and s.
+        forms = {row: p.formula for row, p in enumerate(self.free)}
+        table = np.array(
+            [(k, f.logarithmic, f.center, f.scale) for k, f in forms.items() if f is not None]
+        ).reshape(-1, 4)
+        rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
+        self._formulas = rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
+        self._cut = [(row, self.free[row]) for row, f in forms.items() if f is None]
         # What free parameters must be above, or reach at least: two columns.
         floors = np.array([p.floor for p in self.free])[:, np.newaxis]
         reaches = [p.declared.reaches_floor for p in self.free]
@@ -278,19 +285,6 @@ class JointPrior:
         with np.errstate(divide="ignore"):
             log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
         return free.T, np.where(possible, log_prior, -np.inf)
-
-    @cached_property
-    def _formulas(self) -> tuple[IntArray, BoolArray, FloatArray, FloatArray]:
-        """Which free parameters a formula maps and nothing cuts: most, so it is done at once.
-
-        Their rows; and, as columns, whether x = c exp(s z) instead of c + s z, c, and s.
-        """
-        forms = {row: p.formula for row, p in enumerate(self.free)}
-        table = np.array(
-            [(k, f.logarithmic, f.center, f.scale) for k, f in forms.items() if f is not None]
-        ).reshape(-1, 4)
-        rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
-        return rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
 
     def _values(self, free: FloatArray) -> dict[str, FloatArray]:
         values = {name: np.full(len(free), value) for name, value in self._fixed.items()}

@@ -301,26 +301,14 @@ def solve_branch(
         values[order] = curve(travel[order])
         return values - rise
 
-    return _roots(excess, low, high, below, beyond, resolution)
-
-
-def _roots(
-    function: Curve,
-    low: FloatArray,
-    high: FloatArray,
-    below: FloatArray,
-    beyond: FloatArray,
-    resolution: float,
-) -> FloatArray:
-    """Return the roots (samples,) of rising functions, which are below and beyond zero at ends."""
     latest = low
     for _ in range(60):
         middle = (low + high) / 2
-        between = function(middle)
+        between = excess(middle)
         root = np.sqrt(np.maximum(between**2 - below * beyond, 0.0))
         step = np.divide(between, root, out=np.zeros_like(root), where=root > 0)
         before, latest = latest, np.clip(middle - (middle - low) * step, low, high)
-        value = function(latest)
+        value = excess(latest)
         for place, height in ((middle, between), (latest, value)):
             under = height < 0
             low, below = np.where(under, place, low), np.where(under, height, below)

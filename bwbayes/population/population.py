@@ -278,7 +278,17 @@ def _populations(
         weights, k = smoothed_weights(target - proposed)
         if k <= LARGEST_PARETO_K:
             break
-        mean, spread, proposed = _around(mean, spread, weights, generator)
+        # Around these: a Student distribution of μ and log τ with the weighted moments.
+        places = np.stack([mean, np.log(spread)], axis=1)
+        center = weights @ places
+        away = places - center
+        covariance = (away * weights[:, np.newaxis]).T @ away
+        covariance += np.diag(1e-3 * np.var(places, axis=0))
+        student = scipy.stats.multivariate_t(center, covariance, df=5, seed=generator)
+        drawn = student.rvs(DRAWS)
+        # The density of τ is that of log τ over τ.
+        mean, spread = drawn[:, 0], np.exp(drawn[:, 1])
+        proposed = student.logpdf(drawn) - drawn[:, 1]
     else:
         # Nothing that reweights can be trusted: the normal likelihoods alone.
         mean, spread = posterior.draw(generator, DRAWS)
@@ -300,23 +310,6 @@ def _weights(
     weights -= largest
     np.exp(weights, out=weights)
     return weights, largest - np.log(spread)
-
-
-def _around(
-    mean: FloatArray, spread: FloatArray, weights: FloatArray, generator: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Propose populations around weighted ones: means, spreads, log density, (DRAWS,) each.
-
-    A Student distribution of μ and log τ with the weighted moments.
-    """
-    places = np.stack([mean, np.log(spread)], axis=1)
-    center = weights @ places
-    away = places - center
-    covariance = (away * weights[:, np.newaxis]).T @ away + np.diag(1e-3 * np.var(places, axis=0))
-    student = scipy.stats.multivariate_t(center, covariance, df=5, seed=generator)
-    drawn = student.rvs(DRAWS)
-    # The density of τ is that of log τ over τ.
-    return drawn[:, 0], np.exp(drawn[:, 1]), student.logpdf(drawn) - drawn[:, 1]
 
 
 def _interval(values: FloatArray) -> dict[str, float]:

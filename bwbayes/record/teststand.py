@@ -244,7 +244,22 @@ class VirtualTestStand:
         InputWarning
             If the command goes beyond the amplifier's limit.
         """
-        command = self._command(drive)
+        if isinstance(drive, Waveform):
+            command = drive.sample(self.sample_rate)[1]
+        else:
+            command = np.array(drive, dtype=np.float64)
+        if command.ndim != 1 or command.size < 2 or not np.isfinite(command).all():
+            raise InputError(
+                f"test stand: voltage of shape {command.shape}: give one row of at least two "
+                "finite values"
+            )
+        if np.abs(command).max() > self.amplifier.limit:
+            warnings.warn(
+                f"test stand: voltage: the command reaches {np.abs(command).max():g} V, the "
+                f"amplifier limits it to {self.amplifier.limit:g} V; use a smaller amplitude",
+                InputWarning,
+                stacklevel=2,
+            )
         output = self.amplifier.output(command, 1 / self.sample_rate)
         actuator = replace(self.actuator, hold="zero", interval=1 / self.sample_rate)
         theta = np.array([[self._values[name] for name in actuator.parameters]])
@@ -261,25 +276,6 @@ class VirtualTestStand:
             origin=f"virtual test stand, discrepancy {self.discrepancy}",
             truth=truth,
         )
-
-    def _command(self, drive: Waveform | ArrayLike) -> FloatArray:
-        if isinstance(drive, Waveform):
-            command = drive.sample(self.sample_rate)[1]
-        else:
-            command = np.array(drive, dtype=np.float64)
-        if command.ndim != 1 or command.size < 2 or not np.isfinite(command).all():
-            raise InputError(
-                f"test stand: voltage of shape {command.shape}: give one row of at least two "
-                "finite values"
-            )
-        if np.abs(command).max() > self.amplifier.limit:
-            warnings.warn(
-                f"test stand: voltage: the command reaches {np.abs(command).max():g} V, the "
-                f"amplifier limits it to {self.amplifier.limit:g} V; use a smaller amplitude",
-                InputWarning,
-                stacklevel=3,
-            )
-        return command
 
     @cached_property
     def _values(self) -> dict[str, float]:

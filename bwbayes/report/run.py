@@ -42,7 +42,15 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     """
     pictures, check = all_pictures(result), result.outcome.check
     if result.outcome.converged:
-        blocks = [*_answer(result, pictures), *_evidence(result, pictures)]
+        note = (
+            "The sensor band covers a new reading, the displacement band the actuator's "
+            "displacement, 95 times in 100. The parameter band covers the model output only, not "
+            "the actuator."
+        )
+        parameters: list[Block] = [tables.parameters_table(result), Text(note, note=True)]
+        loop = [[pictures["loop"]]] if "loop" in pictures else []
+        results: list[Block] = [*_results(result)] if result.standing.headline else []
+        blocks = [*results, SideBySide([parameters, *loop]), *_evidence(result, pictures)]
     else:
         sampling: list[Block] = [tables.sampling_table(result), *pictures.values()]
         blocks = [Section("Sampling", sampling, folded=False)]
@@ -153,21 +161,6 @@ def _results(result: Result) -> list[Text]:
         link = Markup(' <a href="#remarks">Remarks: {}</a>.')
         sampling += link.format(len(result.remarks))
     return [Text(text) for text in (*texts, sampling)]
-
-
-def _answer(result: Result, pictures: Pictures) -> list[Block]:
-    parameters: list[Block] = [
-        tables.parameters_table(result),
-        Text(
-            "The sensor band covers a new reading, the displacement band the actuator's "
-            "displacement, 95 times in 100. The parameter band covers the model output only, not "
-            "the actuator.",
-            note=True,
-        ),
-    ]
-    results: list[Block] = [*_results(result)] if result.standing.headline else []
-    loop = [[pictures["loop"]]] if "loop" in pictures else []
-    return [*results, SideBySide([parameters, *loop])]
 
 
 def _evidence(result: Result, pictures: Pictures) -> list[Block]:

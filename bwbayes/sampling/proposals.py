@@ -88,7 +88,12 @@ class StudentMixture:
             draws, modes = bend.to_straight(draws), bend.to_straight(modes)
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
-        mixture = _first_cut(sample, min(max(count // 4_000, 3), 6), modes)
+        # A draw belongs at first to the nearest of a few, or of the modes, in units of their sds.
+        at = np.linspace(0, len(sample) - 1, min(max(count // 4_000, 3), 6)).astype(int)
+        few = np.concatenate([sample[at], modes])
+        away = (few[:, np.newaxis] - sample) / np.std(sample, axis=0)
+        nearest = np.argmin(np.sum(away**2, axis=2), axis=0)
+        mixture = _of_shares(sample, np.equal.outer(np.arange(len(few)), nearest))
         for _ in range(25):
             mixture = mixture._fitted_on(sample)
         sample = subsample(draws, 10_000)
@@ -141,34 +146,27 @@ class StudentMixture:
         return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend)
 
     @cached_property
-    def _whitening(self) -> FloatArray:
-        # Its transpose times a row is one product for all coordinates.
-        return np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
-
-    @cached_property
     def _log_volumes(self) -> FloatArray:
         """The log determinants of the factors, (components,)."""
         return np.sum(np.log(np.diagonal(self.factors, axis1=1, axis2=2)), axis=1)
 
-    @cached_property
-    def _log_scales(self) -> FloatArray:
-        """Log wⱼ / |Lⱼ| and the constant of a Student-t distribution, (components,)."""
-        freedom, free = self.freedom, self.centers.shape[1]
-        constant = scipy.special.gammaln((freedom + free) / 2) - scipy.special.gammaln(freedom / 2)
-        constant -= 0.5 * free * np.log(freedom * np.pi)
-        return np.asarray(np.log(self.weights) - self._log_volumes + constant)
-
     def squares(self, straight: FloatArray) -> FloatArray:
         """Squared distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
-        pairs = zip(self.centers, self._whitening, strict=True)
-        white = [(straight - center) @ whitening for center, whitening in pairs]
+        # Its transpose times a row is one product for all coordinates.
+        inverses = np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
+        pairs = zip(self.centers, inverses, strict=True)
+        white = [(straight - center) @ inverse for center, inverse in pairs]
         return np.stack([np.einsum("...j,...j->...", z, z) for z in white])
 
     def log_parts(self, squares: FloatArray) -> FloatArray:
         """Log densities times weights, of :meth:`squares` and shaped alike."""
-        power = 0.5 * (self.freedom + self.centers.shape[1])
-        scales = self._log_scales.reshape(-1, *[1] * (squares.ndim - 1))
-        parts: FloatArray = scales - power * np.log1p(squares / self.freedom)
+        freedom, free = self.freedom, self.centers.shape[1]
+        # Of a Student-t distribution.
+        constant = scipy.special.gammaln((freedom + free) / 2) - scipy.special.gammaln(freedom / 2)
+        constant -= 0.5 * free * np.log(freedom * np.pi)
+        scales = np.log(self.weights) - self._log_volumes + constant
+        scales = scales.reshape(-1, *[1] * (squares.ndim - 1))
+        parts: FloatArray = scales - 0.5 * (freedom + free) * np.log1p(squares / freedom)
         return parts
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
@@ -232,17 +230,6 @@ def _require_spread(draws: FloatArray) -> None:
     sizes = np.linalg.svd(np.linalg.qr(plane, mode="r"), compute_uv=False)
     if np.sum(sizes > sizes[0] * max(plane.shape) * np.finfo(float).eps) < plane.shape[1]:
         raise np.linalg.LinAlgError("the draws do not span the space")
-
-
-def _first_cut(draws: FloatArray, parts: int, modes: FloatArray) -> StudentMixture:
-    """Let draws (count, free) belong to the nearest of a few of them, or of modes (modes, free).
-
-    In units of their sds.
-    """
-    few = np.concatenate([draws[np.linspace(0, len(draws) - 1, parts).astype(int)], modes])
-    away = (few[:, np.newaxis] - draws) / np.std(draws, axis=0)
-    nearest = np.argmin(np.sum(away**2, axis=2), axis=0)
-    return _of_shares(draws, np.equal.outer(np.arange(len(few)), nearest))
 
 
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:

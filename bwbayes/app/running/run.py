@@ -134,7 +134,25 @@ def _open_chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
-        return _start_chain(folder, problem, console)
+        console.print("computing the MAP estimate ...", highlight=False)
+        problem, point, why = find_map(problem)
+        posterior, config = problem.posterior, problem.config
+        if why:  # the noise was chosen
+            console.print(why, highlight=False, soft_wrap=True)
+            _rewrite(folder, config)
+        attributes: dict[str, str | int] = {
+            "config": dump(config),
+            "data_sha256": problem.sha256,
+            "posterior": fingerprint(config),
+            "versions": json.dumps(versions(posterior.engine)),
+            "engine": posterior.engine,
+            "platform": platform.platform(),
+            "seed": config.seed,
+            "parameters": json.dumps(posterior.names),
+        }
+        first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
+        chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
+        return problem, chain
     chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))
     first_engine, now = chain.attributes()["engine"], problem.posterior.engine
     if first_engine != now:
@@ -144,31 +162,6 @@ def _open_chain(
                 f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
             )
         console.print(f"resuming with the {now} engine a chain begun with {first_engine}")
-    return problem, chain
-
-
-def _start_chain(
-    folder: RunFolder, problem: Problem, console: Console
-) -> tuple[Problem, ChainFile]:
-    """Start a chain with the MAP estimate, and with the noise that it shows."""
-    console.print("computing the MAP estimate ...", highlight=False)
-    problem, point, why = find_map(problem)
-    posterior, config = problem.posterior, problem.config
-    if why:
-        console.print(why, highlight=False, soft_wrap=True)
-        _rewrite(folder, config)
-    attributes: dict[str, str | int] = {
-        "config": dump(config),
-        "data_sha256": problem.sha256,
-        "posterior": fingerprint(config),
-        "versions": json.dumps(versions(posterior.engine)),
-        "engine": posterior.engine,
-        "platform": platform.platform(),
-        "seed": config.seed,
-        "parameters": json.dumps(posterior.names),
-    }
-    first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
-    chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
     return problem, chain
 
 

@@ -162,7 +162,14 @@ class RemembersExtrema(Operator):
             ahead = direction
             _follow(branch, extrema, direction, path[first + 1 : last + 1], moving[:, first:last])
             here = moving[:, last - 1].copy()
-            _leave_behind(extrema, float(path[last]), here)
+            # Models whose own extremum the voltage has passed turn here, if they turn next.
+            end, passed = float(path[last]), extrema[-2] if extrema[1:] else None
+            if passed is not None and passed.own is not None and end > np.min(passed.own):
+                extrema[-2] = Extremum(
+                    passed.voltage,
+                    np.where(passed.own > end, passed.displacement, here),
+                    np.maximum(passed.own, end),
+                )
         return result, Memory(float(path[-1]), here, ahead, tuple(extrema))
 
     def reachable(
@@ -236,17 +243,4 @@ def _along(
         inside = late < before[:, np.newaxis]
         out[:, early:] = np.where(
             inside, from_extremum(last, late), from_extremum(extrema[-3], late)
-        )
-
-
-def _leave_behind(extrema: list[Extremum], voltage: float, displacement: FloatArray) -> None:
-    """Let models whose own extremum the voltage has passed turn here, if they turn next."""
-    if not extrema[1:]:
-        return
-    passed = extrema[-2]
-    if passed.own is not None and voltage > np.min(passed.own):
-        extrema[-2] = Extremum(
-            passed.voltage,
-            np.where(passed.own > voltage, passed.displacement, displacement),
-            np.maximum(passed.own, voltage),
         )

@@ -25,7 +25,7 @@ from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields,
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.record.io.series import Source, array_source, damaged
+from bwbayes.record.io.series import array_source, damaged
 from bwbayes.record.record import Record
 
 _TEXT = (".csv", ".txt")
@@ -134,27 +134,23 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
     if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise InputError(f"{path}: a workbook or an archive; export it as CSV")
     try:
-        source = _reader(path, begin)(path)
+        if h5py.is_hdf5(path):
+            source = read_hdf5(path)
+        elif begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+            source = read_mat(path)
+        elif begin.startswith(b"TDSm"):
+            source = read_tdms(path)
+        elif path.suffix.lower() in _BINARY:
+            raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+        else:
+            from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+
+            source = read_text(path)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
     return select(source, naming, needed)
-
-
-def _reader(path: Path, begin: bytes) -> Callable[[Path], Source]:
-    """Return what reads a file that begins with these bytes."""
-    if h5py.is_hdf5(path):
-        return read_hdf5
-    if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
-        return read_mat
-    if begin.startswith(b"TDSm"):
-        return read_tdms
-    if path.suffix.lower() in _BINARY:
-        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
-    from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
-
-    return read_text
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:

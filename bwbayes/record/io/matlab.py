@@ -74,8 +74,23 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     arrays = record_arrays(record) | numbers
     if version == "5":
         scipy.io.savemat(path, arrays | texts, appendmat=False, oned_as="column")
-    else:
-        _write_7_3(path, arrays, texts)
+        return
+    content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
+    with h5py.File(content, "w", userblock_size=512) as file:
+        for name, values in arrays.items():
+            # MATLAB counts dimensions the other way round: (1, samples) here is a column there.
+            dataset = file.create_dataset(name, data=values[np.newaxis, :])
+            dataset.attrs["MATLAB_class"] = np.bytes_("double")
+        for name, text in texts.items():
+            codes = np.frombuffer(text.encode("utf-16-le"), dtype="<u2")
+            dataset = file.create_dataset(name, data=codes[:, np.newaxis])
+            dataset.attrs["MATLAB_class"] = np.bytes_("char")
+            dataset.attrs["MATLAB_int_decode"] = np.int32(2)
+    # Text of 116 bytes, 8 bytes that stay zero, version 2.0, and the mark of little-endian files.
+    header = b"MATLAB 7.3 MAT-file, written by bwbayes".ljust(116) + bytes(8) + b"\x00\x02IM"
+    content.seek(0)
+    content.write(header)
+    path.write_bytes(content.getvalue())
 
 
 def _series(
@@ -150,22 +165,3 @@ def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[in
         if start + size > len(data):
             raise ValueError("it ends within an element")
         yield kind, data[start : start + size]
-
-
-def _write_7_3(path: Path, arrays: dict[str, Any], texts: dict[str, str]) -> None:
-    content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
-    with h5py.File(content, "w", userblock_size=512) as file:
-        for name, values in arrays.items():
-            # MATLAB counts dimensions the other way round: (1, samples) here is a column there.
-            dataset = file.create_dataset(name, data=values[np.newaxis, :])
-            dataset.attrs["MATLAB_class"] = np.bytes_("double")
-        for name, text in texts.items():
-            codes = np.frombuffer(text.encode("utf-16-le"), dtype="<u2")
-            dataset = file.create_dataset(name, data=codes[:, np.newaxis])
-            dataset.attrs["MATLAB_class"] = np.bytes_("char")
-            dataset.attrs["MATLAB_int_decode"] = np.int32(2)
-    # Text of 116 bytes, 8 bytes that stay zero, version 2.0, and the mark of little-endian files.
-    header = b"MATLAB 7.3 MAT-file, written by bwbayes".ljust(116) + bytes(8) + b"\x00\x02IM"
-    content.seek(0)
-    content.write(header)
-    path.write_bytes(content.getvalue())

@@ -111,7 +111,19 @@ def draw_loop(predictions: Sequence[Bands]) -> Figure:
     for (full, tip), bands in zip(axes.T, predictions, strict=True):
         _draw(full, bands, ",")
         _draw(tip, bands, ".")
-        _zoom(full, tip, bands)
+        # The tip's panel is as high as four sensor bands, or half the loop if that is less, and a
+        # tenth of it lies beyond the tip.
+        inside = slice(None) if bands.inside is None else bands.inside
+        voltage = bands.voltage[inside]
+        lower, upper = bands.lower["sensor", 95][inside], bands.upper["sensor", 95][inside]
+        at = int(np.argmax(voltage))
+        whole = float(np.max(upper) - np.min(lower))
+        height = min(4.0 * float(np.mean(upper - lower)), whole / 2)
+        width = (float(np.ptp(voltage)) or 1.0) * height / whole
+        left, bottom = float(voltage[at]) - 0.9 * width, float(upper[at]) - 0.9 * height
+        tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
+        outline: style.Look = {"edgecolor": style.Color.ZOOM, "alpha": 1.0, "linewidth": 1.5}
+        full.indicate_inset((left, bottom, width, height), **outline)
         full.set_title(style.plain(style.title(bands)))
         tip.set_title("tip at the largest voltage")
     for panel in axes[:, 0]:
@@ -165,22 +177,3 @@ def polygons(bands: Bands, kind: Kind) -> Iterator[FloatArray]:
         back = there[::-1]
         edges = np.append(lower[there], upper[back])
         yield np.stack([voltage[np.append(there, back)], edges], 1)
-
-
-def _zoom(full: Axes, tip: Axes, bands: Bands) -> None:
-    """Cut the tip's panel to the tip and mark it on the whole loop.
-
-    It is as high as four sensor bands, or half the loop if that is less, and a tenth of it lies
-    beyond the tip.
-    """
-    inside = slice(None) if bands.inside is None else bands.inside
-    voltage = bands.voltage[inside]
-    lower, upper = bands.lower["sensor", 95][inside], bands.upper["sensor", 95][inside]
-    at = int(np.argmax(voltage))
-    whole = float(np.max(upper) - np.min(lower))
-    height = min(4.0 * float(np.mean(upper - lower)), whole / 2)
-    width = (float(np.ptp(voltage)) or 1.0) * height / whole
-    left, bottom = float(voltage[at]) - 0.9 * width, float(upper[at]) - 0.9 * height
-    tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
-    outline: style.Look = {"edgecolor": style.Color.ZOOM, "alpha": 1.0, "linewidth": 1.5}
-    full.indicate_inset((left, bottom, width, height), **outline)
