@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
@@ -82,9 +82,25 @@ class QuadraticMap:
         """Log |det F|: what a density loses on the way to x."""
         return float(np.linalg.slogdet(self.factor)[1])
 
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        return np.ascontiguousarray(np.linalg.inv(self.factor).T)
+
+    @cached_property
+    def _pairs(self) -> tuple[IntArray, IntArray]:
+        """Every i and k of the rows of ``bends``."""
+        k, i = np.tril_indices(min(self.center.size, LONGEST))
+        return i, k
+
+    @cached_property
+    def _curved(self) -> tuple[tuple[int, int], ...]:
+        """The coordinates that bend, and how many pairs bend them."""
+        bent = [(j, np.flatnonzero(column)) for j, column in enumerate(self.bends.T)]
+        return tuple((j, int(rows[-1]) + 1) for j, rows in bent if rows.size)
+
     def to_curved(self, straight: FloatArray) -> FloatArray:
         """Return x (..., free) of z (..., free)."""
-        k, i = np.tril_indices(min(self.center.size, LONGEST))  # of the rows of ``bends``
+        i, k = self._pairs
         near = np.clip(straight, -FARTHEST, FARTHEST)
         products = near[..., i] * near[..., k] - (i == k)
         x: FloatArray = self.center + (straight + products @ self.bends) @ self.factor.T
@@ -92,16 +108,12 @@ class QuadraticMap:
 
     def to_straight(self, bent: FloatArray) -> FloatArray:
         """Return z (..., free) of x (..., free)."""
-        inverse = np.ascontiguousarray(np.linalg.inv(self.factor).T)
-        z = ((bent - self.center) @ inverse).reshape(-1, self.center.size)
-        # The coordinates that bend, and how many pairs bend them.
-        rows = [np.flatnonzero(column) for column in self.bends.T]
-        ends = {j: int(pairs[-1]) + 1 for j, pairs in enumerate(rows) if pairs.size}
+        z = ((bent - self.center) @ self._inverse).reshape(-1, self.center.size)
         for start in range(0, len(z), 4096):  # products take memory
             chunk = z[start : start + 4096]
             products = np.empty((len(chunk), 0))
             last = 0
-            for j, end in ends.items():
+            for j, end in self._curved:
                 while products.shape[1] < end:
                     products = np.concatenate([products, _products(chunk, last)], axis=1)
                     last += 1

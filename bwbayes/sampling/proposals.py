@@ -146,16 +146,19 @@ class StudentMixture:
         return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend)
 
     @cached_property
+    def _whitening(self) -> FloatArray:
+        # Its transpose times a row is one product for all coordinates.
+        return np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
+
+    @cached_property
     def _log_volumes(self) -> FloatArray:
         """The log determinants of the factors, (components,)."""
         return np.sum(np.log(np.diagonal(self.factors, axis1=1, axis2=2)), axis=1)
 
     def squares(self, straight: FloatArray) -> FloatArray:
         """Squared distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
-        # Its transpose times a row is one product for all coordinates.
-        inverses = np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
-        pairs = zip(self.centers, inverses, strict=True)
-        white = [(straight - center) @ inverse for center, inverse in pairs]
+        pairs = zip(self.centers, self._whitening, strict=True)
+        white = [(straight - center) @ whitening for center, whitening in pairs]
         return np.stack([np.einsum("...j,...j->...", z, z) for z in white])
 
     def log_parts(self, squares: FloatArray) -> FloatArray:
