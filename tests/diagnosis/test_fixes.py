@@ -126,7 +126,7 @@ def study(kind: str, seed: int, folder: Path) -> Outcome:
     )
 
 
-@pytest.mark.parametrize("kind", ["saturation", pytest.param("operator", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["mains", pytest.param("operator", marks=pytest.mark.slow)])
 def test_a_fix_that_is_followed_is_right_for_the_next_record(kind: str, tmp_path: Path) -> None:
     """The quick twin: a fix at the bench, and one of the model."""
     outcome = study(kind, 0, tmp_path)
