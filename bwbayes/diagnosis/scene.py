@@ -133,8 +133,7 @@ class Scene:
         places = optima
         try:
             rest = posterior.altered(training=later)
-            fits = [climb(rest, valley) for valley in map_estimate.valleys(rest, generator)]
-            best = max(fits, key=lambda fit: fit.log_density)
+            best = climb(rest, map_estimate.valleys(rest, generator))
             places = np.concatenate([optima, best.coordinates[np.newaxis]])
         except InputError:
             pass  # the rest has too few readings for these priors
