@@ -335,7 +335,6 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         most_steps=settings.steps,
         most_pilot_steps=settings.pilot_steps,
         together=best_together(settings.ensembles, walkers, samples),
-        least_pilot_steps=100 if places > 1 else 50,
         places=places,
     )
 
