@@ -171,3 +171,17 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     assert 600 == resolve(load(elsewhere), elsewhere.parent).record.samples
     for unit in ("displacement", "length=nm", "displacement=furlong", "time=-s"):
         assert isinstance(command("init", path, "--unit", unit).exception, InputError)
+
+
+def test_readings_that_are_clipped_on_both_sides_are_left_out_together(write: Write) -> None:
+    def clip(displacement: FloatArray) -> None:
+        low, high = np.min(displacement), np.max(displacement)
+        np.clip(displacement, 0.8 * low, 0.8 * high, out=displacement)
+
+    path = write(change=clip)
+    proposal = propose(path, path.parent, Naming())
+    clipped = [finding for finding in proposal.findings if finding.kind == "clipping"]
+    assert len(clipped) == 2
+    (source,) = proposal.config.records.values()
+    windows = [re.findall(r"\[([\d.]+), [\d.]+\]", finding.fix) for finding in clipped]
+    assert sum(map(len, windows)) == len(source.exclude or [])

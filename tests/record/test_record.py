@@ -16,6 +16,15 @@ def ramp(samples: int = 100, interval: float = 0.01, start: float = 0.0) -> Reco
     return Record(voltage, 2 * voltage, interval, start, truth=3 * voltage)
 
 
+def test_masked_readings_are_missing() -> None:
+    voltage = np.sin(np.arange(300.0))
+    masked = np.ma.masked_array(voltage, voltage > 0.9)
+    record = Record.from_arrays(voltage, masked, interval=0.01)
+    np.testing.assert_array_equal(record.has_reading, voltage <= 0.9)
+    with pytest.raises(InputError, match="voltage"):
+        Record.from_arrays(masked, voltage, interval=0.01)
+
+
 def test_arrays_are_copies_that_cannot_be_written_to() -> None:
     voltage = np.arange(3.0)
     record = Record(voltage, None, 1.0)

@@ -67,12 +67,33 @@ HARMLESS = {
     "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
     "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
     "comments below": (GOOD + "\n% 30 samples\n# end").encode(),
+    "empty line": lines(*LINES[:8], "", " ", *LINES[8:]).encode(),
+    "comment among numbers": lines(*LINES[:8], "# paused, by hand", *LINES[8:]).encode(),
+    "header once more": lines(*LINES[:8], HEADER, *LINES[8:]).encode(),
+    "french": GOOD.replace(HEADER, "Temps (s),Tension (V),Déplacement (µm)").encode("cp1252"),
 }
 
 
 @pytest.mark.parametrize("content", HARMLESS.values(), ids=HARMLESS)
 def test_harmless_differences_change_nothing(tmp_path: Path, content: bytes) -> None:
     assert read(tmp_path, GOOD).sha256 == read(tmp_path, content).sha256
+
+
+@pytest.mark.parametrize("mark", ["'", "\u2019", "\u202f", "\u00a0"])
+def test_thousands_may_be_marked_as_where_no_comma_does(tmp_path: Path, mark: str) -> None:
+    rows = [
+        f"{i * 0.005:.3f};{np.sin(i):.4f};{1 + i}{mark}{i:03d}{mark}{i:03d}.5" for i in range(30)
+    ]
+    record = read(tmp_path, lines(HEADER.replace(",", ";"), *rows))
+    assert record.displacement is not None
+    np.testing.assert_array_equal(
+        record.displacement, [1e6 * (1 + i) + 1e3 * i + i + 0.5 for i in range(30)]
+    )
+
+
+@pytest.mark.parametrize("text", ["1.#INF", "-1.#IND", "1.#QNAN000"])
+def test_what_c_writes_for_no_number_is_a_missing_reading(tmp_path: Path, text: str) -> None:
+    assert read(tmp_path, cell(9, 2, text)).readings == 29
 
 
 def test_thousands_in_quotes_may_be_marked_by_the_separator(tmp_path: Path) -> None:
@@ -210,8 +231,10 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
         lines(HEADER, *(row.replace(".", ",") for row in ROWS)),
         ":2: decimal commas, 6 fields for 3 columns; separate them by semicolons",
     ),
-    "empty line": (lines(*LINES[:8], "", *LINES[8:]), ":9: 0 fields for 3 columns"),
-    "comment below": (lines(*LINES[:8], "# x", *LINES[8:]), ":9: 1 fields for 3 columns"),
+    "too few after an empty line": (
+        lines(*LINES[:8], "", "# x", *LINES[8:11], "0.050,0.1", *LINES[12:]),
+        ":14: 2 fields for 3 columns",
+    ),
     "time goes back": (
         lines(*LINES[:8], LINES[5], *LINES[9:]),
         ":9: time_s: time goes back from 0.030 s to 0.020 s",

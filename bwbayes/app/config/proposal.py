@@ -88,14 +88,22 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
 def _text(
     path: Path, where: Path, naming: Naming, record: Record, findings: tuple[Finding, ...]
 ) -> str:
-    notes, fixes = [], {"record": "", "model": ""}
+    notes: list[str] = []
+    stated: dict[str, dict[str, tuple[str, str]]] = {"record": {}, "model": {}}
     for finding in findings:
         notes.append(f"# {finding.kind}: {finding.text}")
-        fix = re.fullmatch(r"(\w+ = .+) under \[(record|model)\]", finding.fix)
-        if fix:
-            fixes[fix[2]] += f"{fix[1]}  # {finding.kind}\n"
-        else:
+        if not (fix := re.fullmatch(r"(\w+) = (.+) under \[(record|model)\]", finding.fix)):
             notes.append(f"#   fix: {finding.fix}")
+            continue
+        key, value, table = fix.groups()
+        before, kinds = stated[table].get(key, (value, finding.kind))
+        if key == "exclude" and before != value:  # one list of all windows
+            value, kinds = f"{before[:-1]}, {value[1:]}", f"{kinds}, {finding.kind}"
+        stated[table][key] = value, kinds
+    fixes = {
+        table: "".join(f"{key} = {value}  # {kinds}\n" for key, (value, kinds) in keys.items())
+        for table, keys in stated.items()
+    }
     held = _held_out(record)
     # No fit sets aside the spikes that are held out.
     spikes = [s for s in isolated_outliers(record).tolist() for w in held if w.start <= s < w.stop]

@@ -35,11 +35,17 @@ _COMMON_UNITS = {
 }
 # What other people call the quantities, in lower case and without a unit.
 _WORDS = {
-    "time": ("t", "time", "timestamp", "sec", "seconds", "zeit", "x_value", "elapsed time"),
-    "voltage": ("u", "v", "volt", "volts", "voltage", "drive", "command", "input", "spannung"),
+    "time": (
+        *("t", "time", "timestamp", "unix_time", "sec", "seconds", "elapsed time", "x_value"),
+        *("zeit", "temps"),
+    ),
+    "voltage": (
+        *("u", "v", "volt", "volts", "voltage", "drive", "command", "input"),
+        *("spannung", "tension"),
+    ),
     "displacement": (
         *("x", "y", "z", "pos", "position", "disp", "displacement", "stroke", "deflection"),
-        *("sensor", "output", "weg", "auslenkung"),
+        *("sensor", "output", "weg", "auslenkung", "déplacement"),
     ),
 }
 

@@ -180,6 +180,8 @@ def frame_source(frame: Any, origin: str) -> Source:
 
 def _vector(values: Any, origin: str, name: str) -> NDArray[Any]:
     """Return numbers, in s if they are dates or durations, or say whose they are not."""
+    if np.ma.isMaskedArray(values):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
     try:
         vector = np.asarray(in_seconds(values), dtype=np.float64)
     except (TypeError, ValueError) as error:

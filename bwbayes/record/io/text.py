@@ -38,6 +38,7 @@ _NUMBER = re.compile(
     r"|[+-]?nan|[+-]?inf",
     re.IGNORECASE,
 )
+_MARKS = "['\u2019\u00a0\u2009\u202f]"
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _EXAMPLE = "time_s,voltage_V,displacement_um"
 
@@ -88,8 +89,17 @@ def read_text(path: Path) -> Source:
     if skipped:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
-    body = lines[layout.first :]
-    _check_lines(path, body, layout, len(names), is_whole=is_whole)
+    # A pause of the logger may leave an empty line, a comment, or the header once more.
+    heading = set(lines[: layout.first])
+    numbered = [
+        (number, line)
+        for number, line in enumerate(lines[layout.first :], start=layout.first + 1)
+        if line.strip(" ")
+        and line not in heading
+        and (line[0] not in "#%" or len(_cells(line, layout.separator)) == layout.fields)
+    ]
+    numbers, body = [n for n, _ in numbered], [line for _, line in numbered]
+    _check_lines(path, body, layout, len(names), numbers, is_whole=is_whole)
     frame, decimal = _parsed(path, body, layout)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
@@ -97,7 +107,7 @@ def read_text(path: Path) -> Source:
             break
         # Dates and times of day have no unit, and become seconds.
         stated = "s" if re.match(r".*\d:\d\d", str(frame[column].iloc[0])) else unit
-        load = partial(_numbers, path, frame[column], decimal, name, layout.first + 1)
+        load = partial(_numbers, path, frame[column], decimal, name, numbers)
         series.append(
             Series(name, len(body), load, stated, load_readings=partial(load, words=True))
         )
@@ -140,7 +150,13 @@ def _decoded(path: Path) -> str:
             raise InputError(
                 f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV"
             ) from None
-    return text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
+    text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
+    # What C writes where there is no number, and marks of thousands but points and commas.
+    text = re.sub(r"-?1\.#(INF|IND|QNAN|SNAN)\d*", "nan", text)
+    if re.search(_MARKS, text) is None:
+        return text
+    thousands = rf"(?<![\d.,])\d{{1,3}}({_MARKS}\d{{3}})+(?!\d)"
+    return re.sub(thousands, lambda number: re.sub(_MARKS, "", number[0]), text)
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -202,7 +218,13 @@ def _header(
             continue
         first = index
         bare = [cell.strip("[]() ") for cell in cells]
-        is_unit = [any(power_of(cell, q) is not None for q in QUANTITIES) for cell in bare if cell]
+        # Times of day have their form in place of a unit.
+        is_unit = [
+            re.fullmatch("h+:m+(:s+)?([.,]f+)?", cell.lower())
+            or any(power_of(cell, q) is not None for q in QUANTITIES)
+            for cell in bare
+            if cell
+        ]
         if not units and all(is_unit):
             units = bare
             continue
@@ -231,7 +253,13 @@ def _split_header(line: str, layout: _Layout) -> list[str]:
 
 
 def _check_lines(
-    path: Path, body: Sequence[str], layout: _Layout, names: int, *, is_whole: bool
+    path: Path,
+    body: Sequence[str],
+    layout: _Layout,
+    names: int,
+    numbers: Sequence[int],
+    *,
+    is_whole: bool,
 ) -> None:
     """Refuse a line that has fewer fields than the others, or more than the header.
 
@@ -246,8 +274,7 @@ def _check_lines(
         decimals = [len(re.split("[.,]", cell)[-1]) for cell in column if cell]
         is_cut = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
     if is_cut and not is_whole:
-        line_number = layout.first + len(body)
-        raise InputError(f"{path}:{line_number}: the last line is cut off; remove it")
+        raise InputError(f"{path}:{numbers[-1]}: the last line is cut off; remove it")
     for index, line in enumerate(body):
         if (len(line.split()) if separator == " " else line.count(separator) + 1) == fields:
             continue
@@ -260,7 +287,7 @@ def _check_lines(
             advice = f"remove {cells[-1][:30]!r}, or write 1.5 where 1,5 is meant"
         elif index == len(body) - 1:
             problem, advice = f"the last line is cut off, {problem}", "remove it"
-        raise InputError(f"{path}:{layout.first + 1 + index}: {problem}; {advice}")
+        raise InputError(f"{path}:{numbers[index]}: {problem}; {advice}")
 
 
 def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
@@ -294,7 +321,13 @@ def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFr
 
 
 def _numbers(
-    path: Path, column: Any, decimal: str, name: str, first_line: int, *, words: bool = False
+    path: Path,
+    column: Any,
+    decimal: str,
+    name: str,
+    lines: Sequence[int],
+    *,
+    words: bool = False,
 ) -> NDArray[Any]:
     """Return a column's numbers, nan for ``words``; dates and times of day in seconds.
 
@@ -327,7 +360,7 @@ def _numbers(
             return np.asarray(times + 86_400.0 * days)
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
-    where = f"{path}:{first_line + wrong[0]}: {name}: {shown}"
+    where = f"{path}:{lines[wrong[0]]}: {name}: {shown}"
     if (
         words
         and 2 * wrong.size < column.size
