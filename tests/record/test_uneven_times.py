@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -97,6 +97,7 @@ def test_what_is_done_is_said() -> None:
     st.sampled_from([np.rint, np.floor]),
     st.integers(0, 10**6),
 )
+@example(224, 1e-6, 0.17543864867674341, np.floor, 0)
 @settings(max_examples=60, deadline=None)
 def test_samples_are_uniform_whose_clock_ticks_too_slowly(
     samples: int, tick: float, ratio: float, rounded: np.ufunc, start: int

@@ -13,6 +13,7 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning
@@ -156,8 +157,15 @@ def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
     counts = steps / tick
     samples = np.arange(elapsed.size)
     _, interval = np.polynomial.polynomial.polyfit(samples, elapsed, 1)
-    # A tenth for the line, whose ends are uncertain too.
-    is_rounded = np.ptp(elapsed - interval * samples) <= 1.1 * tick
+    # About the line that is nearest to them all: another one may be a tenth of a tick wider.
+    slope = tick / samples.size
+    width = scipy.optimize.minimize_scalar(
+        lambda each: np.ptp(elapsed - each * samples),
+        bounds=(interval - slope, interval + slope),
+        method="bounded",
+        options={"xatol": 1e-4 * slope},
+    ).fun
+    is_rounded = width <= 1.001 * tick
     is_whole = np.abs(counts - np.rint(counts)).max() < 1e-3
     others = np.count_nonzero(np.rint(counts) != np.rint(np.median(counts)))
     if not is_rounded or not is_whole or others < 10:
