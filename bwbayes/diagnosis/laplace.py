@@ -82,6 +82,11 @@ class LocalFit:
         residual = self.posterior.only.readings.values - self.displacement
         return float(np.sqrt(np.mean(residual**2)))
 
+    @property
+    def follows(self) -> bool:
+        """Whether it misses less than a constant would: else the noise takes up the readings."""
+        return self.rmse < float(np.std(self.posterior.only.readings.values))
+
     def error(self, windows: Sequence[slice]) -> float:
         """Root mean square, um, of what it misses of the readings in windows; nan of none."""
         if not windows:

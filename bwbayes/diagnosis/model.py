@@ -103,6 +103,8 @@ def _changed(
         values = {**dict(zip(scene.posterior.names, coordinates, strict=True)), **start}
         places.append([values.get(name, 0.0) for name in posterior.names])
     fit = scene.extended(posterior=posterior, places=np.array(places))
+    if not fit.follows:
+        return
     fix = _lines(changes)
     if parameters:
         fix += f", with what is known of {', '.join(parameters)} in [parameters]"

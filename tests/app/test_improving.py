@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -23,12 +24,13 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
+from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
-from tests.stand import autoregressive
+from tests.stand import autoregressive, play
 from tests.test_sampling_rates import records
 
 QUIET = Console(quiet=True)
@@ -133,6 +135,40 @@ def test_the_noise_is_chosen_by_evidence(
     compared = why.count("nats against") + why.count("a tie with")
     assert compared == 1 + ("innovations are white" not in why)
     assert ("innovations are white" in why) == (expected != {"smooth"})
+
+
+def saturating() -> Record:
+    """Return a record of plays that saturate and creep, under a unipolar triangle that shrinks."""
+    time = 0.02 * np.arange(2500)
+    wave = 2 / np.pi * np.arcsin(np.sin(0.4 * np.pi * time - np.pi / 2))
+    voltage = 50 + 50 * wave * np.linspace(1, 0.3, time.size)
+    weights = {0: 0.4, 5: 0.1, 10: 0.08, 20: 0.06, 30: 0.05}
+    loops = sum(weight * play(voltage, threshold) for threshold, weight in weights.items())
+    moved = 30 * np.tanh(loops / 45)
+    crept = np.zeros(time.size)
+    for lag in (0.2, 2.0, 20.0, 200.0):
+        keep = np.exp(-0.02 / lag)
+        crept += scipy.signal.lfilter([0.03 * (1 - keep)], [1, -keep], moved)
+    noise = 0.05 * np.random.default_rng(1).standard_normal(time.size)
+    return Record(voltage, moved + crept + noise, 0.02)
+
+
+def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> None:
+    """It has more evidence, and the model beside it misses more than a constant would."""
+    write_record(saturating(), tmp_path / "record.h5")
+    windows = [[0.0, 5.0], [7.5, 15.0], [17.5, 25.0], [27.5, 35.0], [37.5, 45.0], [47.5, 50.0]]
+    config = parse(f'[record]\nfile = "record.h5"\ntrain = {windows}\n', "config")
+    problem = resolve(config, tmp_path)
+    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+    rough = climb(problem.posterior, point.optima)
+    other = problem.reconfigured({"noise": "smooth"}, {})
+    starts = [dict(zip(problem.posterior.names, place, strict=True)) for place in point.optima]
+    places = [[start.get(name, 0.0) for name in other.names] for start in starts]
+    smooth = climb(other, np.array(places))
+    assert smooth.log_evidence > rough.log_evidence
+    assert rough.follows
+    assert not smooth.follows
+    assert chosen_noise(problem, point)[0] == "discrepancy"
 
 
 def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:

@@ -95,12 +95,13 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
-        evidence[noise] = sum(
-            climb(
-                other.alone(name), other.select_draws(places, name), least=fit.log_density
-            ).log_evidence
+        fits = [
+            climb(other.alone(name), other.select_draws(places, name), least=fit.log_density)
             for name, fit in rough.items()
-        )
+        ]
+        # Not one that takes up the readings, of which it would tell nothing anew.
+        if all(fit.follows for fit in fits):
+            evidence[noise] = sum(fit.log_evidence for fit in fits)
     best = max(evidence, key=lambda noise: evidence[noise])
     if evidence[best] < evidence[default] + TIED:
         best = default
