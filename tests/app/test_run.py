@@ -63,6 +63,23 @@ def test_larger_target_is_reached_with_the_same_draws_first(run: Path, copy: Run
     assert small.lowest_ess(copy.path) >= required
 
 
+def test_what_is_finished_is_not_worked_out_again(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it stays finished, whenever it is interrupted; files that are missing are made again."""
+    numbers, before = copy.numbers(), copy.summary.stat().st_mtime_ns
+    monkeypatch.setattr("bwbayes.app.running.run.assemble", None)
+    fit = resume(copy, small.quiet(), workers=1)
+    assert fit.converged
+    assert copy.summary.stat().st_mtime_ns == before
+    copy.summary.unlink()
+    resume(copy, small.quiet(), workers=1)
+    again = copy.numbers()
+    assert {k: v for k, v in again.items() if k != "wall_s"} == {
+        k: v for k, v in numbers.items() if k != "wall_s"
+    }
+
+
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:
     """A target that is missed takes back the intervals that a lower one had given."""
     steps = ChainFile.read(copy.chain).steps("sampling")

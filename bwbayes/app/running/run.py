@@ -20,7 +20,7 @@ from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.assembling import assemble, save_result
+from bwbayes.app.running.assembling import assemble, load_result, save_result
 from bwbayes.app.running.explaining import find_map
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
@@ -91,8 +91,10 @@ def resume(
             open_executor(workers, problem.posterior.engine, executor) as pool,
             Progress(console, plan) as progress,
         ):
-            # It is written last, as the sign that all is done; now there is more to do.
-            folder.summary.unlink(missing_ok=True)
+            known = load_result(folder.result, problem, chain)
+            if known is None:
+                # It is written last, as the sign that all is done; now there is more to do.
+                folder.summary.unlink(missing_ok=True)
             outcome = sample(problem.posterior, plan, chain, pool, progress)
         models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
         ess = outcome.check.lowest_ess
@@ -103,15 +105,17 @@ def resume(
         fit = Fit(chain, folder).knowing(problem=problem, outcome=outcome)
         if not predict:
             return fit
-        console.print("computing predictions ...", highlight=False)
-        with StepProgress(console) as watch:
-            result = assemble(problem, chain, outcome, artist, watch)
+        result = known
+        if result is None:
+            console.print("computing predictions ...", highlight=False)
+            with StepProgress(console) as watch:
+                result = assemble(problem, chain, outcome, artist, watch)
         fit = fit.knowing(
             result=result, standing=result.standing, seconds=time.monotonic() - start_time
         )
         if answer is not None:
             answer(fit)
-        if files:
+        if files and not folder.summary.exists():
             console.print("writing figures and files ...", highlight=False)
             write_files(fit, folder, artist)
     return fit
