@@ -67,9 +67,6 @@ HARMLESS = {
     "order": lines(*(",".join(line.split(",")[::-1]) for line in LINES)).encode(),
     "comments": ("# anything\n# at all: yes\n\n" + GOOD).encode(),
     "comments below": (GOOD + "\n% 30 samples\n# end").encode(),
-    "empty line": lines(*LINES[:8], "", " ", *LINES[8:]).encode(),
-    "comment among numbers": lines(*LINES[:8], "# paused, by hand", *LINES[8:]).encode(),
-    "header once more": lines(*LINES[:8], HEADER, *LINES[8:]).encode(),
     "french": GOOD.replace(HEADER, "Temps (s),Tension (V),Déplacement (µm)").encode("cp1252"),
 }
 
@@ -77,6 +74,30 @@ HARMLESS = {
 @pytest.mark.parametrize("content", HARMLESS.values(), ids=HARMLESS)
 def test_harmless_differences_change_nothing(tmp_path: Path, content: bytes) -> None:
     assert read(tmp_path, GOOD).sha256 == read(tmp_path, content).sha256
+
+
+@pytest.mark.parametrize(
+    ("added", "count"),
+    [(["", " "], "2 lines"), (["# paused, by hand"], "1 line"), ([HEADER], "1 line")],
+    ids=["empty", "comment", "header"],
+)
+def test_lines_among_the_numbers_that_are_no_samples_are_skipped_with_a_remark(
+    tmp_path: Path, added: list[str], count: str
+) -> None:
+    with pytest.warns(InputWarning, match=f"csv:9: {count} among the numbers skipped"):
+        record = read(tmp_path, lines(*LINES[:8], *added, *LINES[8:]))
+    assert record.sha256 == read(tmp_path, GOOD).sha256
+
+
+def test_a_row_like_one_above_the_numbers_stays(tmp_path: Path) -> None:
+    """Without times, a row left out would move all that follow."""
+    rows = ["0.1,OVLD", *(f"{np.sin(i):.4f},{np.cos(i):.4f}" for i in range(250)), "0.1,OVLD"]
+    path = tmp_path / "record.csv"
+    path.write_text(lines("voltage_V,displacement_um", *rows, "0.2,0.3"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        record = read_record(path, fs=100.0)
+    assert record.voltage[-2:].tolist() == [0.1, 0.2]
 
 
 @pytest.mark.parametrize("mark", ["'", "\u2019", "\u202f", "\u00a0"])

@@ -42,7 +42,7 @@ class Artist:
             pool.submit(_compile_common)
 
     def rehearse(self, posterior: Posterior) -> None:
-        """Let the other process compile what this one needs later, while this one does the rest."""
+        """Let the other process compile what this one needs later, and load what draws."""
         if self.pool is None:
             return
         if posterior.engine == "numba":

@@ -158,12 +158,12 @@ def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
     samples = np.arange(elapsed.size)
     _, interval = np.polynomial.polynomial.polyfit(samples, elapsed, 1)
     # About the line that is nearest to them all: another one may be a tenth of a tick wider.
-    slope = tick / samples.size
+    margin = tick / samples.size
     width = scipy.optimize.minimize_scalar(
-        lambda each: np.ptp(elapsed - each * samples),
-        bounds=(interval - slope, interval + slope),
+        lambda trial: np.ptp(elapsed - trial * samples),
+        bounds=(interval - margin, interval + margin),
         method="bounded",
-        options={"xatol": 1e-4 * slope},
+        options={"xatol": 1e-4 * margin},
     ).fun
     is_rounded = width <= 1.001 * tick
     is_whole = np.abs(counts - np.rint(counts)).max() < 1e-3

@@ -3,9 +3,9 @@
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
 them names the columns; a second line may hold their units. What stands above the header is skipped
-with a remark, but for lines ``# key: value`` of which ``voltage`` (command or output), ``origin``,
-``interval_s`` and ``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is
-a missing reading. A line that cannot be read is named with its number.
+with a remark, as are empty lines, comments and headers among the numbers; but lines ``# key: value``
+above, of which ``voltage`` (command or output), ``origin``, ``interval_s`` and ``time_offset_s``
+are understood. An empty cell or ``nan`` in the displacement is a missing reading. A line that cannot be read is named with its number.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def read_text(path: Path) -> Source:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     # A pause of the logger may leave an empty line, a comment, or the header once more.
-    heading = set(lines[: layout.first])
+    heading = {line for line in lines[header : layout.first] if _split_header(line, layout)}
     numbered = [
         (number, line)
         for number, line in enumerate(lines[layout.first :], start=layout.first + 1)
@@ -100,6 +100,10 @@ def read_text(path: Path) -> Source:
     ]
     numbers, body = [n for n, _ in numbered], [line for _, line in numbered]
     _check_lines(path, body, layout, len(names), numbers, is_whole=is_whole)
+    if skipped := len(lines) - layout.first - len(body):
+        first = min(set(range(layout.first + 1, len(lines) + 1)) - set(numbers))
+        remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
+        warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     frame, decimal = _parsed(path, body, layout)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
