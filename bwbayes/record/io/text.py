@@ -3,9 +3,10 @@
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
 them names the columns; a second line may hold their units. What stands above the header is skipped
-with a remark, as are empty lines, comments and headers among the numbers; but lines ``# key: value``
-above, of which ``voltage`` (command or output), ``origin``, ``interval_s`` and ``time_offset_s``
-are understood. An empty cell or ``nan`` in the displacement is a missing reading. A line that cannot be read is named with its number.
+with a remark, as are empty lines, comments and headers among the numbers. Of lines
+``# key: value`` above them ``voltage`` (command or output), ``origin``, ``interval_s`` and
+``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is a missing reading.
+A line that cannot be read is named with its number.
 """
 
 from __future__ import annotations
