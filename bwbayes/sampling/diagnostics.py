@@ -76,6 +76,11 @@ class Check:
         """The effective draws of the parameter that has the fewest, of ranks or tails."""
         return float(np.min([self.ess_bulk, self.ess_tail]))
 
+    @property
+    def steps_needed(self) -> float:
+        """Steps after which walkers would agree, by how they differ now: R² − 1 ∝ 1/steps."""
+        return self.steps * (self.walker_rhat**2 - 1) / (LARGEST_WALKER_RHAT**2 - 1)
+
     def shortcomings(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 

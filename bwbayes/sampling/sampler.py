@@ -7,7 +7,8 @@ little, each time with a new fit and twice as long. Every fit keeps a share for 
 point fit knows, be it in the draws or not. Pilot and tuning are thrown away. Then draws
 count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row
 find nothing wrong, the first on half the draws that are to be reached, the second on all of them
-and a fifth more than the first at least; or the budget of steps is used up.
+and a fifth more than the first at least; or the budget of steps is used up, or a tenth of it shows
+that walkers differ so much that four times as many would not do.
 To judge costs as much as many steps, so each judgment predicts how long the chain must become,
 and the next one waits until then, and until the chain is long against its autocorrelation times.
 
@@ -230,7 +231,9 @@ class _Sampling:
             may_refit = at_end and drawn >= 2 * fitted_to and self._is_early
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
-            if required > blocks and blocks < budget:
+            # A tenth of the budget has had several proposals, and tells whether all of it may do.
+            is_early = drawn < budget / 10
+            if required > blocks and is_early:
                 if may_refit and not passed and required > LARGEST_SLOWDOWN * needed:
                     return None
                 needed = required
@@ -248,6 +251,9 @@ class _Sampling:
                 return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
+            if at_end and not is_early and latest.steps_needed > 4 * budget * plan.block:
+                why = f"some {latest.steps_needed:.1e} steps would be needed: {'; '.join(missing)}"
+                return Outcome(False, f"step limit {plan.most_steps} out of reach: {why}", latest)
             first = not latest.shortcomings(plan.ess, FIRST_PART)
             ess = latest.lowest_ess
             growth, best = (ess - judged[1]) / (blocks - judged[0]), max(best, ess / blocks)

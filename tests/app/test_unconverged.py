@@ -55,7 +55,7 @@ def test_line_on_the_screen_says_what_to_do(
     assert "" == printed.out
     assert 1 == printed.err.count("\n")
     assert printed.err.startswith("NOT CONVERGED: step limit 25 reached: ")
-    assert f"`bwbayes resume {tmp_path / 'a'} --steps 50`" in printed.err
+    assert f"`bwbayes resume {tmp_path / 'a'} --steps 89`" in printed.err
 
 
 @pytest.mark.parametrize(

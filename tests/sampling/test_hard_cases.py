@@ -13,6 +13,8 @@ all with ``-m slow``.
 
 from __future__ import annotations
 
+import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +23,8 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling import sampler
-from bwbayes.sampling.diagnostics import check
+from bwbayes.sampling.chain import Phase
+from bwbayes.sampling.diagnostics import Check, check
 from bwbayes.sampling.plan import SamplingPlan
 from tests.sampling.hard_chains import BLOCK, HARD, good, hard, moved
 from tests.sampling.samplings import run
@@ -110,7 +113,7 @@ def test_hard_target_never_converges(name: str) -> None:
     density, point = HARD_TARGETS[name]
     _, outcome = run(PLAN, 1, target(density, 2), point)
     assert not outcome.converged
-    assert outcome.stop_reason.startswith(f"step limit {PLAN.most_steps} reached: ")
+    assert re.match(f"step limit {PLAN.most_steps} (reached|out of reach): ", outcome.stop_reason)
 
 
 def test_far_modes_converge_to_their_weights() -> None:
@@ -130,6 +133,34 @@ def test_far_modes_do_not_converge_without_a_proposal(monkeypatch: pytest.Monkey
     upper = chain.coordinates("sampling")[..., 0] > 0
     assert (upper == upper[0]).all()
     assert 0 < np.mean(upper[0]) < 1
+
+
+def thin_rings(x: FloatArray) -> FloatArray:
+    """One in each other, so thin that hardly any place that is proposed lies on one."""
+    radius = np.linalg.norm(x, axis=1)
+    density: FloatArray = -0.5 * (np.sin(20 * radius) / 1e-3) ** 2 - 0.5 * radius**2
+    return density
+
+
+def interrupt(_: Phase, check: Check | None) -> None:
+    if check is None:  # there is one more block
+        raise KeyboardInterrupt
+
+
+def test_budget_that_is_out_of_reach_is_not_used_up() -> None:
+    """It is known after a tenth; going on ends at once, and with a budget that may do goes on."""
+    plan, posterior = replace(PLAN, most_steps=8000), target(thin_rings, 2)
+    chain, outcome = run(plan, 2, posterior, point_at([0.0, 0.0]))
+    assert not outcome.converged
+    assert outcome.stop_reason.startswith("step limit 8000 out of reach: some ")
+    steps = chain.steps("sampling")
+    assert steps + chain.set_aside * plan.block < 0.3 * plan.most_steps
+    with ThreadPoolExecutor(1) as pool:
+        again = sampler.sample(posterior, plan, chain, pool)
+        assert again.stop_reason == outcome.stop_reason
+        longer = replace(plan, most_steps=int(outcome.check.steps_needed))
+        with pytest.raises(KeyboardInterrupt):
+            sampler.sample(posterior, longer, chain, pool, interrupt)
 
 
 # Good runs

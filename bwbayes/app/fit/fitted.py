@@ -183,8 +183,13 @@ class Fit(Shown):
 
     @property
     def resuming(self) -> str:
-        """The command that resumes the run, with twice the steps that it had."""
-        return f"bwbayes resume {self.folder.path} --steps {2 * self.problem.config.sampling.steps}"
+        """The command that resumes the run, with twice the steps that it had, or all it needs."""
+        return f"bwbayes resume {self.folder.path} --steps {self._more_steps}"
+
+    @property
+    def _more_steps(self) -> int:
+        needed = float(f"{self.outcome.check.steps_needed:.1e}")
+        return max(2 * self.problem.config.sampling.steps, int(np.nan_to_num(needed, posinf=0.0)))
 
     @property
     def numbers(self) -> dict[str, object]:
@@ -336,7 +341,7 @@ class Fit(Shown):
             call = "fit.resume(" if self._scratch else f"bwbayes.resume({str(self.folder.path)!r}, "
             raise NotConvergedError(
                 f"not converged: {self.outcome.stop_reason}; intervals are withheld; resume with "
-                f"`{call}steps={2 * self.problem.config.sampling.steps})`, and look at the traces"
+                f"`{call}steps={self._more_steps})`, and look at the traces"
             )
 
     def _converged(self) -> Result:
