@@ -111,11 +111,11 @@ class Record:
 
         Parameters
         ----------
-        voltage, displacement : arrays (samples,), V and um
+        voltage, displacement : arrays (samples,), (samples, 1) or (1, samples), V and um
             The displacement is nan where a reading is missing, and None for a planned voltage.
         interval, start : float, s
             Sampling interval, and time of the first sample (default: 0).
-        time : array (samples,), s
+        time : array as these, s
             Times of the samples, in place of interval and start; dates and durations too.
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;

@@ -197,13 +197,21 @@ def test_arrays_may_have_times_and_units(
         ({"time": ["a"] * 200}, "time: not numbers"),
         ({"time": np.full(200, np.nan)}, "arrays:sample 0: time: no number .*; give one, or leave"),
         ({"voltage": ["a"] * 200}, "voltage: not numbers"),
-        ({"voltage": VOLTAGE[:, np.newaxis]}, r"voltage: shape \(200, 1\) is no vector"),
+        ({"voltage": VOLTAGE.reshape(2, 100)}, r"voltage: shape \(2, 100\) is no vector; give"),
     ],
 )
 def test_arrays_that_are_no_record_are_one_line(changes: dict[str, Any], line: str) -> None:
     arrays = {"time": TIME, "voltage": VOLTAGE, "displacement": DISPLACEMENT}
     with pytest.raises(InputError, match=line):
         Record.from_arrays(**arrays | changes)
+
+
+@given(st.lists(st.sampled_from([(-1,), (-1, 1), (1, -1)]), min_size=3, max_size=3))
+def test_rows_and_columns_are_vectors(shapes: list[tuple[int, ...]]) -> None:
+    """As MATLAB keeps every vector, each array in its own way."""
+    arrays = [x.reshape(s) for x, s in zip((TIME, VOLTAGE, DISPLACEMENT), shapes, strict=True)]
+    time, voltage, displacement = arrays
+    assert_same(Record.from_arrays(voltage, displacement, time=time))
 
 
 @pytest.mark.parametrize("kind", ["datetime64[ns]", "datetime64[us]", "timedelta64[ns]"])

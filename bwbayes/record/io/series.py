@@ -152,7 +152,7 @@ def array_source(
     start: float = 0.0,
     notes: Mapping[str, str] | None = None,
 ) -> Source:
-    """Return arrays (samples,) by name as what a file called ``origin`` holds."""
+    """Return arrays (samples,), or a row or a column, by name as a file called ``origin``."""
     series = [
         Series(name, np.size(values), partial(_vector, values, origin, name))
         for name, values in arrays.items()
@@ -186,6 +186,6 @@ def _vector(values: Any, origin: str, name: str) -> NDArray[Any]:
         vector = np.asarray(in_seconds(values), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{origin}: {name}: not numbers ({error}); convert them") from None
-    if vector.ndim != 1:
+    if not vector.ndim or sum(side != 1 for side in vector.shape) > 1:
         raise InputError(f"{origin}: {name}: shape {vector.shape} is no vector; give (samples,)")
-    return vector
+    return vector.ravel()
