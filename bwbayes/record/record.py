@@ -19,10 +19,11 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
-from bwbayes.record.io.columns import QUANTITIES, Naming, select
+from bwbayes.record.io.columns import Naming, select
 from bwbayes.record.io.fields import VoltageIs, record_fields, require_voltage_is
 from bwbayes.record.io.grid import clock
 from bwbayes.record.io.series import Source, array_source, frame_source
+from bwbayes.record.io.units import QUANTITIES
 from bwbayes.shown import brief
 
 Window = tuple[float, float]
@@ -119,7 +120,7 @@ class Record:
             Times of the samples, in place of interval and start; dates and durations too.
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
-            ``"-nm"`` turns the sign.
+            ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1.
 
         Raises
         ------

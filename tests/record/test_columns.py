@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
-from bwbayes.record.io.columns import unit_in
+from bwbayes.record.io.units import power_of, unit_in
 
 TIME = np.arange(200) / 100
 VOLTAGE = 50 * np.sin(6 * TIME)
@@ -161,6 +161,28 @@ def test_a_unit_is_read_from_any_usual_name(
 ) -> None:
     quantity, unit = base
     assert prefix + unit == unit_in(form.format(word, prefix + unit), quantity)
+
+
+@given(
+    st.floats(1e-9, 1e9),
+    st.sampled_from(["{:.17g} {}", "-{:.17e}{}", "{:.17f}  {}"]),
+    st.sampled_from(["um", "nm", "mm", "µm", "micron"]),
+    st.sampled_from(["V", "kV", "millivolt"]),
+)
+def test_a_number_of_units_is_a_sensitivity(number: float, form: str, unit: str, volt: str) -> None:
+    """Of a displacement in volts or counts, or an amplifier's monitor, with a sign or without."""
+    sensitivity = form.format(number, unit)
+    units = {"displacement": sensitivity, "voltage": f"{number!r} {volt}", "time": "0.1 ms"}
+    sign = -1.0 if form.startswith("-") else 1.0
+    counts = sign * DISPLACEMENT / number / 10.0 ** (power_of(unit, "displacement") or 0)
+    volts = VOLTAGE / number / 10.0 ** (power_of(volt, "voltage") or 0)
+    assert_same(Record.from_arrays(volts, counts, time=1e4 * TIME, units=units))
+
+
+@pytest.mark.parametrize("unit", ["0 um", "0.35", "1e999 um", "1 2 um", "--um", "x um"])
+def test_a_number_without_a_unit_or_with_a_strange_one_is_refused(unit: str) -> None:
+    with pytest.raises(InputError, match=r"is unknown; write um, .* as '0.35 um'"):
+        Record.from_arrays(VOLTAGE, DISPLACEMENT, interval=0.01, units={"displacement": unit})
 
 
 # Arrays and tables

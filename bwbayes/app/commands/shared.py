@@ -137,7 +137,8 @@ def naming_options(command: AnyCommand) -> AnyCommand:
         multiple=True,
         metavar="QUANTITY=UNIT",
         callback=_pairs,
-        help="A column's unit, if the file does not state it; -nm turns the sign.",
+        help="A column's unit, if the file does not state it: nm; -nm turns the sign; '0.35 um' is "
+        "a sensor's sensitivity.",
     )
     columns = click.option(
         "--column",

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import scipy
@@ -73,7 +74,7 @@ def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProp
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
     here = (
         f'units = {{ displacement = "{turned}" }} under [record], or '
-        f"`bwbayes init {path} --unit displacement={turned}`"
+        f"`bwbayes init {path} --unit displacement={quote(turned)}`"
     )
     findings = tuple(
         replace(finding, fix=f"{finding.fix}, or say {here}")

@@ -88,7 +88,9 @@ class _Source(ConfigTable):
     paths, or numbers counted from 1.
     """
     units: dict[str, str] | None = key(None, example='{ displacement = "nm" }')
-    """Units by quantity, where the file does not state them; a minus turns the sign."""
+    """Units by quantity, where the file does not state them; "0.35 um" is a sensor's sensitivity,
+    that of 1 in the column, and a minus turns the sign.
+    """
     fs: Positive | None = key(None, unit="Hz", example="1e3")
     """The file's sampling rate, in place of a time column."""
 

@@ -23,16 +23,8 @@ from numpy.typing import NDArray
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 from bwbayes.record.io.series import RATES, Series, Source
+from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, power_of, scale_of, unit_in
 
-QUANTITIES = ("time", "voltage", "displacement")
-
-# The powers of ten of units' prefixes.
-_PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
-_COMMON_UNITS = {
-    "time": ("s", "ms", "us"),
-    "voltage": ("V", "mV", "kV"),
-    "displacement": ("um", "nm", "mm", "m"),
-}
 # What other people call the quantities, in lower case and without a unit.
 _WORDS = {
     "time": (
@@ -60,8 +52,9 @@ class Naming:
         The column of a quantity, "time", "voltage" or "displacement": its name, the end of its
         path, or its number, counted from 1. The others are recognized.
     units
-        The unit of a quantity, where the file does not state it or states another. A minus before
-        it turns the sign: ``"-um"`` is a displacement that the sensor counts backwards.
+        The unit of a quantity, where the file does not state it or states another. A number before
+        it is what 1 in the column stands for, as the sensor's sensitivity: ``"0.35 um"`` for volts
+        of 0.35 um each. A minus turns the sign: ``"-um"`` is a displacement counted backwards.
     fs
         The sampling rate, Hz, in place of a time column.
 
@@ -83,14 +76,14 @@ class Naming:
                     allowed = ", ".join(QUANTITIES)
                     raise InputError(f"{key}: no quantity {quantity!r}; write {allowed}")
         for quantity, unit in self.units.items():
-            if power_of(unit.removeprefix("-"), quantity) is None:
-                allowed = ", ".join(_COMMON_UNITS[quantity])
+            if (scale := scale_of(unit, quantity)) is None:
+                allowed = ", ".join(COMMON_UNITS[quantity])
                 raise InputError(
-                    f"units: {quantity} in {unit!r} is unknown; write {allowed}, or with another "
-                    "SI prefix"
+                    f"units: {quantity} in {unit!r} is unknown; write {allowed}, with another SI "
+                    f"prefix, or a number of them, as '0.35 {COMMON_UNITS[quantity][0]}'"
                 )
-        if self.units.get("time", "").startswith("-"):
-            raise InputError("units: time does not run backwards; remove the minus")
+            if quantity == "time" and scale[0] < 0:
+                raise InputError("units: time does not run backwards; remove the minus")
         if len(set(self.columns.values())) < len(self.columns):
             raise InputError("columns: two quantities have the same column; give each its own")
         if self.fs is not None and not 0 < self.fs < np.inf:
@@ -101,7 +94,7 @@ class Naming:
 
 @dataclass(frozen=True)
 class FileColumn:
-    """One column as it stands in a file; a minus before its unit turns the sign."""
+    """One column as it stands in a file; its unit may be a number of units, and negative."""
 
     name: str
     values: NDArray[Any]
@@ -109,10 +102,9 @@ class FileColumn:
 
     def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
         """Return values in this column's unit in the package's."""
-        power = power_of(self.unit.removeprefix("-"), quantity) or 0
+        factor, power = scale_of(self.unit, quantity) or (1.0, 0)
         # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
-        scaled = values * 10.0**power if power >= 0 else values / 10.0**-power
-        return -scaled if self.unit.startswith("-") else scaled
+        return factor * (values * 10.0**power if power >= 0 else values / 10.0**-power)
 
 
 @dataclass(frozen=True)
@@ -258,32 +250,6 @@ def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Seri
     return candidates
 
 
-def power_of(unit: str, quantity: str) -> int | None:
-    """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
-    base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
-    written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
-    if written:
-        prefix, *bases = written.groups()
-        base = "sVm"[[*map(bool, bases[:3])].index(True)] if not bases[3] else "um"
-        unit = {"micro": "u", "kilo": "k"}.get(prefix.lower(), prefix[:1].lower()) + base
-    base, shift = {"time": ("s", 0), "voltage": ("V", 0)}.get(quantity, ("m", 6))
-    if not unit.endswith(base) or unit.removesuffix(base) not in _PREFIXES:
-        return None
-    return _PREFIXES[unit.removesuffix(base)] + shift
-
-
-def unit_in(name: str, quantity: str) -> str | None:
-    """Return the unit at the end of a column's name, if it is one of the quantity.
-
-    In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``.
-    """
-    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+))\s*$", name)
-    if ending is None:
-        return None
-    unit = next(group for group in ending.groups() if group is not None).strip()
-    return unit if power_of(unit, quantity) is not None else None
-
-
 def _unit_of(label: str, unit: str, quantity: str) -> str | None:
     """Return the unit that a file states for a series, if it is one of the quantity."""
     return unit if power_of(unit, quantity) is not None else unit_in(label, quantity)
@@ -320,7 +286,7 @@ def _columns_error(
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
     columns = dict(naming.columns)
-    units = {q: _COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
+    units = {q: COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
         pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or pool
@@ -329,7 +295,7 @@ def _columns_error(
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
         candidates = [s for s in candidates if s is not pool[0]]
         if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
-            units.setdefault(quantity, _COMMON_UNITS[quantity][0])
+            units.setdefault(quantity, COMMON_UNITS[quantity][0])
     listing = _listed(source.series, ranges)
     lost = [q for q in missing if q not in columns]
     if lost:

@@ -20,12 +20,13 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, refuse_unwritable
-from bwbayes.record.io.columns import QUANTITIES, ColumnTable, Naming, select
+from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields, require_voltage_is
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.record.io.series import array_source, damaged
+from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
 
 _TEXT = (".csv", ".txt")
@@ -63,7 +64,7 @@ def read_record(
         ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "3"}``.
     units : dict
         Units by quantity, ``{"displacement": "nm"}``, where the file does not state them; ``"-nm"``
-        turns the sign.
+        turns the sign, and ``"0.35 um"`` is a sensor's sensitivity, that of 1 in the column.
     fs : float, Hz
         The sampling rate, in place of a time column.
 

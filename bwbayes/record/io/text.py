@@ -28,10 +28,10 @@ from charset_normalizer import from_bytes
 from numpy.typing import NDArray
 
 from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
-from bwbayes.record.io.columns import QUANTITIES, power_of
 from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.labview import plain_lvm
 from bwbayes.record.io.series import Series, Source, in_seconds
+from bwbayes.record.io.units import QUANTITIES, power_of
 from bwbayes.record.record import Record
 
 _NUMBER = re.compile(

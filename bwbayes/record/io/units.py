@@ -1,0 +1,55 @@
+"""Units of columns: those of the SI with any prefix, and numbers of them, as sensitivities are."""
+
+from __future__ import annotations
+
+import math
+import re
+
+QUANTITIES = ("time", "voltage", "displacement")
+COMMON_UNITS = {
+    "time": ("s", "ms", "us"),
+    "voltage": ("V", "mV", "kV"),
+    "displacement": ("um", "nm", "mm", "m"),
+}
+# The powers of ten of units' prefixes.
+_PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
+
+
+def power_of(unit: str, quantity: str) -> int | None:
+    """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
+    base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
+    written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
+    if written:
+        prefix, *bases = written.groups()
+        base = "sVm"[[*map(bool, bases[:3])].index(True)] if not bases[3] else "um"
+        unit = {"micro": "u", "kilo": "k"}.get(prefix.lower(), prefix[:1].lower()) + base
+    base, shift = {"time": ("s", 0), "voltage": ("V", 0)}.get(quantity, ("m", 6))
+    if not unit.endswith(base) or unit.removesuffix(base) not in _PREFIXES:
+        return None
+    return _PREFIXES[unit.removesuffix(base)] + shift
+
+
+def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
+    """Return the factor and the power of ten that lead from a user's unit to s, V or um, or None.
+
+    A number before it is what 1 in the column stands for, a minus turns the sign: ``-0.35 um``.
+    """
+    number = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+    written = re.fullmatch(rf"(-?)({number}|)\s*(\S*)", unit.strip())
+    power = power_of(written[3], quantity) if written else None
+    if written is None or power is None:
+        return None
+    factor = float(f"{written[1]}{written[2] or 1}")
+    return (factor, power) if 0 < abs(factor) < math.inf else None
+
+
+def unit_in(name: str, quantity: str) -> str | None:
+    """Return the unit at the end of a column's name, if it is one of the quantity.
+
+    In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``.
+    """
+    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+))\s*$", name)
+    if ending is None:
+        return None
+    unit = next(group for group in ending.groups() if group is not None).strip()
+    return unit if power_of(unit, quantity) is not None else None
