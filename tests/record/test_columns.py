@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,25 @@ def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> Non
     assert_same(read_record(path, fs=100.0))
     with pytest.raises(InputError, match=r"fs: 0 Hz is no sampling rate"):
         read_record(path, fs=0.0)
+
+
+@given(st.floats(-300, 300))
+def test_a_rate_has_the_limits_of_times(exponent: float) -> None:
+    """Whether it is given as times, an interval or a rate: from 1e-10 s on, for 1e12 s at most."""
+    interval = 10.0**exponent
+    frame = pd.DataFrame({"voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT})
+    arrays = VOLTAGE, DISPLACEMENT
+    readings: list[Callable[[], Record]] = [
+        lambda: Record.from_pandas(frame, fs=1 / interval),
+        lambda: Record.from_arrays(*arrays, interval=interval),
+        lambda: Record.from_arrays(*arrays, time=interval * np.arange(200)),
+    ]
+    for read in readings:
+        if 1.1e-10 <= interval <= 0.9e12 / 200:
+            assert read().interval == pytest.approx(interval)
+        elif not 0.9e-10 <= interval <= 1.1e12 / 200:
+            with pytest.raises(InputError, match=r"is absurd; check|absurdly large; check"):
+                read()
 
 
 def test_the_ends_of_a_time_stamps_range_can_be_told_apart(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.columns import ColumnTable
-from bwbayes.record.io.grid import Grid, clock, time_grid
+from bwbayes.record.io.grid import Grid, clock, require_plausible, time_grid
 
 VoltageIs = Literal["command", "output"]
 """What a voltage column is: the command that a DAC holds, or the amplifier's output."""
@@ -145,8 +145,9 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
 def _grid(table: ColumnTable) -> Grid:
     if "time" in table.columns:
         return time_grid(table, _converted(table, "time"))
-    fs, interval = table.naming.fs, table.source.interval
-    return Grid(table.source.start, 1 / fs if fs else interval or 0.0)
+    interval = 1 / table.naming.fs if table.naming.fs else table.source.interval or 0.0
+    require_plausible(table, interval, next(iter(table.columns.values())).values.size)
+    return Grid(table.source.start, interval)
 
 
 def _without_gaps(

@@ -91,9 +91,7 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
     interval = float(elapsed[-1]) / steps.size
     if (steps < 0).any() or interval == 0:
         raise _repeated(table, elapsed + start - offset)
-    if interval < 1e-12:
-        problem = f"steps of {interval:.3g} s are absurdly small; check the unit"
-        raise table.error(problem, "time")
+    require_plausible(table, interval, elapsed.size)
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
     uniform = _uniform_interval(table, stamps, elapsed, samples, rounding)
@@ -105,6 +103,13 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
     if uniform := _uniform_interval(table, stamps, elapsed, positions, rounding):
         return Grid(start - offset, uniform, offset, positions, samples)
     return _nearest_grid(table, elapsed, positions, start - offset, offset)
+
+
+def require_plausible(table: ColumnTable, interval: float, samples: int) -> None:
+    """Refuse an interval, s, that no instrument has, or that makes a record absurdly long."""
+    if interval < 1e-10 or interval * samples > 1e12:
+        problem = f"a sample every {interval:.3g} s is absurd; check the unit of times, or `fs`"
+        raise table.error(problem, "time")
 
 
 def _repeated(table: ColumnTable, times: FloatArray) -> InputError:
