@@ -89,6 +89,26 @@ def test_lines_among_the_numbers_that_are_no_samples_are_skipped_with_a_remark(
     assert record.sha256 == read(tmp_path, GOOD).sha256
 
 
+@given(
+    st.integers(1, len(ROWS[-1])),
+    st.lists(st.sampled_from(["Mean,0.1,0.2", "End of file", "Mean", "", "# end"]), max_size=3),
+)
+def test_a_line_that_is_cut_off_and_words_below_the_numbers_are_skipped_with_a_remark(
+    tmp_path_factory: pytest.TempPathFactory, lost: int, below: list[str]
+) -> None:
+    """Wherever a logger was killed, in mid-line or in mid-number, and whatever stands below."""
+    folder = tmp_path_factory.mktemp("cut")
+    cut = lines(*LINES, *below) if below else GOOD[: -1 - lost]
+    whole = read(folder, lines(*(LINES if below else LINES[:-1])))
+    if any(line[:1].isalpha() for line in below) or not cut.endswith("\n"):
+        line = rf"csv:{32 if below else 31}: \d lines? among the numbers skipped"
+        with pytest.warns(InputWarning, match=line):
+            record = read(folder, cut)
+    else:
+        record = read(folder, cut)
+    assert whole.sha256 == record.sha256
+
+
 def test_a_row_like_one_above_the_numbers_stays(tmp_path: Path) -> None:
     """Without times, a row left out would move all that follow."""
     rows = ["0.1,OVLD", *(f"{np.sin(i):.4f},{np.cos(i):.4f}" for i in range(250)), "0.1,OVLD"]
@@ -288,7 +308,6 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "one long line": ('{"time": [' + "0.125, " * 30_000 + "0]}", ": a line of 210013 characters;"),
     "header alone": (HEADER, ": no columns of numbers in it"),
     "few samples": (lines(*LINES[:6]), ": too short, samples: 5"),
-    "cut in a field": (GOOD[:-3], ":31: the last line is cut off"),
     "NUL": (cell(9, 1, "\0"), ":9: voltage_V: "),
     "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), ": neither text nor HDF5"),
     "a workbook": (b"PK\3\4" + bytes(range(256)), ": a workbook or an archive; export it"),

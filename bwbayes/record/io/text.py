@@ -3,7 +3,8 @@
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
 them names the columns; a second line may hold their units. What stands above the header is skipped
-with a remark, as are empty lines, comments and headers among the numbers. Of lines
+with a remark, as are empty lines, comments and headers among the numbers, and words or a line that
+is cut off below them. Of lines
 ``# key: value`` above them ``voltage`` (command or output), ``origin``, ``interval_s`` and
 ``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is a missing reading.
 A line that cannot be read is named with its number.
@@ -99,8 +100,8 @@ def read_text(path: Path) -> Source:
         and line not in heading
         and (line[0] not in "#%" or len(_cells(line, layout.separator)) == layout.fields)
     ]
+    numbered = _samples(path, numbered, layout, len(names), is_whole=is_whole)
     numbers, body = [n for n, _ in numbered], [line for _, line in numbered]
-    _check_lines(path, body, layout, len(names), numbers, is_whole=is_whole)
     if skipped := len(lines) - layout.first - len(body):
         first = min(set(range(layout.first + 1, len(lines) + 1)) - set(numbers))
         remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
@@ -257,42 +258,53 @@ def _split_header(line: str, layout: _Layout) -> list[str]:
     return []
 
 
-def _check_lines(
+def _samples(
     path: Path,
-    body: Sequence[str],
+    numbered: Sequence[tuple[int, str]],
     layout: _Layout,
     names: int,
-    numbers: Sequence[int],
     *,
     is_whole: bool,
-) -> None:
-    """Refuse a line that has fewer fields than the others, or more than the header.
+) -> list[tuple[int, str]]:
+    """Return the lines of samples, with their numbers, without what is no sample at the end.
 
-    Also a last line that is cut off, unless the text ``is_whole``: its last number is missing, or
-    has fewer decimals than all the numbers above it have alike.
+    That is lines of words, and a last line that is cut off: with fewer fields than the others, or,
+    unless the text ``is_whole``, without its last number or with fewer decimals in it than all
+    those above have alike.
+
+    Raises
+    ------
+    InputError
+        Another line has fewer fields than the others, or more than the header.
     """
     separator, fields = layout.separator, layout.fields
-    column = [line.rpartition(separator)[2].strip() for line in body[-50:]]
+    samples, is_cut = list(numbered), False
+    while len(samples) > 1:
+        first, last = (_cells(line, separator) for _, line in (samples[0], samples[-1]))
+        is_short = len(last) < fields and not is_cut
+        if not is_short and (re.search(r"\d", last[0]) or not re.search(r"\d", first[0])):
+            break
+        is_cut |= is_short
+        samples.pop()
+    column = [line.rpartition(separator)[2].strip() for _, line in samples[-50:]]
     if not column[-1] or len(column) < 6 or any("e" in cell.lower() for cell in column):
-        is_cut = not column[-1] and all(column[:-1])
+        is_half = not column[-1] and all(column[:-1])
     else:
         decimals = [len(re.split("[.,]", cell)[-1]) for cell in column if cell]
-        is_cut = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
-    if is_cut and not is_whole:
-        raise InputError(f"{path}:{numbers[-1]}: the last line is cut off; remove it")
-    for index, line in enumerate(body):
+        is_half = len(set(decimals[:-1])) == 1 and decimals[-1] < decimals[0]
+    if is_half and not is_whole and len(samples) == len(numbered):
+        samples.pop()
+    for number, line in samples:
         if (len(line.split()) if separator == " " else line.count(separator) + 1) == fields:
             continue
         cells = _cells(line, separator)
         if len(cells) >= fields and not any(cells[max(fields, names) :]):
             continue
-        problem = f"{len(cells)} fields for {fields} columns"
         advice = "complete the line, or remove it"
         if len(cells) > fields:
             advice = f"remove {cells[-1][:30]!r}, or write 1.5 where 1,5 is meant"
-        elif index == len(body) - 1:
-            problem, advice = f"the last line is cut off, {problem}", "remove it"
-        raise InputError(f"{path}:{numbers[index]}: {problem}; {advice}")
+        raise InputError(f"{path}:{number}: {len(cells)} fields for {fields} columns; {advice}")
+    return samples
 
 
 def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
