@@ -167,6 +167,34 @@ def test_the_ends_of_a_time_stamps_range_can_be_told_apart(tmp_path: Path) -> No
         read_record(write(tmp_path / "a.csv", values))
 
 
+@pytest.mark.parametrize("columns", [{}, {"time": "t"}])
+def test_units_of_time_are_asked_for_with_their_rates(
+    tmp_path: Path, columns: dict[str, str]
+) -> None:
+    """As nothing else would show a wrong one."""
+    name = "t" if columns else "clock"
+    values = {name: 2 * np.arange(200), "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT}
+    line = rf"{name}' is 0.5 Hz for 398 s in s, 500 Hz for 0.398 s in ms, 500000 Hz for"
+    with pytest.raises(ColumnsError, match=line):
+        read_record(write(tmp_path / "a.csv", values), columns=columns)
+
+
+@given(
+    st.sampled_from(["unix_time", "Unix Timestamp", "epoch"]),
+    st.sampled_from([("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)]),
+    st.integers(315_600_000, 7_100_000_000),
+)
+def test_times_from_1970_need_no_unit(name: str, unit: tuple[str, int], start: int) -> None:
+    """If their column says that they are such: in other units they are no dates of our time."""
+    frame = pd.DataFrame({"voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT})
+    frame[name] = start * unit[1] + np.arange(200) * unit[1] // 100
+    if unit[1] == 1:
+        frame[name] = start + np.round(TIME, 2)
+    assert_same(Record.from_pandas(frame))
+    with pytest.raises(ColumnsError, match="which unit has"):
+        Record.from_pandas(frame.assign(**{name: frame[name] / 1e11}))
+
+
 # Names and units
 
 

@@ -23,12 +23,21 @@ from numpy.typing import NDArray
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 from bwbayes.record.io.series import RATES, Series, Source
-from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, power_of, scale_of, unit_in
+from bwbayes.record.io.units import (
+    COMMON_UNITS,
+    QUANTITIES,
+    epoch_unit,
+    power_of,
+    scale_of,
+    unit_in,
+)
 
 # What other people call the quantities, in lower case and without a unit.
 _WORDS = {
     "time": (
-        *("t", "time", "timestamp", "unix_time", "sec", "seconds", "elapsed time", "x_value"),
+        *("t", "time", "timestamp", "sec", "seconds", "elapsed time", "x_value"),
+        *("unix", "unix_time", "unix time", "unix_timestamp", "unix timestamp", "posix_time"),
+        *("epoch", "epoch_time", "epoch time"),
         *("zeit", "temps"),
     ),
     "voltage": (
@@ -151,6 +160,8 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     has_rate = naming.fs is not None or source.interval is not None
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
     units = {q: naming.units.get(q) or _unit_of(s.label, s.unit, q) for q, s in chosen.items()}
+    if "time" in units:
+        units["time"] = units["time"] or epoch_unit(chosen["time"].label, _finite(chosen["time"]))
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
         raise _columns_error(source, naming, chosen, missing, unknown)
@@ -278,6 +289,7 @@ def _columns_error(
         others = [s for s in others if s.size in {c.size for c in chosen.values()}]
     moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
     candidates = _beside(moving or others, chosen)
+    clock = chosen["time"] if "time" in unknown else None
     clocks = [
         s
         for s in candidates
@@ -295,6 +307,7 @@ def _columns_error(
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
         candidates = [s for s in candidates if s is not pool[0]]
         if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
+            clock = pool[0] if quantity == "time" else clock
             units.setdefault(quantity, COMMON_UNITS[quantity][0])
     listing = _listed(source.series, ranges)
     lost = [q for q in missing if q not in columns]
@@ -306,7 +319,15 @@ def _columns_error(
         questions.append(f"which unit has {names}")
     if timeless:
         questions.append("what is the sampling rate, Hz (no column can be the time)")
-    problem = f"{where}: {', and '.join(questions)}? {listing}"
+    problem = f"{where}: {', and '.join(questions)}? "
+    if clock and clock.name in ranges:  # a wrong unit would show nowhere else
+        length = float(np.ptp(ranges[clock.name]))
+        scaled = {u: length * 10.0 ** (power_of(u, "time") or 0) for u in COMMON_UNITS["time"]}
+        rates = [
+            f"{(clock.size - 1) / t:.6g} Hz for {t:.6g} s in {u}" for u, t in scaled.items() if t
+        ]
+        problem += f"{clock.name!r} is {', '.join(rates)}. " * bool(rates)
+    problem += listing
     single = [s for s in source.series if s.size == 1 and s.name in ranges]
     numbers = {s.label.lower(): float(ranges[s.name][0]) for s in single}
     for name, text in chain.from_iterable(notes.items() for notes in source.notes.values()):

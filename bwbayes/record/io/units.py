@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 
+from bwbayes.arrays import FloatArray
+
 QUANTITIES = ("time", "voltage", "displacement")
 COMMON_UNITS = {
     "time": ("s", "ms", "us"),
@@ -53,3 +55,16 @@ def unit_in(name: str, quantity: str) -> str | None:
         return None
     unit = next(group for group in ending.groups() if group is not None).strip()
     return unit if power_of(unit, quantity) is not None else None
+
+
+def epoch_unit(name: str, times: FloatArray) -> str | None:
+    """Return the unit in which times (samples,) count from 1970, if the column's name says so.
+
+    It is the only one in which they all are between 1980 and 2200; None if none is.
+    """
+    if not times.size or not re.search("unix|epoch|posix", name.lower()):
+        return None
+    first, last = float(times.min()), float(times.max())
+    powers = {"s": 0, "ms": 3, "us": 6, "ns": 9}
+    dates = (u for u, p in powers.items() if 3.155e8 * 10**p < first <= last < 7.2e9 * 10**p)
+    return next(dates, None)
