@@ -89,6 +89,12 @@ def test_lines_among_the_numbers_that_are_no_samples_are_skipped_with_a_remark(
     assert record.sha256 == read(tmp_path, GOOD).sha256
 
 
+@pytest.mark.filterwarnings("ignore:.*2 lines among the numbers skipped")
+def test_lines_count_in_the_file_where_some_are_skipped(tmp_path: Path) -> None:
+    text = lines(*LINES[:8], "# paused", "", *LINES[8:20], LINES[10], *LINES[21:])
+    assert fault(tmp_path, text).startswith("record.csv:23: time_s: time goes back from 0.09 s to")
+
+
 @given(
     st.integers(1, len(ROWS[-1])),
     st.lists(st.sampled_from(["Mean,0.1,0.2", "End of file", "Mean", "", "# end"]), max_size=3),
@@ -278,17 +284,26 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     ),
     "time goes back": (
         lines(*LINES[:8], LINES[5], *LINES[9:]),
-        ":9: time_s: time goes back from 0.030 s to 0.020 s",
+        ":9: time_s: time goes back from 0.03 s to 0.02 s; sort them",
     ),
-    "repeated": (lines(*LINES[:8], *LINES[7:]), ":9: time_s: 0.030 s is repeated"),
+    "repeated": (
+        lines(*LINES[:8], "0.030,1,1", "0.030,2,2", *LINES[8:]),
+        ":9: time_s: 2 times are repeated, first 0.03 s; remove one of two samples, or give `fs=",
+    ),
+    "one time": (
+        lines(HEADER, *(f"1.5,{i},{i}" for i in range(20))),
+        ":3: time_s: all times are 1",
+    ),
     "gap": (
         lines(*LINES[:8], *LINES[12:]),
         ":9: time_s: gap of 0.025 s after 0.03 s, about 4 missing",
     ),
     "header missing": (
         lines(*ROWS),
-        ": which column is the time, which the voltage, which the displacement? There are 30 values"
-        " each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.88 to 20); say "
+        ": which column is the time, which the voltage, which the displacement? 'column 1' is 200 "
+        "Hz for 0.145 s in s, 200000 Hz for 0.000145 s in ms, 2e+08 Hz for 1.45e-07 s in us. There "
+        "are 30 values each: 'column 1' (0 to 0.145), 'column 2' (-1 to 0.9906), 'column 3' (-19.88"
+        " to 20); say "
         "columns={'time': '1', 'voltage': '2', 'displacement': '3'}, units={'time': ",
     ),
     "half of a column words": (

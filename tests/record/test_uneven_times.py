@@ -125,11 +125,46 @@ def test_a_slow_clock_is_named_and_samples_may_be_missing_beside_it() -> None:
     with pytest.warns(InputWarning, match=r"20 samples are missing"):
         record = Record.from_arrays(voltage[kept], voltage[kept], time=kept * 1e-3)
     assert 1e-3 == record.interval
-    # A single one that is repeated is no clock's doing, nor are many at once.
-    for repeated in ([500], range(200, 600)):
-        time = 1e-3 * np.sort(np.concatenate([index, repeated]))[:1000]
-        with pytest.raises(InputError, match=r"is repeated; remove one .*, or give `fs=HZ`"):
-            Record.from_arrays(voltage, voltage, time=time)
+    # Many that are repeated at once are no clock's doing.
+    time = 1e-3 * np.sort(np.concatenate([index, range(200, 600)]))[:1000]
+    with pytest.raises(InputError, match=r"400 times are repeated, first 0.2 s; remove one of two"):
+        Record.from_arrays(voltage, voltage, time=time)
+
+
+@given(
+    st.integers(400, 2000),
+    st.sets(st.integers(1, 19), min_size=1),
+    st.lists(st.sampled_from(["copied", "late", "early", "added"]), min_size=19, max_size=19),
+    st.sampled_from([0.0, -3.0, 1.7e9]),
+)
+def test_repeated_times_leave_a_record_as_it_was(
+    samples: int, places: set[int], kinds: list[str], start: float
+) -> None:
+    """Whether rows are copied, times written late or early, or other samples beside them.
+
+    A remark counts them all, and names the first.
+    """
+    index = np.arange(samples)
+    voltage = np.sin(index / 40)
+    rows, stamps, added = index.copy(), index.copy(), []
+    for place in places:
+        row = place * samples // 20
+        if kinds[place - 1] in ("copied", "added"):
+            rows = np.sort(np.append(rows, row))
+            added += [row] * (kinds[place - 1] == "added")
+        else:
+            stamps[row] += -1 if kinds[place - 1] == "late" else 1
+    displacement = 0.4 * voltage[rows]
+    repeats = np.flatnonzero(np.diff(rows) == 0) + 1
+    displacement[repeats[np.isin(rows[repeats], added)]] = 7.0
+    time = start + np.round(0.002 * stamps[rows], 3)
+    first = rf"arrays:sample {np.flatnonzero(np.diff(stamps[rows]) == 0)[0] + 1}: time: "
+    said = rf"{first}{len(places)} times? (is|are) repeated, first"
+    with pytest.warns(InputWarning, match=said):
+        record = Record.from_arrays(voltage[rows], displacement, time=time)
+    assert (0.002, samples) == (record.interval, record.readings)
+    np.testing.assert_array_equal(record.voltage, voltage)
+    np.testing.assert_array_equal(np.asarray(record.displacement), 0.4 * voltage)
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,14 @@ import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
 from bwbayes.record.io.series import RATES, Series, Source
 from bwbayes.record.io.units import (
@@ -121,23 +121,31 @@ class ColumnTable:
     """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
 
     ``notes`` is what the file says in words. ``naming`` finds the same columns again; the times
-    are those of its rate, or of the source, where there is no column of them.
+    are those of its rate, or of the source, where there is no column of them. ``rows`` are the
+    samples of the file that are in it, if not all.
     """
 
     source: Source
     columns: Mapping[str, FileColumn]
     notes: Mapping[str, str]
     naming: Naming
+    rows: IntArray | None = None
 
     def error(self, problem: str, quantity: str = "", sample: int | None = None) -> InputError:
         """Return the error ``file:line: column: problem``; sample and quantity may be left out."""
-        where, first_line = str(self.source.path), self.source.first_line
+        where, lines = str(self.source.path), self.source.lines
         if sample is not None:
-            where += f":sample {sample}" if first_line is None else f":{first_line + sample}"
+            sample = sample if self.rows is None else int(self.rows[sample])
+            where += f":{lines[sample]}" if lines else f":sample {sample}"
         if quantity:
             name = self.columns[quantity].name if quantity in self.columns else quantity
             where += f": {name}"
         return InputError(f"{where}: {problem}")
+
+    def only(self, rows: IntArray) -> ColumnTable:
+        """Return the table of some of its rows."""
+        columns = {q: replace(c, values=c.values[rows]) for q, c in self.columns.items()}
+        return replace(self, columns=columns, rows=rows)
 
 
 def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
@@ -165,7 +173,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
         raise _columns_error(source, naming, chosen, missing, unknown)
-    path, line = source.path, source.first_line
+    path = source.path
     if by_unit:
         reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
         _warn(f"{path}: taken by its unit: {reasons}; if not, say `columns`")
@@ -180,9 +188,9 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     }
     names = {q: column.name for q, column in columns.items()}
     others = [s.name for s in source.series if s.name not in names.values()]
-    if others and line is not None:
+    if others and source.lines:
         shown = ", ".join(others[:10]) + ", ..." * (len(others) > 10)
-        _warn(f"{path}:{max(line - 1, 1)}: ignored columns: {shown}")
+        _warn(f"{path}:{max(source.lines[0] - 1, 1)}: ignored columns: {shown}")
     foreign = {
         q: name for q, name in names.items() if q in QUANTITIES and _likeness(name, "", q) != 0
     }
@@ -275,8 +283,8 @@ def _columns_error(
 ) -> InputError:
     """Return the error that names all that is open, and guesses it."""
     where = str(source.path)
-    if source.first_line is not None and source.first_line > 1:
-        where += f":{source.first_line - 1}"
+    if source.lines and source.lines[0] > 1:
+        where += f":{source.lines[0] - 1}"
     if all(series.size == 1 for series in source.series):
         return InputError(
             f"{where}: no column has more than one number; give a row for each sample"

@@ -56,7 +56,7 @@ def record_fields(
         kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
     except InputError as error:
         raise table.error(str(error)) from error
-    grid = _grid(table)
+    table, grid = _grid(table)
     values = {name: _converted(table, name) for name in table.columns if name != "time"}
     if values["voltage"].size < _MINIMUM_SAMPLES:
         raise table.error(
@@ -93,7 +93,7 @@ def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
         For the first problem, in one line.
     """
     _check_lengths(table)
-    grid = _grid(table)
+    table, grid = _grid(table)
     values = _converted(table, "displacement")
     if np.isnan(values).any():
         sample = int(np.argmax(np.isnan(values)))
@@ -142,12 +142,12 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
     return values
 
 
-def _grid(table: ColumnTable) -> Grid:
+def _grid(table: ColumnTable) -> tuple[ColumnTable, Grid]:
     if "time" in table.columns:
         return time_grid(table, _converted(table, "time"))
     interval = 1 / table.naming.fs if table.naming.fs else table.source.interval or 0.0
     require_plausible(table, interval, next(iter(table.columns.values())).values.size)
-    return Grid(table.source.start, interval)
+    return table, Grid(table.source.start, interval)
 
 
 def _without_gaps(

@@ -3,7 +3,7 @@
 Times count as uniform as far as their digits can tell. Where samples are missing, the others stay
 at their places. Where times scatter, as those of a loop in a program do, samples move to the
 nearest times of the grid, along the columns' slopes. Time stamps of a clock count from the first;
-those of a coarse one, whose ticks are longer than an interval, may repeat.
+those of a coarse one, whose ticks are longer than an interval, may repeat. Of others a few may.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.series import MAXIMUM_SAMPLES
 
@@ -66,18 +66,20 @@ def clock(time: float, interval: float) -> str:
     return f"{round(float(time), decimals_of(interval)):.15g}"
 
 
-def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
+def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid]:
     """Return the grid of a table's times, whose values in s are ``stamps`` (samples,).
+
+    The table is without the samples that repeat others.
 
     Raises
     ------
     InputError
-        Times are repeated or go back, or a gap makes the record too long.
+        Times are repeated too often or go back, or a gap makes the record too long.
 
     Warns
     -----
     InputWarning
-        If samples are missing, or times are not uniform.
+        If samples are missing, or times are repeated or not uniform.
     """
     column = table.columns["time"]
     is_float = column.values.dtype.kind == "f"
@@ -90,19 +92,30 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> Grid:
     steps, samples = np.diff(elapsed), np.arange(elapsed.size)
     interval = float(elapsed[-1]) / steps.size
     if (steps < 0).any() or interval == 0:
-        raise _repeated(table, elapsed + start - offset)
+        sample = int(np.argmax(steps <= min(steps.min(), 0.0)))
+        times = stamps[sample : sample + 2] - offset
+        before, after = (f"{clock(t, float(np.abs(steps).mean()))} s" for t in times)
+        problem = f"time goes back from {before} to {after}; sort them"
+        if interval == 0:
+            problem = f"all times are {after}; give those of the samples, or `fs=HZ` for them"
+        raise table.error(problem, "time", sample + 1)
     require_plausible(table, interval, elapsed.size)
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
     uniform = _uniform_interval(table, stamps, elapsed, samples, rounding)
     if uniform := uniform or _rounded_interval(table, elapsed):
-        return Grid(start - offset, uniform, offset)
+        return table, Grid(start - offset, uniform, offset)
     if (steps == 0).any():
-        raise _repeated(table, elapsed + start - offset)
-    positions = _with_gaps(table, steps)
+        table, elapsed = _without_repeats(table, elapsed, start - offset)
+        start += float(elapsed[0])
+        elapsed = elapsed - elapsed[0]
+        stamps = start + elapsed
+    positions = _with_gaps(table, np.diff(elapsed))
     if uniform := _uniform_interval(table, stamps, elapsed, positions, rounding):
-        return Grid(start - offset, uniform, offset, positions, samples)
-    return _nearest_grid(table, elapsed, positions, start - offset, offset)
+        if positions[-1] == elapsed.size - 1:
+            return table, Grid(start - offset, uniform, offset)
+        return table, Grid(start - offset, uniform, offset, positions, np.arange(elapsed.size))
+    return table, _nearest_grid(table, elapsed, positions, start - offset, offset)
 
 
 def require_plausible(table: ColumnTable, interval: float, samples: int) -> None:
@@ -112,16 +125,56 @@ def require_plausible(table: ColumnTable, interval: float, samples: int) -> None
         raise table.error(problem, "time")
 
 
-def _repeated(table: ColumnTable, times: FloatArray) -> InputError:
-    """Return the error of times (samples,), s, of which one is repeated or goes back."""
-    steps = np.diff(times)
-    sample = int(np.argmax(steps < 0 if (steps < 0).any() else steps == 0))
-    digits = decimals_of(float(np.mean(np.abs(steps))))
-    before, after = (f"{time:.{digits}f} s" for time in times[sample : sample + 2])
-    problem = f"{after} is repeated; remove one of the two samples, or give `fs=HZ` for the times"
-    if steps[sample] < 0:
-        problem = f"time goes back from {before} to {after}; sort them"
-    return table.error(problem, "time", sample + 1)
+def _without_repeats(
+    table: ColumnTable, elapsed: FloatArray, start: float
+) -> tuple[ColumnTable, FloatArray]:
+    """Return a table in which no time is repeated, and its times, s after ``start``.
+
+    Of rows that are equal one is retained. Others of the same time go on or back to times where
+    samples are missing, as a logger writes them that is late, or are left out.
+
+    Raises
+    ------
+    InputError
+        More than one in twenty would be left out.
+
+    Warns
+    -----
+    InputWarning
+        In any case.
+    """
+    steps = np.diff(elapsed)
+    is_repeat = np.append(False, steps == 0)
+    is_copy = is_repeat.copy()
+    for column in table.columns.values():
+        before, after = column.values[:-1], column.values[1:]
+        is_copy[1:] &= (after == before) | (np.isnan(after) & np.isnan(before))
+    rows = np.flatnonzero(~is_copy)
+    times, first, of = np.unique(elapsed[rows], return_index=True, return_inverse=True)
+    counts = np.bincount(of)
+    interval = float(np.median(steps[steps > 0]))
+    room = np.rint(np.diff(times) / interval)
+    is_late = np.append(room, np.inf) < counts
+    # Where the sample before was not repeated, which may need the same time.
+    is_early = is_late & (np.append(0, np.where(counts[:-1] > 1, 0, room)) >= counts)
+    rank = np.arange(rows.size) - first[of]
+    shift = np.where(is_late[of], 0, rank) - np.where(is_early[of], counts[of] - 1 - rank, 0)
+    is_left_out = (is_late & ~is_early)[of] & (rank > 0)
+    number, sample = int(np.count_nonzero(is_repeat)), int(np.argmax(is_repeat))
+    several, time = "s are" if number > 1 else " is", clock(start + elapsed[sample], interval)
+    said = f"{number} time{several} repeated, first {time} s"
+    if (lost := int(np.count_nonzero(is_left_out))) > 0.05 * elapsed.size:
+        advice = "remove one of two samples, or give `fs=HZ` for the times if none are missing"
+        raise table.error(f"{said}; {advice}", "time", sample)
+    kinds = {
+        "equal to the row above, left out": int(np.count_nonzero(is_copy)),
+        "moved to times without a sample": int(np.count_nonzero(shift)),
+        "left out": lost,
+    }
+    remark = f"{said}: {', '.join(f'{n} {kind}' for kind, n in kinds.items() if n)}"
+    warnings.warn(str(table.error(remark, "time", sample)), InputWarning, stacklevel=6)
+    moved = elapsed[rows] + interval * shift
+    return table.only(rows[~is_left_out]), moved[~is_left_out]
 
 
 def _uniform_interval(

@@ -7,7 +7,7 @@ when they are needed, since a file may hold much else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -78,14 +78,14 @@ class Source:
     """What a file holds.
 
     ``notes`` are what it says in words (`NOTES`), by the group of the series that they are of.
-    ``first_line`` is the line of the first sample in a text file. ``interval`` and ``start``, s,
-    are those of a file that states them in place of a time column.
+    ``lines`` are those of the samples in a text file, from 1 on. ``interval`` and ``start``, s, are
+    those of a file that states them in place of a time column.
     """
 
     path: Path
     series: tuple[Series, ...]
     notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    first_line: int | None = None
+    lines: Sequence[int] = ()
     interval: float | None = None
     start: float = 0.0
 

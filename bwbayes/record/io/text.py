@@ -117,7 +117,7 @@ def read_text(path: Path) -> Source:
         series.append(
             Series(name, len(body), load, stated, load_readings=partial(load, words=True))
         )
-    return Source(path, tuple(series), {"": notes}, layout.first + 1, interval)
+    return Source(path, tuple(series), {"": notes}, numbers, interval)
 
 
 def write_text(record: Record, path: Path) -> None:
