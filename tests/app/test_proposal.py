@@ -117,7 +117,7 @@ def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
             {"factors": (1.0, 1e3, 1.0)},
             "wrong units: voltages of up to .*; check the units in the",
         ),
-        ({"rows": np.r_[0:200, 220:600]}, r"csv:202: time_s: gap of 0.21 s .*; give the voltage"),
+        ({"rows": np.r_[0:200, 280:600]}, r"csv:202: time_s: gap of 0.81 s .*; give the voltage"),
         ({"header": "time_s,voltage_V,pos"}, "which unit has 'pos' .* --unit displacement=um"),
         ({"header": "time_s,a_V,b_V"}, "which column is the voltage"),
         ({"header": "time_s,voltage_V,displacement_in"}, "which unit has 'displacement_in'"),

@@ -300,9 +300,9 @@ def test_a_table_may_have_dates_or_an_index_for_times(kind: str) -> None:
 
 
 def test_a_gap_in_a_table_is_one_line_or_held() -> None:
-    frame = pd.DataFrame(VALUES).drop(index=range(50, 60))
-    with pytest.raises(InputError, match=r"sample 50: t \[ms\]: gap of 0.11 s after 0.49 s"):
+    frame = pd.DataFrame(VALUES).drop(index=range(50, 120))
+    with pytest.raises(InputError, match=r"sample 50: t \[ms\]: gap of 0.71 s after 0.49 s"):
         Record.from_pandas(frame, **COLUMNS, units=UNIT)
-    with pytest.warns(InputWarning, match="10 samples are missing"):
+    with pytest.warns(InputWarning, match="70 samples are missing"):
         held = Record.from_pandas(frame, **COLUMNS, units=UNIT, voltage_is="command")
-    assert (200, 190) == (held.samples, held.readings)
+    assert (200, 130) == (held.samples, held.readings)

@@ -2,9 +2,9 @@
 
 What all formats share is checked here: lengths, finite numbers, a voltage and a displacement that
 move. A displacement may be missing here and there (nan), and so may whole samples where the voltage
-is known: a command is held, and an output is on the line between its neighbors where no extremum
-can be hidden there. A problem is one line, ``file:line: column: problem; what to do``;
-files without lines name the sample, counted from 0.
+is known: a command is held, and an output is interpolated where that is right elsewhere. A problem
+is one line, ``file:line: column: problem; what to do``; files without lines name the sample,
+counted from 0.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
+import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, require_plausible, time_grid
@@ -155,42 +156,80 @@ def _without_gaps(
 ) -> FloatArray:
     """Return a column at all times of the grid: held where samples are missing, or interpolated.
 
+    Gaps are filled as is right elsewhere to 1% of the range: along the line between both ends, else
+    along a polynomial, else along the line if between others as far apart no value is beyond both.
+
     Raises
     ------
     InputError
-        It is interpolated, and the longest gap may hide an extremum: between others that are as
-        far apart is a value beyond both, by more than 1% of the range.
+        It is interpolated, and none of these will do.
     """
     positions, sources = grid.positions, grid.sources
     if positions is None or sources is None:
         return values
     values, steps = grid.filled(values)[positions], np.diff(positions)
-    longest, samples = int(np.argmax(steps)), int(positions[-1]) + 1
-    missing = int(steps[longest]) - 1
-    if missing and not held:
-        # Hysteresis depends on extrema alone: how far beyond both ends such a gap would hide one.
+    samples = int(positions[-1]) + 1
+    if held:
+        full = np.repeat(values, np.append(steps, 1))
+    else:
+        full = np.interp(np.arange(samples), positions, values)
+    for missing in () if held else np.unique(steps[steps > 1] - 1)[::-1].tolist():
         ends = np.array([values[: -missing - 1], values[missing + 1 :]])
-        lowest, highest = ends.min(axis=0), ends.max(axis=0)
-        inside = [values[i : i + lowest.size] for i in {(missing + 1) // 2, missing // 2 + 1}]
-        hidden = np.abs(inside - np.clip(inside, lowest, highest))
-        if not (hidden.size and hidden.max() <= 0.01 * np.ptp(values)):
-            since = clock(grid.start + positions[longest] * grid.interval, grid.interval)
+        places = np.unique(np.linspace(1, missing, 9).astype(np.int64))
+        inside = np.array([values[i : i + ends.shape[1]] for i in places])
+        share = places[:, np.newaxis] / (missing + 1)
+        errors = np.abs(inside - (1 - share) * ends[0] - share * ends[1])
+        if errors.size and errors.max() <= 0.01 * np.ptp(values):
+            continue
+        # Hysteresis depends on extrema alone: how far beyond both ends such a gap would hide one.
+        hidden = np.abs(inside - inside.clip(ends.min(axis=0), ends.max(axis=0)))
+        hides_none = hidden.size > 0 and hidden.max() <= 0.01 * np.ptp(values)
+        is_smooth = _is_smooth(values, positions, missing)
+        for gap in np.flatnonzero(steps == missing + 1).tolist():
+            before, after = positions[gap], positions[gap + 1]
+            first = np.searchsorted(positions, before - missing)
+            last = np.searchsorted(positions, after + missing, side="right")
+            if is_smooth and min(gap + 1 - first, last - gap - 1) > 0.75 * missing:
+                near = positions[first:last]
+                curve = np.polynomial.Polynomial.fit(
+                    near, values[first:last], min(5, near.size - 1)
+                )
+                full[before + 1 : after] = curve(np.arange(before + 1, after))
+                continue
+            if hides_none:
+                continue
+            since = clock(grid.start + positions[gap] * grid.interval, grid.interval)
             held_too = ""
             if quantity == "voltage":
                 held_too = (
                     ' (the displacement may be nan), say voltage_is = "command" if it was held'
                 )
-            problem = f"gap of {steps[longest] * grid.interval:.6g} s after {since} s"
+            problem = f"gap of {steps[gap] * grid.interval:.6g} s after {since} s"
             advice = f"give the {quantity} there{held_too}, or cut the record"
             problem = f"{problem}, about {missing} missing; {advice}"
-            raise table.error(problem, "time", int(sources[longest + 1]))
-    if missing:
+            raise table.error(problem, "time", int(sources[gap + 1]))
+    if count := int(np.count_nonzero(steps > 1)):
         kind = "held" if held else "interpolated"
         remark = f"{samples - values.size} samples are missing, from here on in "
-        count = int(np.count_nonzero(steps > 1))
         remark += f"{count} gap{'s' * (count > 1)}; the {quantity} is {kind} there"
         where = int(sources[int(np.argmax(steps > 1)) + 1])
         warnings.warn(str(table.error(remark, "time", where)), InputWarning, stacklevel=5)
-    if held:
-        return np.repeat(values, np.append(steps, 1))
-    return np.interp(np.arange(samples), positions, values)
+    return full
+
+
+def _is_smooth(values: FloatArray, positions: IntArray, missing: int) -> bool:
+    """Tell whether a polynomial across so many values is right where none are missing.
+
+    To 1% of their range, in the middle; it is fitted to as many on either side, and one more.
+    """
+    width = 3 * missing + 2
+    if width > values.size:
+        return False
+    powers = np.vander(np.arange(width) / width - 0.5, min(6, 2 * missing + 2))
+    is_inside = (np.arange(width) > missing) & (np.arange(width) <= 2 * missing)
+    error = np.zeros(width)
+    error[~is_inside] = -powers[width // 2] @ np.linalg.pinv(powers[~is_inside])
+    error[width // 2] = 1.0
+    errors = scipy.signal.oaconvolve(values - values[0], error[::-1], mode="valid")
+    errors = errors[positions[width - 1 :] - positions[: values.size - width + 1] == width - 1]
+    return errors.size > 0 and bool(np.abs(errors).max() <= 0.01 * np.ptp(values))
