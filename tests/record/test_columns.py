@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
@@ -282,6 +282,44 @@ def test_rows_and_columns_are_vectors(shapes: list[tuple[int, ...]]) -> None:
     arrays = [x.reshape(s) for x, s in zip((TIME, VOLTAGE, DISPLACEMENT), shapes, strict=True)]
     time, voltage, displacement = arrays
     assert_same(Record.from_arrays(voltage, displacement, time=time))
+
+
+@given(
+    st.sampled_from([-9999.0, 9999.0, 1e30, -32768.0, 1.7e308, -120.0]),
+    st.sets(st.integers(0, 199), min_size=2, max_size=150),
+    st.sampled_from(["um", "nm", "mm"]),
+)
+def test_a_number_far_from_all_readings_that_is_repeated_is_a_missing_one(
+    mark: float, where: set[int], unit: str
+) -> None:
+    """As loggers write where there is nothing to read, however often, in any unit; it is said."""
+    rows = sorted(where)
+    inside = (VOLTAGE[rows] >= np.delete(VOLTAGE, rows).min()) & (
+        VOLTAGE[rows] <= np.delete(VOLTAGE, rows).max()
+    )
+    assume(inside.all())
+    displacement = np.round(DISPLACEMENT, 4)
+    displacement[rows] = mark
+    arrays: dict[str, Any] = {"voltage": VOLTAGE, "displacement": displacement, "interval": 0.01}
+    line = rf"arrays:sample {rows[0]}: displacement: .* {len(where)} times, far from all other"
+    with pytest.warns(InputWarning, match=line):
+        record = Record.from_arrays(**arrays, units={"displacement": unit})
+    assert rows == np.flatnonzero(~record.has_reading).tolist()
+
+
+def test_a_number_that_may_be_a_reading_stays_one() -> None:
+    """One that stands alone or is near others, and where the voltage is one of its own."""
+    step = np.where(np.arange(200) < 20, 0.0, 50.0 + 0.1 * np.sin(TIME))
+    cases: list[tuple[Any, list[int], float]] = [
+        (VOLTAGE, [50], -9999.0),
+        (VOLTAGE, [50, 60, 70], -80.0),
+        (step, [*range(20)], -9999.0),
+    ]
+    for voltage, rows, mark in cases:
+        displacement = 0.7 * voltage + 0.1 * np.cos(50 * TIME)
+        displacement[rows] = mark
+        record = Record.from_arrays(voltage, displacement, interval=0.01)
+        assert 200 == record.readings
 
 
 @pytest.mark.parametrize("kind", ["datetime64[ns]", "datetime64[us]", "timedelta64[ns]"])

@@ -1,15 +1,16 @@
 """From the columns of a file to a record that can be trusted: units, lengths, numbers, gaps.
 
 What all formats share is checked here: lengths, finite numbers, a voltage and a displacement that
-move. A displacement may be missing here and there (nan), and so may whole samples where the voltage
-is known: a command is held, and an output is interpolated where that is right elsewhere. A problem
-is one line, ``file:line: column: problem; what to do``; files without lines name the sample,
-counted from 0.
+move. A displacement may be missing here and there (nan, or a number far from all others), and so
+may whole samples where the voltage is known: a command is held, and an output is interpolated where
+that is right elsewhere. A problem is one line, ``file:line: column: problem; what to do``; files
+without lines name the sample, counted from 0.
 """
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -58,6 +59,8 @@ def record_fields(
     except InputError as error:
         raise table.error(str(error)) from error
     table, grid = _grid(table)
+    if "displacement" in table.columns:
+        table = _without_marks(table)
     values = {name: _converted(table, name) for name in table.columns if name != "time"}
     if values["voltage"].size < _MINIMUM_SAMPLES:
         raise table.error(
@@ -111,6 +114,38 @@ def _check_lengths(table: ColumnTable) -> None:
             raise table.error(f"{problem}; store one per sample", quantity)
     if samples < 2:
         raise table.error(f"too short, samples: {samples}; give at least {_MINIMUM_SAMPLES}")
+
+
+def _without_marks(table: ColumnTable) -> ColumnTable:
+    """Return the table without readings of a number that marks missing ones, as -9999 or 1e30.
+
+    Such a number is repeated, further from all others than they are apart, where the voltage is one
+    that others were read at.
+    """
+    column, voltage = table.columns["displacement"], table.columns["voltage"].values
+    readings = np.array(column.values, dtype=np.float64)
+    is_finite = np.isfinite(readings)
+    levels, counts = np.unique(readings[is_finite], return_counts=True)
+    center = np.median(levels / 2) if levels.size else 0.0
+    farthest = np.argsort(-np.abs(levels / 2 - center))
+    for mark in levels[farthest][counts[farthest] > 1]:
+        is_mark = readings == mark
+        is_other = is_finite & ~is_mark
+        if np.count_nonzero(is_other) < _MINIMUM_SAMPLES:
+            break
+        # Halved, as the largest numbers are no further apart than a number can be.
+        others, volts = readings[is_other] / 2, voltage[is_other]
+        distance = max(others.min() - mark / 2, mark / 2 - others.max())
+        inside = (voltage[is_mark] >= volts.min()) & (voltage[is_mark] <= volts.max())
+        if not (distance > np.ptp(others) > 0 and inside.all()):
+            break
+        count, sample = int(np.count_nonzero(is_mark)), int(np.argmax(is_mark))
+        remark = f"{mark:g} {count} times, far from all other readings, is taken as missing"
+        warnings.warn(str(table.error(remark, "displacement", sample)), InputWarning, stacklevel=4)
+        readings[is_mark] = np.nan
+        is_finite = is_other
+    columns = {**table.columns, "displacement": replace(column, values=readings)}
+    return replace(table, columns=columns)
 
 
 def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None:
