@@ -16,41 +16,32 @@ import csv
 import gzip
 import re
 import warnings
-from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from charset_normalizer import from_bytes
 from numpy.typing import NDArray
 
-from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
+from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.labview import plain_lvm
+from bwbayes.record.io.layout import (
+    EXAMPLE,
+    Layout,
+    cells_of,
+    find_header,
+    find_layout,
+    split_header,
+)
 from bwbayes.record.io.series import Series, Source, in_seconds
-from bwbayes.record.io.units import QUANTITIES, power_of
 from bwbayes.record.record import Record
 
-_NUMBER = re.compile(
-    r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)([eEdD][+-]?\d+)?"
-    r"|[+-]?nan|[+-]?inf",
-    re.IGNORECASE,
-)
 _MARKS = "['\u2019\u00a0\u2009\u202f]"
-_SEPARATORS = ("\t", ";", ",", "|", " ")
-_EXAMPLE = "time_s,voltage_V,displacement_um"
-
-
-class _Layout(NamedTuple):
-    """How the numbers stand in a text: separator, fields of a line, and the first line's index."""
-
-    separator: str
-    fields: int
-    first: int
 
 
 def read_text(path: Path) -> Source:
@@ -78,8 +69,8 @@ def read_text(path: Path) -> Source:
         is_whole = True
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
-    layout = _layout(path, lines)
-    names, units, header = _header(path, lines, layout)
+    layout = find_layout(path, lines)
+    names, units, header = find_header(path, lines, layout)
     above = lines[: layout.first if header is None else header]
     notes = {}
     for line in above:
@@ -92,13 +83,13 @@ def read_text(path: Path) -> Source:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     # A pause of the logger may leave an empty line, a comment, or the header once more.
-    heading = {line for line in lines[header : layout.first] if _split_header(line, layout)}
+    heading = {line for line in lines[header : layout.first] if split_header(line, layout)}
     numbered = [
         (number, line)
         for number, line in enumerate(lines[layout.first :], start=layout.first + 1)
         if line.strip(" ")
         and line not in heading
-        and (line[0] not in "#%" or len(_cells(line, layout.separator)) == layout.fields)
+        and (line[0] not in "#%" or len(cells_of(line, layout.separator)) == layout.fields)
     ]
     numbered = _samples(path, numbered, layout, len(names), is_whole=is_whole)
     numbers, body = [n for n, _ in numbered], [line for _, line in numbered]
@@ -137,7 +128,7 @@ def _decoded(path: Path) -> str:
     with gzip.open(path) if is_packed else path.open("rb") as file:
         data = file.read(2**31)
     if not data.strip():
-        raise InputError(f"{path}: the file is empty; write {_EXAMPLE} and a line a sample")
+        raise InputError(f"{path}: the file is empty; write {EXAMPLE} and a line a sample")
     try:
         encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
         text = data.decode(encoding)
@@ -165,103 +156,10 @@ def _decoded(path: Path) -> str:
     return re.sub(thousands, lambda number: re.sub(_MARKS, "", number[0]), text)
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-
-
-def _layout(path: Path, lines: Sequence[str]) -> _Layout:
-    """Find how the numbers stand in a text: most lines in its middle and at its end are such."""
-    center, sample = len(lines) // 2, 60
-    probed = [*lines[center : center + sample], *lines[-sample:]]
-    rows = [line for line in probed if line.strip() and not line.startswith("#")]
-    best, separator, fields = 0.0, "", 0
-    columns: list[int] = []
-    for candidate in _SEPARATORS if rows else ():
-        split = [_cells(line, candidate) for line in rows]
-        width = Counter(map(len, split)).most_common(1)[0][0]
-        if width < 2:
-            continue
-        whole = [row for row in split if len(row) == width]
-        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in whole])
-        # An empty cell speaks for no separator, nor against one.
-        filled = sum(bool(cell) for row in whole for cell in row)
-        share = float(numeric.sum()) / max(filled, 1) * len(whole) / len(split)
-        numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
-        if share > best and numeric_columns:
-            best, separator, fields, columns = share, candidate, width, numeric_columns
-    in_a_row: list[int] = []
-    for index, line in enumerate(lines if columns else []):
-        if not line.strip():
-            continue
-        cells = _cells(line, separator)
-        numbers = sum(bool(_NUMBER.fullmatch(cells[c])) for c in columns if c < len(cells))
-        in_a_row = [*in_a_row, index] if numbers > len(columns) / 2 else []
-        if len(in_a_row) == 3:
-            break
-    if not in_a_row:
-        raise NoNumbersError(f"{path}: no columns of numbers in it; write {_EXAMPLE} above such")
-    return _Layout(separator, fields, in_a_row[0])
-
-
-def _header(
-    path: Path, lines: Sequence[str], layout: _Layout
-) -> tuple[list[str], list[str], int | None]:
-    """Return the columns' names and units, and the index of the header's first line."""
-    names: list[str] = []
-    units: list[str] = []
-    first = None
-    above = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
-    for index, line in reversed(above[-6:]):
-        cells = _split_header(line, layout)
-        if not cells:
-            if layout.separator == "," and 2 * len(line.split(",")) == layout.fields:
-                raise InputError(
-                    f"{path}:{layout.first + 1}: decimal commas, {layout.fields} fields for "
-                    f"{layout.fields // 2} columns; separate them by semicolons, or write 1.5"
-                )
-            continue
-        first = index
-        bare = [cell.strip("[]() ") for cell in cells]
-        # Times of day have their form in place of a unit.
-        is_unit = [
-            re.fullmatch("h+:m+(:s+)?([.,]f+)?", cell.lower())
-            or any(power_of(cell, q) is not None for q in QUANTITIES)
-            for cell in bare
-            if cell
-        ]
-        if not units and all(is_unit):
-            units = bare
-            continue
-        names = cells
-        break
-    fields = max(layout.fields, len(names))
-    units += [""] * (fields - len(units))
-    names += [""] * (fields - len(names))
-    named = [name or f"column {i}" for i, name in enumerate(names, start=1)]
-    count = Counter(named)
-    named = [f"{n} (column {i})" if count[n] > 1 else n for i, n in enumerate(named, start=1)]
-    return named, units, first
-
-
-def _split_header(line: str, layout: _Layout) -> list[str]:
-    """Return the cells of a line, by any separator that gives as many as the numbers have."""
-    bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
-    ways = [_cells(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
-    for number, fields in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
-        cells = [cell.strip().strip('"') for cell in fields]
-        more = any(cells[layout.fields :]) and number > 0
-        is_name = any(cells) and not any(_NUMBER.fullmatch(cell) for cell in cells)
-        if len(cells) >= layout.fields and not more and is_name:
-            return cells
-    return []
-
-
 def _samples(
     path: Path,
     numbered: Sequence[tuple[int, str]],
-    layout: _Layout,
+    layout: Layout,
     names: int,
     *,
     is_whole: bool,
@@ -280,7 +178,7 @@ def _samples(
     separator, fields = layout.separator, layout.fields
     samples, is_cut = list(numbered), False
     while len(samples) > 1:
-        first, last = (_cells(line, separator) for _, line in (samples[0], samples[-1]))
+        first, last = (cells_of(line, separator) for _, line in (samples[0], samples[-1]))
         is_short = len(last) < fields and not is_cut
         if not is_short and (re.search(r"\d", last[0]) or not re.search(r"\d", first[0])):
             break
@@ -297,7 +195,7 @@ def _samples(
     for number, line in samples:
         if (len(line.split()) if separator == " " else line.count(separator) + 1) == fields:
             continue
-        cells = _cells(line, separator)
+        cells = cells_of(line, separator)
         if len(cells) >= fields and not any(cells[max(fields, names) :]):
             continue
         advice = "complete the line, or remove it"
@@ -307,7 +205,7 @@ def _samples(
     return samples
 
 
-def _parsed(path: Path, body: Sequence[str], layout: _Layout) -> tuple[pd.DataFrame, str]:
+def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, str]:
     """Return the cells, as numbers where a whole column is, and the decimal mark."""
     # Fortran writes 1.5D+00.
     text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
