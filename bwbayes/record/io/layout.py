@@ -10,6 +10,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,6 +50,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     rows = [line for line in probed if line.strip() and not line.startswith("#")]
     best, separator, fields = 0.0, "", 0
     columns: list[int] = []
+    whole_columns: list[int] = []
     for candidate in _SEPARATORS if rows else ():
         split = [cells_of(line, candidate) for line in rows]
         width = Counter(map(len, split)).most_common(1)[0][0]
@@ -62,13 +64,15 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
         if share > best and numeric_columns:
             best, separator, fields, columns = share, candidate, width, numeric_columns
+            whole_columns = np.flatnonzero(numeric.all(axis=0)).tolist()
     in_a_row: list[int] = []
     for index, line in enumerate(lines if columns else []):
         if not line.strip():
             continue
         cells = cells_of(line, separator)
-        numbers = sum(bool(_NUMBER.fullmatch(cells[c])) for c in columns if c < len(cells))
-        in_a_row = [*in_a_row, index] if numbers > len(columns) / 2 else []
+        numbers = {c for c in columns if c < len(cells) and _NUMBER.fullmatch(cells[c])}
+        is_row = len(numbers) > len(columns) / 2 and numbers.issuperset(whole_columns)
+        in_a_row = [*in_a_row, index] if is_row else []
         if len(in_a_row) == 3:
             break
     if not in_a_row:
@@ -80,33 +84,39 @@ def find_header(
     path: Path, lines: Sequence[str], layout: Layout
 ) -> tuple[list[str], list[str], int | None]:
     """Return the columns' names and units, and the index of the header's first line."""
-    names: list[str] = []
-    units: list[str] = []
-    first = None
+    rows: list[tuple[int, list[str]]] = []
+    unit_row: int | None = None
+    values = cells_of(lines[layout.first], layout.separator)
     above = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
     for index, line in reversed(above[-6:]):
         cells = split_header(line, layout)
         if not cells:
-            if layout.separator == "," and 2 * len(line.split(",")) == layout.fields:
+            commas = layout.separator == "," and not rows
+            if commas and 2 * len(line.split(",")) == layout.fields:
                 raise InputError(
                     f"{path}:{layout.first + 1}: decimal commas, {layout.fields} fields for "
                     f"{layout.fields // 2} columns; separate them by semicolons, or write 1.5"
                 )
             continue
-        first = index
         bare = [cell.strip("[]() ") for cell in cells]
         # Times of day have their form in place of a unit.
         is_unit = [
             re.fullmatch("h+:m+(:s+)?([.,]f+)?", cell.lower())
             or any(power_of(cell, q) is not None for q in QUANTITIES)
-            for cell in bare
-            if cell
+            for cell, value in zip_longest(bare, values, fillvalue="")
+            if cell and value
         ]
-        if not units and all(is_unit):
-            units = bare
-            continue
-        names = cells
-        break
+        if unit_row is None and is_unit and all(is_unit):
+            unit_row = len(rows)
+            cells = bare
+        rows.append((index, cells))
+    # From the numbers upwards: comments, units and names, or names alone.
+    used = rows[:1]
+    if unit_row is not None:
+        used = rows[unit_row : unit_row + 2] if rows[unit_row + 1 :] else rows[: unit_row + 1][-2:]
+    units = rows[unit_row][1] if unit_row is not None else []
+    names = next((cells for _, cells in used[::-1] if cells is not units), [])
+    first = used[-1][0] if used else None
     fields = max(layout.fields, len(names))
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
