@@ -320,3 +320,63 @@ def _(folder: Path) -> Written:
     head += [","] * (len(rows) - len(head))
     lines = [f"{a},{b}" for a, b in zip(head, rows, strict=True)]
     return _text(folder / "a.csv", lines, columns=_named("3", "4", "5"), units=UNITS)
+
+
+@_instrument("oscilloscope, settings in as many fields")
+def _(folder: Path) -> Written:
+    head = ["Model,MSO44", "", "Sample Interval,0.005", "Vertical Units,V,V", "Vertical Offset,0,0"]
+    head += ["Vertical Scale,2,1", "Position,0,0", ",", "Label,Monitor,Sensor", "TIME,CH1,CH2"]
+    rows = _rows([TIME, VOLTAGE / 20, DISPLACEMENT / 0.35], ",", ".9f")
+    columns = _named("TIME", "CH1", "CH2")
+    units = {"time": "s", "voltage": "20 V", "displacement": "0.35 um"}
+    return _text(folder / "a.csv", [*head, *rows], columns=columns, units=units)
+
+
+@_instrument("Origin, comments below the units")
+def _(folder: Path) -> Written:
+    head = ["Time\tVoltage\tDisplacement", "s\tV\tum", "\tamplifier\tcapacitive"]
+    return _text(folder / "a.txt", [*head, *_rows(COLUMNS, "\t")])
+
+
+@_instrument("dSPACE, with a column of words")
+def _(folder: Path) -> Written:
+    head = ["values;;;", 'path;;"Model Root/DAC";"Model Root/ADC"', "name;time;U_cmd;pos_um"]
+    rows = _commas([f";{row}" for row in _rows(COLUMNS, ";")])
+    return _text(folder / "a.csv", [*head, "unit;s;V;um", *rows])
+
+
+@_instrument("MATLAB timetable")
+def _(folder: Path) -> Written:
+    rows = [f"{t:g} sec,{v:.6f},{d:.6f}" for t, v, d in zip(*COLUMNS, strict=True)]
+    return _text(folder / "a.csv", ["Time,Voltage_V_,Position_um_", *rows])
+
+
+@_instrument("data recorder of PI")
+def _(folder: Path) -> Written:
+    head = ["REM E-709", "", "VERSION = 1", "SEPARATOR = 32", "DIM = 2", "SAMPLE_TIME = 0.005000"]
+    head += ["NDATA = 600", "", "NAME0 = Actual Position of axis 1"]
+    head += ["NAME1 = Control Voltage of output chan 1", "", "END_HEADER"]
+    rows = _rows([DISPLACEMENT, VOLTAGE], " ")
+    columns = {"voltage": "Control Voltage of output chan 1", "displacement": "1"}
+    units = {"voltage": "V", "displacement": "um"}
+    return _text(
+        folder / "a.dat",
+        [*(f"# {line}" for line in head), *rows],
+        columns=columns,
+        units=units,
+        fs=200,
+    )
+
+
+@_instrument("commas in quotes")
+def _(folder: Path) -> Written:
+    rows = [f'"{row}"' for row in _commas(_rows(COLUMNS, '"|"'))]
+    rows = [row.replace("|", ",") for row in rows]
+    return _text(folder / "a.csv", ['"Time (s)","Voltage (V)","Displacement (um)"', *rows])
+
+
+@_instrument("numbered samples")
+def _(folder: Path) -> Written:
+    head = ["Interferometer", "Sample Rate (Hz): 200", "", "Sample;Voltage(V);Position(nm)"]
+    rows = _rows([np.arange(SAMPLES), VOLTAGE, 1e3 * DISPLACEMENT], ";")
+    return _text(folder / "a.txt", [*head, *rows], fs=200)

@@ -201,7 +201,7 @@ def test_times_from_1970_need_no_unit(name: str, unit: tuple[str, int], start: i
 @given(
     st.sampled_from([("time", "s"), ("voltage", "V"), ("displacement", "m")]),
     st.sampled_from(["", "n", "u", "µ", "μ", "m", "k"]),
-    st.sampled_from(["{} [{}]", "{} ({})", "{}_{}", "{} / {}", "{}[{}]", "{} {}"]),
+    st.sampled_from(["{} [{}]", "{} ({})", "{}_{}", "{} / {}", "{}[{}]", "{} {}", "{}_{}_"]),
     st.text("abcdefgh 1", min_size=1).map(str.strip).filter(bool),
 )
 def test_a_unit_is_read_from_any_usual_name(

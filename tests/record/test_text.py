@@ -168,7 +168,9 @@ def test_a_bad_cell_is_named_by_line_and_column(
     assert fault(tmp_path, cell(line, column, text)).startswith(where + problem)
 
 
-@pytest.mark.parametrize("text", ["", "  ", "nan", "-NaN", "#N/A", "OVERLOAD", "---", "no signal"])
+@pytest.mark.parametrize(
+    "text", ["", "  ", "nan", "-NaN", "#N/A", "OVERLOAD", "---", "no signal", "∞"]
+)
 @pytest.mark.filterwarnings("ignore:.*record.csv.17.*, taken as missing")
 def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     tmp_path: Path, text: str
@@ -178,7 +180,7 @@ def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     np.testing.assert_array_equal(whole.voltage, record.voltage)
     for column in (0, 1):
         where = f"record.csv:17: {HEADER.split(',')[column]}: "
-        word = text in ("OVERLOAD", "---", "no signal")
+        word = text in ("OVERLOAD", "---", "no signal", "∞")
         problem = f"{text!r} is not a number" if word else "no number (empty or nan); give one, or"
         assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 

@@ -12,9 +12,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
-from bwbayes.record.io.series import RATES, Series, Source
+from bwbayes.record.io.series import Series, Source
 from bwbayes.record.io.units import (
     COMMON_UNITS,
     QUANTITIES,
@@ -245,7 +243,7 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
 
 def _likeness(label: str, unit: str, quantity: str) -> int | None:
     """Tell if a name means a quantity: 0 as the package's own, 1 by its word, 2 by its unit."""
-    word, _, ending = label.strip().rpartition("_")
+    word, _, ending = label.strip(" _").rpartition("_")
     if word.lower() == quantity and power_of(ending, quantity) is not None:
         return 0
     if quantity == "truth" or _likeness(label, "", "truth") == 0:
@@ -254,7 +252,7 @@ def _likeness(label: str, unit: str, quantity: str) -> int | None:
     if any(stated.values()) and stated[quantity] is None:
         return None
     ending = unit_in(label, quantity) or ""
-    bare = re.sub(rf"[\s_/.\-\[(]*{re.escape(ending)}[\])\s]*$", "", label) if ending else label
+    bare = re.sub(rf"[\s_/.\-\[(]*{re.escape(ending)}[\])\s_]*$", "", label) if ending else label
     if bare.strip().lower() in _WORDS[quantity] or word.lower() == quantity:
         return 1
     return 2 if stated[quantity] else None
@@ -298,10 +296,17 @@ def _columns_error(
     moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
     candidates = _beside(moving or others, chosen)
     clock = chosen["time"] if "time" in unknown else None
+    steps = {s.name: np.diff(_finite(s)) for s in candidates if s.name in ranges}
+    # But for those that number the samples.
+    candidates = [
+        s
+        for s in candidates
+        if _unit_of(s.label, s.unit, "time") or s.name not in steps or (steps[s.name] != 1).any()
+    ]
     clocks = [
         s
         for s in candidates
-        if s.name in ranges and _finite(s).size == s.size and (np.diff(_finite(s)) > 0).all()
+        if s.name in steps and steps[s.name].size == s.size - 1 and (steps[s.name] > 0).all()
     ]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
@@ -309,7 +314,9 @@ def _columns_error(
     units = {q: COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
-        pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or pool
+        words = [word for word in _WORDS[quantity] if len(word) > 3]
+        alike = [s for s in pool if any(word in s.label.lower() for word in words)]
+        pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or alike or pool
         if not pool:
             continue
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
@@ -336,21 +343,16 @@ def _columns_error(
         ]
         problem += f"{clock.name!r} is {', '.join(rates)}. " * bool(rates)
     problem += listing
-    single = [s for s in source.series if s.size == 1 and s.name in ranges]
-    numbers = {s.label.lower(): float(ranges[s.name][0]) for s in single}
-    for name, text in chain.from_iterable(notes.items() for notes in source.notes.values()):
-        with suppress(ValueError):
-            numbers.setdefault(name.lower(), float(text))
-    stated = [
-        numbers[name] ** power for name, power in RATES.items() if 0 < numbers.get(name, 0) < np.inf
-    ]
-    return ColumnsError(problem, columns, units, fs=[*stated, 1000.0][0] if timeless else None)
+    fs = source.stated_rate(1000.0) if timeless else None
+    return ColumnsError(problem, columns, units, fs=fs)
 
 
 def _finite(series: Series) -> FloatArray:
-    """Return the finite numbers of a series; none of one that has something else."""
+    """Return the finite numbers of a series; none of one that has something else but words."""
     try:
-        values = series.numbers("").astype(np.float64)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            values = series.numbers("", readings=True).astype(np.float64)
     except InputError:
         return np.empty(0)
     return values[np.isfinite(values)] + 0.0

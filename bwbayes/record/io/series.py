@@ -8,6 +8,7 @@ when they are needed, since a file may hold much else.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
 # s: the power of it that is the rate.
 RATES = {
     **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
-    **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time"), -1),
+    **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time", "sample_interval"), -1),
 }
 
 
@@ -88,6 +89,21 @@ class Source:
     lines: Sequence[int] = ()
     interval: float | None = None
     start: float = 0.0
+
+    def stated_rate(self, default: float) -> float:
+        """Return the sampling rate, Hz, that is stated beside the series, or the default."""
+        texts = {n.lower(): t for notes in self.notes.values() for n, t in notes.items()}
+        for series in self.series:
+            if series.size == 1 and series.label.lower() in RATES:
+                with suppress(InputError):
+                    texts[series.label.lower()] = str(series.numbers("")[0])
+        for name, power in RATES.items():
+            with suppress(ValueError):
+                # Of kHz and ms no number is left.
+                text = texts.get(name, "").strip(" ,;\t").removesuffix("Hz").removesuffix("s")
+                if 0 < float(text) < np.inf:
+                    return float(float(text) ** power)
+        return default
 
 
 def vectors(

@@ -4,10 +4,10 @@ Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
 them names the columns; a second line may hold their units. What stands above the header is skipped
 with a remark, as are empty lines, comments and headers among the numbers, and words or a line that
-is cut off below them. Of lines
-``# key: value`` above them ``voltage`` (command or output), ``origin``, ``interval_s`` and
-``time_offset_s`` are understood. An empty cell or ``nan`` in the displacement is a missing reading.
-A line that cannot be read is named with its number.
+is cut off below them. Of lines ``# key: value`` above them ``voltage`` (command or output),
+``origin``, ``interval_s`` and ``time_offset_s`` are understood, and of any a sampling rate or
+interval, as a guess. An empty cell or ``nan`` in the displacement is a missing reading. A line that
+cannot be read is named with its number.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from bwbayes.record.io.layout import (
     find_layout,
     split_header,
 )
-from bwbayes.record.io.series import Series, Source, in_seconds
+from bwbayes.record.io.series import RATES, Series, Source, in_seconds
 from bwbayes.record.record import Record
 
 _MARKS = "['\u2019\u00a0\u2009\u202f]"
@@ -74,10 +74,12 @@ def read_text(path: Path) -> Source:
     above = lines[: layout.first if header is None else header]
     notes = {}
     for line in above:
-        key, colon, value = line.lstrip(" #").partition(":")
-        if line.startswith("#") and colon:
-            key = key.strip().lower()
+        key, sign, value, *_ = [*re.split(r"([:=,;\t])", line, maxsplit=1), "", ""]
+        key = re.sub(r"\W+", "_", re.sub(r"\(.*", "", key)).strip("_").lower()
+        if (line.startswith("#") and sign in ("=", ":")) or key in RATES:
             notes["voltage_is" if key == "voltage" else key] = value.strip()
+    # As data recorders of PI write them.
+    names = [notes.get(f"name{i}", name) for i, name in enumerate(names)]
     skipped = sum(bool(line.strip()) and not line.startswith("#") for line in above)
     if skipped:
         remark = f"{path}:1: {skipped} line{'s' * (skipped > 1)} above the header skipped"
@@ -102,9 +104,11 @@ def read_text(path: Path) -> Source:
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
         if column >= layout.fields:
             break
-        # Dates and times of day have no unit, and become seconds.
-        stated = "s" if re.match(r".*\d:\d\d", str(frame[column].iloc[0])) else unit
-        load = partial(_numbers, path, frame[column], decimal, name, numbers)
+        # Dates, times of day and durations as MATLAB's 0.5 sec have no unit, and become seconds.
+        cell = str(frame[column].iloc[0])
+        is_clock = bool(re.match(r".*\d:\d\d|[\d.]+ (sec|min|hr)$", cell))
+        stated = "s" if is_clock else unit
+        load = partial(_numbers, path, frame[column], decimal, name, numbers, is_clock=is_clock)
         series.append(
             Series(name, len(body), load, stated, load_readings=partial(load, words=True))
         )
@@ -210,7 +214,7 @@ def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFra
     # Fortran writes 1.5D+00.
     text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
     frames = []
-    for decimal in ".," if "," in text and layout.separator != "," else ".":
+    for decimal in ".," if "," in text and (layout.separator != "," or '"' in text) else ".":
         mark = "." if decimal == "," else ","
         # In quotes they may be those that separate columns as well.
         begin = '"-?' if mark == layout.separator else ""
@@ -242,6 +246,7 @@ def _numbers(
     name: str,
     lines: Sequence[int],
     *,
+    is_clock: bool,
     words: bool = False,
 ) -> NDArray[Any]:
     """Return a column's numbers, nan for ``words``; dates and times of day in seconds.
@@ -263,15 +268,15 @@ def _numbers(
     wrong = np.flatnonzero(numbers.isna() & column.notna() & (text.str.lower() != "nan"))
     if not wrong.size:
         return np.asarray(numbers, dtype=np.float64)
-    if ":" in text.iloc[0]:
+    if is_clock:
         for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
-            is_clock = parse is pd.to_timedelta
+            is_duration = parse is pd.to_timedelta
             try:
-                times = in_seconds(parse(text).to_numpy(f"{'Mm'[is_clock]}8[ns]"))
+                times = in_seconds(parse(text).to_numpy(f"{'Mm'[is_duration]}8[ns]"))
             except (ValueError, OverflowError):
                 continue
             # Times of day begin again at midnight.
-            days = np.cumsum(np.diff(times, prepend=times[:1]) < -43_200) if is_clock else 0
+            days = np.cumsum(np.diff(times, prepend=times[:1]) < -43_200) if is_duration else 0
             return np.asarray(times + 86_400.0 * days)
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")

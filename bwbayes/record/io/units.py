@@ -48,9 +48,10 @@ def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
 def unit_in(name: str, quantity: str) -> str | None:
     """Return the unit at the end of a column's name, if it is one of the quantity.
 
-    In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``.
+    In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``;
+    also ``pos_nm_``, as MATLAB writes brackets.
     """
-    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+))\s*$", name)
+    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+)_?)\s*$", name)
     if ending is None:
         return None
     unit = next(group for group in ending.groups() if group is not None).strip()
