@@ -179,6 +179,14 @@ def test_units_of_time_are_asked_for_with_their_rates(
         read_record(write(tmp_path / "a.csv", values), columns=columns)
 
 
+def test_a_sensors_volts_are_asked_for_with_their_sensitivity(tmp_path: Path) -> None:
+    """As the guess would else be read as if 1 V were 1 um."""
+    values = {"time_s": TIME, "amplifier [V]": VOLTAGE, "gauge [mV]": DISPLACEMENT}
+    line = r"which the displacement, and how many um is 1 mV of 'gauge \[mV\]'\? .*t': '1 um'}$"
+    with pytest.raises(ColumnsError, match=line):
+        read_record(write(tmp_path / "a.csv", values))
+
+
 @given(
     st.sampled_from(["unix_time", "Unix Timestamp", "epoch"]),
     st.sampled_from([("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)]),

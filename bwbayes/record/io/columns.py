@@ -26,6 +26,7 @@ from bwbayes.record.io.units import (
     QUANTITIES,
     epoch_unit,
     power_of,
+    rates_by_unit,
     scale_of,
     unit_in,
 )
@@ -310,7 +311,7 @@ def _columns_error(
     ]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
-    columns = dict(naming.columns)
+    columns, sensitivities = dict(naming.columns), []
     units = {q: COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
@@ -321,9 +322,14 @@ def _columns_error(
             continue
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
         candidates = [s for s in candidates if s is not pool[0]]
+        stated = [unit for q in QUANTITIES if (unit := _unit_of(pool[0].label, pool[0].unit, q))]
         if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
             clock = pool[0] if quantity == "time" else clock
-            units.setdefault(quantity, COMMON_UNITS[quantity][0])
+            guess = COMMON_UNITS[quantity][0]
+            if stated and quantity not in units:  # as of a sensor's volts
+                sensitivities.append(f"how many {guess} is 1 {stated[0]} of {pool[0].name!r}")
+                guess = f"1 {guess}"
+            units.setdefault(quantity, guess)
     listing = _listed(source.series, ranges)
     lost = [q for q in missing if q not in columns]
     if lost:
@@ -332,17 +338,12 @@ def _columns_error(
     if unknown:
         names = ", which ".join(f"{chosen[q].name!r} ({q})" for q in unknown)
         questions.append(f"which unit has {names}")
+    questions += sensitivities
     if timeless:
         questions.append("what is the sampling rate, Hz (no column can be the time)")
-    problem = f"{where}: {', and '.join(questions)}? "
-    if clock and clock.name in ranges:  # a wrong unit would show nowhere else
-        length = float(np.ptp(ranges[clock.name]))
-        scaled = {u: length * 10.0 ** (power_of(u, "time") or 0) for u in COMMON_UNITS["time"]}
-        rates = [
-            f"{(clock.size - 1) / t:.6g} Hz for {t:.6g} s in {u}" for u, t in scaled.items() if t
-        ]
-        problem += f"{clock.name!r} is {', '.join(rates)}. " * bool(rates)
-    problem += listing
+    extent = float(np.ptp(ranges[clock.name])) if clock and clock.name in ranges else 0.0
+    rates = f"{clock.name!r} is {rates_by_unit(clock.size, extent)}. " if clock and extent else ""
+    problem = f"{where}: {', and '.join(questions)}? {rates}{listing}"
     fs = source.stated_rate(1000.0) if timeless else None
     return ColumnsError(problem, columns, units, fs=fs)
 

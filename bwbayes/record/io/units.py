@@ -69,3 +69,13 @@ def epoch_unit(name: str, times: FloatArray) -> str | None:
     powers = {"s": 0, "ms": 3, "us": 6, "ns": 9}
     dates = (u for u, p in powers.items() if 3.155e8 * 10**p < first <= last < 7.2e9 * 10**p)
     return next(dates, None)
+
+
+def rates_by_unit(samples: int, extent: float) -> str:
+    """Say which sampling rate and duration times have in each unit: a wrong one shows in nothing else.
+
+    ``extent`` is how far the last one is from the first.
+    """
+    durations = {u: extent * 10.0 ** (power_of(u, "time") or 0) for u in COMMON_UNITS["time"]}
+    rates = [f"{(samples - 1) / t:.6g} Hz for {t:.6g} s in {u}" for u, t in durations.items()]
+    return ", ".join(rates)
