@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
@@ -82,6 +82,32 @@ def test_times_of_day_go_on_after_midnight(
     record = read(Written(path))
     assert (INTERVAL, float(start)) == (record.interval, record.start)
     np.testing.assert_allclose(record.voltage, VOLTAGE)
+
+
+@given(
+    st.datetimes(datetime(2001, 1, 2), datetime(2059, 12, 29)),
+    st.sampled_from(
+        ["{:%d.%m.%Y %H:%M:%S.%f}", "{:%m/%d/%Y %H:%M:%S.%f}", "{:%d/%m/%y %H:%M:%S,%f}"]
+    ),
+    st.booleans(),
+)
+@example(datetime(2026, 5, 3), "{:%d.%m.%Y %H:%M:%S.%f}", True)
+def test_dates_go_on_after_midnight_whatever_their_order(
+    tmp_path_factory: pytest.TempPathFactory, day: datetime, form: str, over_midnight: bool
+) -> None:
+    """Of days and months; also minutes and seconds alone, as Excel writes them, after an hour."""
+    begin = day.replace(hour=0, minute=0, second=0, microsecond=0)
+    begin -= timedelta(seconds=1 * over_midnight)
+    for written in (form, "{:%M:%S.%f}"):
+        rows = [
+            f'"{written.format(begin + timedelta(seconds=t))}",{v},{d}'
+            for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)
+        ]
+        path = tmp_path_factory.getbasetemp() / "dates.csv"
+        path.write_text("\n".join(["Time,voltage_V,displacement_um", *rows]) + "\n")
+        record = read(Written(path))
+        assert (INTERVAL, TIME.size) == (record.interval, record.samples)
+        np.testing.assert_array_equal(record.voltage, VOLTAGE)
 
 
 @pytest.mark.parametrize(

@@ -286,16 +286,13 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     ),
     "time goes back": (
         lines(*LINES[:8], LINES[5], *LINES[9:]),
-        ":9: time_s: time goes back from 0.03 s to 0.02 s; sort them",
+        ":9: time_s: time goes back from 0.03 s to 0.02 s; sort the rows",
     ),
     "repeated": (
         lines(*LINES[:8], "0.030,1,1", "0.030,2,2", *LINES[8:]),
         ":9: time_s: 2 times are repeated, first 0.03 s; remove one of two samples, or give `fs=",
     ),
-    "one time": (
-        lines(HEADER, *(f"1.5,{i},{i}" for i in range(20))),
-        ":3: time_s: all times are 1",
-    ),
+    "one time": (lines(HEADER, *(f"1.5,{i},{i}" for i in range(20))), ": time_s: all times are 1"),
     "gap": (
         lines(*LINES[:8], *LINES[12:]),
         ":9: time_s: gap of 0.025 s after 0.03 s, about 4 missing",

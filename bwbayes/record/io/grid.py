@@ -91,14 +91,15 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
     offset = start if abs(start) > 1e6 else 0.0
     steps, samples = np.diff(elapsed), np.arange(elapsed.size)
     interval = float(elapsed[-1]) / steps.size
-    if (steps < 0).any() or interval == 0:
-        sample = int(np.argmax(steps <= min(steps.min(), 0.0)))
-        times = stamps[sample : sample + 2] - offset
-        before, after = (f"{clock(t, float(np.abs(steps).mean()))} s" for t in times)
-        problem = f"time goes back from {before} to {after}; sort them"
-        if interval == 0:
-            problem = f"all times are {after}; give those of the samples, or `fs=HZ` for them"
+    sample = int(np.argmax(steps < 0))
+    times = stamps[sample : sample + 2] - offset
+    before, after = (f"{clock(time, float(np.abs(steps).mean()))} s" for time in times)
+    if steps[sample] < 0:
+        problem = f"time goes back from {before} to {after}; sort the rows, or cut the file there"
         raise table.error(problem, "time", sample + 1)
+    if interval == 0:
+        problem = f"all times are {after}; give those of the samples, or `fs=HZ` for them"
+        raise table.error(problem, "time")
     require_plausible(table, interval, elapsed.size)
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0

@@ -17,6 +17,7 @@ import gzip
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -269,15 +270,24 @@ def _numbers(
     if not wrong.size:
         return np.asarray(numbers, dtype=np.float64)
     if is_clock:
-        for parse in (pd.to_timedelta, partial(pd.to_datetime, format="mixed", utc=True)):
-            is_duration = parse is pd.to_timedelta
-            try:
-                times = in_seconds(parse(text).to_numpy(f"{'Mm'[is_duration]}8[ns]"))
-            except (ValueError, OverflowError):
-                continue
-            # Times of day begin again at midnight.
-            days = np.cumsum(np.diff(times, prepend=times[:1]) < -43_200) if is_duration else 0
-            return np.asarray(times + 86_400.0 * days)
+        text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
+        # Minutes and seconds alone have a fraction, as Excel writes times.
+        is_short = text.str.fullmatch(r"\d+:\d+\.\d+").all()
+        with suppress(ValueError, OverflowError):
+            durations = pd.to_timedelta("0:" + text if is_short else text)
+            times = in_seconds(durations.to_numpy("m8[ns]"))
+            # Times of day begin again at midnight, and minutes after an hour.
+            period = 3600.0 if is_short else 86_400.0
+            turns = np.cumsum(np.diff(times, prepend=times[:1]) < -period / 2)
+            return np.asarray(times + period * turns)
+        # Days come before months or behind them: as is no jump at midnight.
+        dates = []
+        for is_day_first in (False, True):
+            with suppress(ValueError, OverflowError):
+                parsed = pd.to_datetime(text, format="mixed", utc=True, dayfirst=is_day_first)
+                dates.append(in_seconds(parsed.to_numpy("M8[ns]")))
+        if dates:
+            return min(dates, key=np.ptp)
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     where = f"{path}:{lines[wrong[0]]}: {name}: {shown}"

@@ -72,9 +72,9 @@ def epoch_unit(name: str, times: FloatArray) -> str | None:
 
 
 def rates_by_unit(samples: int, extent: float) -> str:
-    """Say which sampling rate and duration times have in each unit: a wrong one shows in nothing else.
+    """Say which sampling rate and duration times have in each unit; a wrong one shows nowhere else.
 
-    ``extent`` is how far the last one is from the first.
+    ``extent`` is how far the last time is from the first.
     """
     durations = {u: extent * 10.0 ** (power_of(u, "time") or 0) for u in COMMON_UNITS["time"]}
     rates = [f"{(samples - 1) / t:.6g} Hz for {t:.6g} s in {u}" for u, t in durations.items()]
