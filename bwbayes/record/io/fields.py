@@ -14,12 +14,11 @@ from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.columns import ColumnTable
-from bwbayes.record.io.grid import Grid, clock, require_plausible, time_grid
+from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
 
 VoltageIs = Literal["command", "output"]
 """What a voltage column is: the command that a DAC holds, or the amplifier's output."""
@@ -219,12 +218,12 @@ def _without_gaps(
         # Hysteresis depends on extrema alone: how far beyond both ends such a gap would hide one.
         hidden = np.abs(inside - inside.clip(ends.min(axis=0), ends.max(axis=0)))
         hides_none = hidden.size > 0 and hidden.max() <= 0.01 * np.ptp(values)
-        is_smooth = _is_smooth(values, positions, missing)
+        smooth = is_smooth(values, positions, missing)
         for gap in np.flatnonzero(steps == missing + 1).tolist():
             before, after = positions[gap], positions[gap + 1]
             first = np.searchsorted(positions, before - missing)
             last = np.searchsorted(positions, after + missing, side="right")
-            if is_smooth and min(gap + 1 - first, last - gap - 1) > 0.75 * missing:
+            if smooth and min(gap + 1 - first, last - gap - 1) > 0.75 * missing:
                 near = positions[first:last]
                 curve = np.polynomial.Polynomial.fit(
                     near, values[first:last], min(5, near.size - 1)
@@ -250,21 +249,3 @@ def _without_gaps(
         where = int(sources[int(np.argmax(steps > 1)) + 1])
         warnings.warn(str(table.error(remark, "time", where)), InputWarning, stacklevel=5)
     return full
-
-
-def _is_smooth(values: FloatArray, positions: IntArray, missing: int) -> bool:
-    """Tell whether a polynomial across so many values is right where none are missing.
-
-    To 1% of their range, in the middle; it is fitted to as many on either side, and one more.
-    """
-    width = 3 * missing + 2
-    if width > values.size:
-        return False
-    powers = np.vander(np.arange(width) / width - 0.5, min(6, 2 * missing + 2))
-    is_inside = (np.arange(width) > missing) & (np.arange(width) <= 2 * missing)
-    error = np.zeros(width)
-    error[~is_inside] = -powers[width // 2] @ np.linalg.pinv(powers[~is_inside])
-    error[width // 2] = 1.0
-    errors = scipy.signal.oaconvolve(values - values[0], error[::-1], mode="valid")
-    errors = errors[positions[width - 1 :] - positions[: values.size - width + 1] == width - 1]
-    return errors.size > 0 and bool(np.abs(errors).max() <= 0.01 * np.ptp(values))

@@ -299,3 +299,21 @@ def _exact_interval(
         problem = f"interval_s {text!r} contradicts the time column, {measured:.9g} s"
         raise table.error(f"{problem}; remove or correct it")
     return declared
+
+
+def is_smooth(values: FloatArray, positions: IntArray, missing: int) -> bool:
+    """Tell whether a polynomial across so many values is right where none are missing.
+
+    To 1% of their range, in the middle; it is fitted to as many on either side, and one more.
+    """
+    width = 3 * missing + 2
+    if width > values.size:
+        return False
+    powers = np.vander(np.arange(width) / width - 0.5, min(6, 2 * missing + 2))
+    is_inside = (np.arange(width) > missing) & (np.arange(width) <= 2 * missing)
+    error = np.zeros(width)
+    error[~is_inside] = -powers[width // 2] @ np.linalg.pinv(powers[~is_inside])
+    error[width // 2] = 1.0
+    errors = scipy.signal.oaconvolve(values - values[0], error[::-1], mode="valid")
+    errors = errors[positions[width - 1 :] - positions[: values.size - width + 1] == width - 1]
+    return errors.size > 0 and bool(np.abs(errors).max() <= 0.01 * np.ptp(values))
