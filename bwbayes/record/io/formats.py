@@ -9,6 +9,7 @@ binary formats.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +20,7 @@ import h5py
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, refuse_unwritable
+from bwbayes.errors import InputError, InputWarning, refuse_unwritable
 from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields, require_voltage_is
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
@@ -198,7 +199,9 @@ def require_readable(record: Record, where: str) -> None:
     source = array_source(where, record_arrays(record), notes={"interval_s": repr(record.interval)})
     need = record.displacement is not None
     needed = QUANTITIES if need else ("time", "voltage")
-    record_fields(select(source, Naming(), needed), need_displacement=need)
+    with warnings.catch_warnings():  # what would be taken as missing is as it is
+        warnings.simplefilter("ignore", InputWarning)
+        record_fields(select(source, Naming(), needed), need_displacement=need)
 
 
 def _truth_path(path: Path) -> Path:
