@@ -108,8 +108,6 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
         return table, Grid(start - offset, uniform, offset)
     if (steps == 0).any():
         table, elapsed = _without_repeats(table, elapsed, start - offset)
-        start += float(elapsed[0])
-        elapsed = elapsed - elapsed[0]
         stamps = start + elapsed
     positions = _with_gaps(table, np.diff(elapsed))
     if uniform := _uniform_interval(table, stamps, elapsed, positions, rounding):
