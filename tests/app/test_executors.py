@@ -33,6 +33,7 @@ from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
 from tests.app import small
+from tests.app.conftest import Type
 from tests.inference.problems import short_posterior, truth
 
 distributed = pytest.importorskip("distributed", reason="bwbayes[dask] is not installed")
@@ -178,6 +179,37 @@ def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
         open_executor(executor="ray").__enter__()
     with pytest.raises(InputError, match="object has no submit"):
         open_executor(executor=object()).__enter__()  # type: ignore[arg-type]
+
+
+def test_a_run_refuses_an_executor_before_its_map_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does it take a new target, which the next one would have."""
+    folder = small.begun(tmp_path / "run")
+    before = folder.config.read_bytes()
+    monkeypatch.setattr("bwbayes.app.running.run.find_map", None)
+    with pytest.raises(InputError, match="'slurm' is unknown"):
+        resume(folder, small.quiet(), executor="slurm", ess=50.0)
+    assert before == folder.config.read_bytes()
+
+
+@pytest.mark.parametrize("command", ["run", "resume", "compare", "campaign", "calibrate"])
+@pytest.mark.parametrize(
+    ("executor", "said"),
+    [
+        ("slurm", "executor: 'slurm' is unknown; write one of local"),
+        ("dask", "distributed is not installed; install bwbayes[dask]"),
+        ("dask://127.0.0.1:9", "no scheduler there; start one with `dask scheduler`"),
+    ],
+)
+def test_every_command_refuses_an_executor_first_of_all(
+    bwbayes: Type, monkeypatch: pytest.MonkeyPatch, command: str, executor: str, said: str
+) -> None:
+    """Before it looks at what it is given, which is not there."""
+    monkeypatch.setattr(workers_module, "PATIENCE", 0.2)
+    if executor == "dask":
+        monkeypatch.setitem(sys.modules, "distributed", None)
+    bwbayes(command, "nothing", "--executor", executor).assert_refused(said)
 
 
 class Foreign(Executor):

@@ -110,6 +110,17 @@ def _option(
         options = {"type": click.Choice(ast.literal_eval(hint.removeprefix("Literal")))}
     if key in RANGES:
         options = {"type": RANGES[key]}
+    if key == "executor":
+
+        def usable(_: click.Context, __: click.Parameter, executor: str | None) -> str | None:
+            from bwbayes.app.running.workers import require_executor  # slow to load
+
+            if executor is not None:
+                require_executor(executor)
+            return executor
+
+        # Refused before its command does anything.
+        options = {"callback": usable}
     return click.option(
         f"--{flag}", key, default=default, show_default=default is not None, help=text, **options
     )

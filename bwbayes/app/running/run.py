@@ -28,7 +28,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine
+from bwbayes.inference.engine import Engine, choose
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import write_bands, write_summary
@@ -77,25 +77,24 @@ def resume(
     start_time = time.monotonic()
     artist = artist or Artist()
     with folder.locked(), one_thread():
+        config = load(folder.config)
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
-        if targets:
-            config = load(folder.config)
-            sampling = config.sampling.model_copy(update=targets)
-            _rewrite(folder, config.model_copy(update={"sampling": sampling}))
-        problem = problem or folder.problem()
-        artist.rehearse(problem.posterior)
-        problem, chain = _open_chain(folder, problem, console, engine)
-        plan = problem.plan
-        with (
-            open_executor(workers, problem.posterior.engine, executor) as pool,
-            Progress(console, plan) as progress,
-        ):
-            known = load_result(folder.result, problem, chain)
-            if known is None:
-                # It is written last, as the sign that all is done; now there is more to do.
-                folder.summary.unlink(missing_ok=True)
-            outcome = sample(problem.posterior, plan, chain, pool, progress)
+        sampling = config.sampling.model_copy(update=targets)
+        # What computes is refused before anything is computed for it.
+        with open_executor(workers, choose(sampling.engine), executor) as pool:
+            if targets:
+                _rewrite(folder, config.model_copy(update={"sampling": sampling}))
+            problem = problem or folder.problem()
+            artist.rehearse(problem.posterior)
+            problem, chain = _open_chain(folder, problem, console, engine)
+            plan = problem.plan
+            with Progress(console, plan) as progress:
+                known = load_result(folder.result, problem, chain)
+                if known is None:
+                    # It is written last, as the sign that all is done; now there is more to do.
+                    folder.summary.unlink(missing_ok=True)
+                outcome = sample(problem.posterior, plan, chain, pool, progress)
         models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
         ess = outcome.check.lowest_ess
         console.print(

@@ -80,12 +80,7 @@ def open_executor(
             )
         return
     count = workers or os.cpu_count() or 1
-    kind, _, address = (executor or "local").partition("://")
-    if kind not in KINDS or (address and kind != "dask"):
-        kinds = ", ".join(KINDS)
-        raise InputError(
-            f"executor: {executor!r} is unknown; write one of {kinds}, dask://HOST:PORT"
-        )
+    kind, address = _kind_of(executor)
     if kind == "local":
         kind = "processes" if engine == "numpy" and count > 1 else "threads"
     if kind == "dask":
@@ -100,6 +95,30 @@ def open_executor(
             yield threads
         finally:
             threads.shutdown(cancel_futures=True)
+
+
+def require_executor(executor: str | None) -> None:
+    """Refuse what :func:`open_executor` refuses of a word, before anything is done for it.
+
+    Raises InputError: another word, no ``distributed``, or a cluster that does not answer.
+    """
+    kind, address = _kind_of(executor)
+    if address:
+        with _cluster(address, None):
+            pass
+    elif kind == "dask":
+        _dask()
+
+
+def _kind_of(executor: str | None) -> tuple[str, str]:
+    """Return which of `KINDS` an executor is, and the address of its scheduler, if it has one."""
+    kind, _, address = (executor or "local").partition("://")
+    if kind not in KINDS or (address and kind != "dask"):
+        kinds = ", ".join(KINDS)
+        raise InputError(
+            f"executor: {executor!r} is unknown; write one of {kinds}, dask://HOST:PORT"
+        )
+    return kind, address
 
 
 @contextmanager
@@ -208,13 +227,7 @@ def _cluster(address: str, workers: int | None) -> Iterator[ByValue]:
     BrokenExecutor
         The scheduler is gone, or workers die under one call.
     """
-    try:
-        dask: Any = import_module("dask")  # only those who ask for it have it
-        distributed: Any = import_module("distributed")
-    except ImportError:
-        raise InputError(
-            "executor dask: distributed is not installed; install bwbayes[dask]"
-        ) from None
+    dask, distributed = _dask()
     # What a person has to know is said in one line; the rest is for those who run the cluster.
     for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -250,6 +263,16 @@ def _cluster(address: str, workers: int | None) -> Iterator[ByValue]:
             client.close(timeout=PATIENCE)
             if not address:
                 scheduler.close(timeout=PATIENCE)
+
+
+def _dask() -> tuple[Any, Any]:
+    """Return dask and distributed, which only those who ask for them have."""
+    try:
+        return import_module("dask"), import_module("distributed")
+    except ImportError:
+        raise InputError(
+            "executor dask: distributed is not installed; install bwbayes[dask]"
+        ) from None
 
 
 def _require_workers(client: Any, address: str) -> None:
