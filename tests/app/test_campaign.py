@@ -184,6 +184,24 @@ def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_pa
     assert means[1]["s000"] == means[1]["broken"]
 
 
+def test_a_record_whose_validation_file_was_changed_is_fitted_again(tmp_path: Path) -> None:
+    """Its bands are those of the file as it is; a campaign that is finished would not look."""
+    (tmp_path / "small.toml").write_text(CONFIG + '[validation.next]\nfile = "next.csv"\n')
+    specimens(tmp_path / "records", 1)
+    bw.write_record(record(0), tmp_path / "next.csv")
+    folder = begun(tmp_path, tmp_path / "batch")
+    assert ended(folder).exit_status == 0
+    first = folder.run("s000")
+    assert folder.is_done(tmp_path / "records/s000.csv")
+    before = json.loads((first / "summary.json").read_text())["validation"]["next"]
+    worse = record(0)
+    bw.write_record(replace(worse, displacement=1.2 * worse.displacement), tmp_path / "next.csv")
+    assert not folder.is_done(tmp_path / "records/s000.csv")
+    assert ended(folder).exit_status == 3
+    after = json.loads((first / "summary.json").read_text())["validation"]["next"]
+    assert (True, False) == (before["holds"], after["holds"])
+
+
 def test_the_worst_ending_is_the_exit_status() -> None:
     endings = ["passed", "validation inconclusive", "validation failed", "not converged", "refused"]
     rows = tuple(Row(ending, "x.csv", ending, "why", {}) for ending in endings)

@@ -25,7 +25,7 @@ from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
-from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, digest, ended
+from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
@@ -149,7 +149,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
         # They are the run's remarks, and a hundred records of one kind say the same.
         warnings.simplefilter("ignore", InputWarning)
         try:
-            record = digest(file)
+            digests = campaign.digests(file)
             folder = _run_folder(file, campaign)
             fit = resume_run(folder, Console(quiet=True), workers=1, files=origin.pictures)
             if not origin.pictures:
@@ -158,7 +158,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
                 source = generator(fit.problem.config.seed, "specimen")
                 specimen = specimen_of(file.stem, fit.problem.posterior, fit.flat_draws, source)
                 specimen.save(run / SPECIMEN)
-            (run / ENDED).write_text(ended(record, run), encoding="utf-8")
+            (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
             return Ended(file, "" if fit.converged else "not converged")
         except InputError as error:
             # Of a file in the folder of the records its name says enough.
@@ -187,7 +187,7 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
             found = existing.problem()
             expected = problem.with_noise(found.config.model.noise)
             same_posterior = fingerprint(found.config) == fingerprint(expected.config)
-            if same_posterior and found.record.sha256 == problem.record.sha256:
+            if same_posterior and found.digests == problem.digests:
                 return existing
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version

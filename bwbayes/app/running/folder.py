@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -227,9 +227,9 @@ class CampaignFolder(Folder):
     """The files of one campaign: a run's folder for each record, and what is finished.
 
     ``records/NAME/`` is the run of the record ``NAME.csv`` (or another suffix), as ``bwbayes run``
-    leaves it, with the digests of the record's file and of the run's summary in ``ended.json`` once
-    it came to its end. So a record that was changed is fitted again, and a run that was resumed by
-    itself is looked at again.
+    leaves it, with the digests of the record's file, of those that the config predicts and of the
+    run's summary in ``ended.json`` once it came to its end. So a record that was changed, or what
+    it is validated on, is fitted again, and a run that was resumed by itself is looked at again.
     """
 
     KIND: ClassVar[str] = "campaign"
@@ -283,11 +283,23 @@ class CampaignFolder(Folder):
                 "`overwrite=True`"
             ) from None
 
+    def digests(self, file: Path) -> dict[str, str]:
+        """Return the SHA-256 of a record's file, and of all files that the config predicts."""
+        from bwbayes.app.config.config import parse
+
+        files = {"record": file}
+        if text := self.config.read_text(encoding="utf-8"):
+            where = Path(self.origin().where)
+            for name, validation in parse(text, str(self.config)).validation.items():
+                if validation.file is not None:
+                    files[f"validation.{name}"] = where / validation.file
+        return {name: sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+
     def is_done(self, file: Path) -> bool:
-        """Tell whether a record's run has ended, and is about the file as it is now."""
+        """Tell whether a record's run has ended, and is about the files as they are now."""
         run = self.run(file.stem)
         try:
-            return (run / ENDED).read_text(encoding="utf-8") == ended(digest(file), run)
+            return (run / ENDED).read_text(encoding="utf-8") == ended(self.digests(file), run)
         except (OSError, UnicodeError):
             return False
 
@@ -296,11 +308,7 @@ class CampaignFolder(Folder):
 ENDED = "ended.json"
 
 
-def digest(file: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return sha256(file.read_bytes()).hexdigest()
-
-
-def ended(record: str, run: Path) -> str:
-    """Return what the folder of a run that ended says: digests of its record and summary, JSON."""
-    return json.dumps({"record": record, "summary": digest(run / "summary.json")})
+def ended(digests: Mapping[str, str], run: Path) -> str:
+    """Return what the folder of a run that ended says: digests of its files and summary, JSON."""
+    summary = sha256((run / "summary.json").read_bytes()).hexdigest()
+    return json.dumps({**digests, "summary": summary})
