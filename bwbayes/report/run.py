@@ -40,6 +40,13 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     Of its ``numbers`` the ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` are shown if they
     are there, and without convergence ``go_on``, the command that goes on.
     """
+    if result.verdicts and all(verdict.training for verdict in result.verdicts.values()):
+        nothing = (
+            "no readings are held out: the bands are validated on the training readings alone. "
+            "Fix: leave a window out of train, and write it under [validation.held_out], as "
+            "`bwbayes init` does"
+        )
+        result = replace(result, remarks=(nothing, *result.remarks))
     pictures, check = all_pictures(result), result.outcome.check
     if result.outcome.converged:
         note = (

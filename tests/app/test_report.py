@@ -18,7 +18,9 @@ from bwbayes.diagnosis.validation import Verdict
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.figures import interactive
+from bwbayes.report.report import as_text
 from bwbayes.report.result import Result, summary
+from bwbayes.report.run import run_report
 from bwbayes.report.words import digits, symbol
 from tests.app import example
 
@@ -95,6 +97,18 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     assert {"held-out (held out)": "failed", "training": "passed"} == statuses
     for kind, status in (("bad", "failed"), ("good", "passed")):
         assert f'<span class="mark {kind}">{status}</span>' in text
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_a_run_that_holds_nothing_out_says_so_on_page_and_screen(held_out: bool) -> None:
+    """With what to write; a run that holds readings out says nothing of it."""
+    verdicts = {"training": Verdict("training", True, True)}
+    if held_out:
+        verdicts["held-out"] = Verdict("held-out", False, True)
+    run = dataclasses.replace(example.run(), verdicts=verdicts)
+    for text in (page(run), as_text(run_report(run, {}), 400)):
+        assert held_out == ("no readings are held out: the bands are validated on" not in text)
+        assert held_out == ("under [validation.held_out]" not in text)
 
 
 @pytest.mark.parametrize("value", [1.0, np.nan])
