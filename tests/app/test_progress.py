@@ -1,16 +1,22 @@
-"""The line that a person watches: its ETA counts down."""
+"""The line that a person watches: its ETA counts down, and it is there whatever takes its time."""
 
 from __future__ import annotations
 
+import re
+import time
 from io import StringIO
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.running.progress import Progress, StepProgress
+from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.plan import SamplingPlan
+from tests.app import small
+from tests.app.conftest import Type
 
 
 class Watched:
@@ -79,3 +85,92 @@ def test_each_step_after_the_sampling_counts_down_by_itself(
         "explanations 0%   ETA unknown",
         "explanations 50%   ETA 1:30",
     ] == console.export_text().splitlines()
+
+
+# Where nothing else is new, a terminal says for how long
+
+
+def test_a_terminal_says_for_how_long_a_step_takes_by_itself() -> None:
+    """Once a second brings nothing new, and not before; a moment later the line is gone."""
+    screen = StringIO()
+    console = Console(force_terminal=True, width=100, file=screen)
+    with ProgressLine(console, "judging ring ..."):
+        time.sleep(2.4)
+    shown = re.findall(r"judging ring \.\.\.(?: *elapsed (\d:\d\d))?", screen.getvalue())
+    assert ["", "0:01", "0:02"] == list(dict.fromkeys(shown))
+    assert screen.getvalue().rstrip().endswith("\x1b[2K")
+
+
+@pytest.mark.parametrize("seconds", [0.5, 30.0])
+def test_what_says_more_than_how_long_says_that_alone(
+    monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    line = ProgressLine(Console(force_terminal=True, file=StringIO()), "judging ...")
+    now[0] += 10
+    line.show("judging 10%   ETA 1:30")
+    now[0] += seconds
+    elapsed = "   elapsed 0:40" if seconds > 1 else ""
+    assert f"judging 10%   ETA 1:30{elapsed}" == line.get_renderable().plain
+
+
+def test_a_log_has_each_step_once() -> None:
+    log = StringIO()
+    console = Console(width=100, file=log)
+    with ProgressLine(console, "judging ring ..."):
+        time.sleep(1.2)
+    assert "judging ring ...\n" == log.getvalue()
+
+
+def test_of_many_calls_a_terminal_says_how_many_before_the_first_is_done() -> None:
+    screen = StringIO()
+    console = Console(force_terminal=True, width=100, file=screen)
+    options: dict[str, Any] = {
+        "kind": "models judged",
+        "done": 0,
+        "short": {},
+        "workers": 1,
+        "executor": "threads",
+    }
+    for _ in batch(time.sleep, [(0.6,)], lambda _: "", console=console, **options):
+        pass
+    assert "models judged 0 of 1   ETA unknown" in screen.getvalue()
+
+
+COMMANDS = {
+    "simulate": ("new.csv", "--rate", "50", "--signal", "step50"),
+    "init": ("record.csv",),
+    "check": ("small.toml",),
+    "report": ("copy",),
+    "predict": ("copy", "--signal", "step50", "--from-rest"),
+    "compensate": ("copy", "sine", "--amplitude", "20", "--frequency", "1", "--from-rest"),
+    "design": ("copy", "--parameter", "d"),
+    "track": ("copy", "--frequency", "2", "--draws", "5"),
+    "export": ("copy",),
+}
+
+
+@pytest.mark.usefixtures("copy", "_without_pictures")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
+    bwbayes: Type, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Elsewhere, and if it is to be quiet, there is none."""
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    rows = [f"{i / 100},{5 * (i % 7)},{2 * (i % 7)}" for i in range(60)]
+    (tmp_path / "record.csv").write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]))
+    silent = bwbayes(command, *COMMANDS[command])
+    assert f"{command} ..." not in silent.err
+    (tmp_path / "record.toml").unlink(missing_ok=True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
+    said = bwbayes(command, *COMMANDS[command], *again(command))
+    assert said.status == silent.status
+    assert f"{command} ..." in said.err
+    if command in ("compensate", "design", "track"):
+        assert "" == bwbayes(command, *COMMANDS[command], *again(command), "--quiet").err
+
+
+def again(command: str) -> tuple[str, ...]:
+    """Return what a command needs to write its files again."""
+    return () if command in ("init", "check", "report") else ("--overwrite",)

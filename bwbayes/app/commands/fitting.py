@@ -18,6 +18,7 @@ from bwbayes.app.commands.shared import (
     quiet_option,
     seed_option,
     show_report,
+    working,
 )
 from bwbayes.app.running.figure_worker import artist_of
 from bwbayes.errors import ColumnsError, InputError, NoNumbersError, refuse_unwritable
@@ -56,11 +57,13 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
-    from bwbayes.app.jobs.check import check as check_config
-
     chosen, _ = _config_or_proposal(config, record, naming, "check", quiet=True)
     out = out or Path("results") / f"{config.stem}-check"
-    show_report(check_config(chosen, config.parent, out))
+    with working():
+        from bwbayes.app.jobs.check import check as check_config
+
+        checked = check_config(chosen, config.parent, out)
+    show_report(checked)
     click.echo(f"report: {out / 'check.html'}")
     return 0
 
@@ -93,11 +96,12 @@ def run(
     """
     # First of all: it loads what draws while this process loads what samples.
     with artist_of(workers) as artist:
-        from bwbayes.app.problem.problem import resolve
-        from bwbayes.app.running.explaining import improve_model
-        from bwbayes.app.running.folder import RunFolder
-        from bwbayes.report.report import Report, remarks_banner
-        from bwbayes.report.tables import priors_table
+        with working():
+            from bwbayes.app.problem.problem import resolve
+            from bwbayes.app.running.explaining import improve_model
+            from bwbayes.app.running.folder import RunFolder
+            from bwbayes.report.report import Report, remarks_banner
+            from bwbayes.report.tables import priors_table
 
         chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
         chosen = chosen.renamed(config.stem, seed)
@@ -105,11 +109,13 @@ def run(
         if improve:
             RunFolder.require_free(path, overwrite)
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
-        folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
-        problem = folder.problem()
+        with working():
+            folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
+            problem = folder.problem()
+            remarks = problem.remarks
         if not quiet:
             # Of a record alone the remarks are shown already.
-            banners = [] if is_proposal else remarks_banner(problem.remarks)
+            banners = [] if is_proposal else remarks_banner(remarks)
             priors = priors_table(problem.posterior.prior)
             show_report(Report(title="priors", banners=banners, blocks=[priors]))
         options = {"workers": workers, "executor": executor, "artist": artist}
@@ -136,10 +142,11 @@ def report(folder: Path) -> int:
 
     Example: bwbayes report results/ring_bender
     """
-    from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.run import redraw
+    with working():
+        from bwbayes.app.running.folder import RunFolder
+        from bwbayes.app.running.run import redraw
 
-    redraw(RunFolder.open(folder))
+        redraw(RunFolder.open(folder))
     click.echo(f"wrote {folder / 'report.html'}")
     return 0
 
@@ -188,11 +195,12 @@ def _config_or_proposal(
 
 def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
-    from bwbayes.app.config.proposal import propose
-    from bwbayes.record.io.columns import Naming
-
     try:
-        return propose(path, where, Naming(**naming))
+        with working():
+            from bwbayes.app.config.proposal import propose
+            from bwbayes.record.io.columns import Naming
+
+            return propose(path, where, Naming(**naming))
     except ColumnsError as error:
         raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
 

@@ -26,6 +26,7 @@ from bwbayes.app.config import LARGEST_SEED
 from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
+    from bwbayes.app.running.progress import ProgressLine
     from bwbayes.diagnosis.validation import Standing
     from bwbayes.report.report import Report
 
@@ -178,6 +179,16 @@ def show_report(report: Report) -> None:
     from bwbayes.report.report import show
 
     show(report, Console())
+
+
+def working() -> ProgressLine:
+    """Return a line that says on a terminal which command is at work, and for how long."""
+    # Here, because it is slow to load.
+    from bwbayes.app.running.progress import ProgressLine
+
+    context, console = click.get_current_context(), Console(stderr=True)
+    console.quiet = context.params.get("quiet", False) or not console.is_terminal
+    return ProgressLine(console, f"{context.info_name} ...")
 
 
 @contextmanager

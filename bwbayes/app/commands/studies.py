@@ -18,6 +18,7 @@ from bwbayes.app.commands.shared import (
     resumable,
     seed_option,
     show_report,
+    working,
 )
 from bwbayes.app.config import USUAL_MODELS
 from bwbayes.errors import ExitStatus
@@ -31,9 +32,11 @@ def simulate(out: Path, **options: Any) -> int:
 
     Example: bwbayes simulate ring.csv --signal verification --seed 7
     """
-    from bwbayes.app.jobs.simulate import simulate as write
+    with working():
+        from bwbayes.app.jobs.simulate import simulate as write
 
-    for path in write(out, **options):
+        files = write(out, **options)
+    for path in files:
         click.echo(f"wrote {path}")
     return 0
 

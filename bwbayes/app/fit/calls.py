@@ -164,10 +164,12 @@ def compare(
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.jobs import compare as job
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
+    from bwbayes.app.running.progress import ProgressLine
     from bwbayes.record import Record
     from bwbayes.report.outputs import refuse_existing
 
     path, scratch = folder_or_scratch(folder, "comparison")
+    console = console_of(progress)
     refuse_existing([path / "comparison.json"], overwrite=overwrite)
     compared_runs = runs[0] if len(runs) == 1 else list(runs)
     listed = compared_runs if isinstance(compared_runs, list | tuple) else [compared_runs]
@@ -180,9 +182,7 @@ def compare(
         if len(listed) < 2:
             raise InputError("compare: one fit alone; give two or more, or a record")
         fits = job.fits_of(listed)
-        comparison = job.compare(
-            fits, console_of(progress), future=future, workers=workers, executor=executor
-        )
+        comparison = job.compare(fits, console, future=future, workers=workers, executor=executor)
     else:
         where, records = Path(), dict[str, Record]()
         if isinstance(compared_runs, str | Path) and is_config(Path(compared_runs)):
@@ -198,7 +198,7 @@ def compare(
             where,
             models_of(text, config.model),
             path,
-            console_of(progress),
+            console,
             in_memory=records,
             overwrite=overwrite,
             screen=screen,
@@ -208,7 +208,8 @@ def compare(
             executor=executor,
         )
     if scratch is None:
-        comparison.save(path, overwrite=True)
+        with ProgressLine(console, "writing the comparison ..."):
+            comparison.save(path, overwrite=True)
     return comparison
 
 

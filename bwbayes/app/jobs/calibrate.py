@@ -27,7 +27,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import batch
+from bwbayes.app.running.progress import ProgressLine, batch
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
 from bwbayes.calibration.records import OtherRecord
@@ -133,26 +133,26 @@ def resume(
         ):
             entries[result.entry["number"]] = result.entry
             _append(folder, json.dumps(result.entry))
-        console.print("judging and drawing ...", highlight=False)
-        ordered = [entries[number] for number in sorted(entries)]
-        plan, packages = problem.plan, versions(problem.posterior.engine)
-        calibration = replace(
-            judge(ordered, generator(seed, "ranks")),
-            name=problem.config.name or "calibration",
-            parameters=problem.parameters,
-            facts=[
-                *problem.facts.items(),
-                ("held out", ", ".join(problem.validations) or "nothing"),
-                (
-                    "sampling",
-                    f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS {plan.ess:g}, "
-                    f"at most {plan.most_steps} steps",
-                ),
-            ],
-            provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
-        )
-        # Nothing in its files depends on when or how it was computed.
-        save(calibration_report(calibration), folder.path, "calibration", pictures="figures")
+        with ProgressLine(console, "judging and drawing ..."):
+            ordered = [entries[number] for number in sorted(entries)]
+            plan, packages = problem.plan, versions(problem.posterior.engine)
+            calibration = replace(
+                judge(ordered, generator(seed, "ranks")),
+                name=problem.config.name or "calibration",
+                parameters=problem.parameters,
+                facts=[
+                    *problem.facts.items(),
+                    ("held out", ", ".join(problem.validations) or "nothing"),
+                    (
+                        "sampling",
+                        f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS "
+                        f"{plan.ess:g}, at most {plan.most_steps} steps",
+                    ),
+                ],
+                provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
+            )
+            # Nothing in its files depends on when or how it was computed.
+            save(calibration_report(calibration), folder.path, "calibration", pictures="figures")
     return calibration
 
 

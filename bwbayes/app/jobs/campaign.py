@@ -26,7 +26,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
-from bwbayes.app.running.progress import batch
+from bwbayes.app.running.progress import ProgressLine, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
 from bwbayes.errors import InputError, InputWarning, one_line
@@ -123,10 +123,10 @@ def resume(
         ):
             if outcome.refused:
                 refused[outcome.file.name] = outcome.short
-        console.print("combining the records ...", highlight=False)
-        campaign = Campaign.of(folder, files, refused)
-        # Nothing in its files depends on when or how it was computed.
-        save(campaign.report(), folder.path, "campaign", pictures="figures")
+        with ProgressLine(console, "combining the records ..."):
+            campaign = Campaign.of(folder, files, refused)
+            # Nothing in its files depends on when or how it was computed.
+            save(campaign.report(), folder.path, "campaign", pictures="figures")
     return campaign
 
 

@@ -28,9 +28,9 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
+from bwbayes.app.running.progress import ProgressLine, batch
 from bwbayes.app.running.run import begin, resume
-from bwbayes.app.running.workers import one_thread, open_executor, side_by_side
-from bwbayes.calibration.replicates import as_done
+from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import evidence, screening_evidence
@@ -89,8 +89,11 @@ def compare(
         _require_same(f"compare: {first} and {name}", fits[first].problem, fits[name].problem)
     candidates = []
     for name, fit in fits.items():
-        console.print(f"judging {name} ...", highlight=False)
-        with one_thread(), open_executor(workers, fit.problem.posterior.engine, executor) as pool:
+        with (
+            ProgressLine(console, f"judging {name} ..."),
+            one_thread(),
+            open_executor(workers, fit.problem.posterior.engine, executor) as pool,
+        ):
             candidate = _candidate(name, fit, pool, future=future)
         standing = fit.standing if fit.converged else None
         candidates.append(replace(candidate, standing=standing))
@@ -126,30 +129,37 @@ def compare_models(
     Raises InputError: the config, its records or a folder cannot be used, or a folder has another
     run.
     """
-    _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
     folders: dict[str, RunFolder] = {}
-    for name, model in models.items():
-        named = config.model_copy(update={"name": name})
-        problem = resolve(with_model(named, model, [*wholes.values()]), where, in_memory)
-        folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
-        folders[name] = _folder(out / folder, problem, overwrite)
+    with ProgressLine(console, f"reading the records for {len(models)} models ..."):
+        _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
+        for name, model in models.items():
+            named = config.model_copy(update={"name": name})
+            problem = resolve(with_model(named, model, [*wholes.values()]), where, in_memory)
+            folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
+            folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
     with one_thread(), open_executor(count, executor=executor) as pool:
-        together = side_by_side(pool, workers, len(models))
-        console.print(f"screening {len(models)} models ...", highlight=False)
-        screened = as_done(pool, together, _screened, folders.items())
+        together: dict[str, Any] = {
+            "label": lambda _: "",
+            "console": console,
+            "done": 0,
+            "short": {},
+            "workers": workers,
+            "executor": pool,
+        }
+        screened = batch(_screened, [*folders.items()], kind="models screened", **together)
         candidates = {candidate.name: candidate for candidate in screened}
         criteria = {
             name: np.array([candidate.log_evidence, candidate.log_likelihood], dtype=np.float64)
             for name, candidate in candidates.items()
         }
         within_reach = np.max([*criteria.values()], axis=0) - reach
-        runs = (
+        runs = [
             (name, folders[name], future)
             for name, values in criteria.items()
             if not screen or folders[name].summary.is_file() or np.any(values >= within_reach)
-        )
-        for candidate in as_done(pool, together, _sampled, runs):
+        ]
+        for candidate in batch(_sampled, runs, kind="models sampled", **together):
             candidates[candidate.name] = candidate
             console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
         problem = next(iter(folders.values())).problem()
@@ -157,7 +167,8 @@ def compare_models(
         best = comparison.recommended
         if best is None or comparison[best].standing is not None:
             return comparison
-        standing = pool.submit(_standing, folders[best], files).result()
+        with ProgressLine(console, f"validating {best} ..."):
+            standing = pool.submit(_standing, folders[best], files).result()
     candidates[best] = replace(candidates[best], standing=standing)
     return _comparison(problem, [candidates[name] for name in folders])
 

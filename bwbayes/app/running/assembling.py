@@ -69,6 +69,7 @@ def assemble(
     bands = predictions(problem, flat, partial(watch, "predictions"))
     result = replace(result, bands=bands, steps=steps)
     artist.draw(result)
+    watch("loops", 0.0)
     best = flat[[int(np.argmax(result.log_density))]]
     series = {
         name: innovations.innovations(alone, theta[0], records[name].start)
@@ -111,6 +112,7 @@ def assemble(
         for name, texts in said.items():
             remarks += [f"{name}: {text}" if several else str(text) for text in texts]
     remarks += [f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes]
+    watch("posterior checks", 0.0)
     source = generator(seed, "checks")
     return replace(
         result,

@@ -22,6 +22,7 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
+from bwbayes.app.running.progress import ProgressLine
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.innovations import innovations
@@ -148,9 +149,9 @@ def improve_model(
     while True:
         problem = resolve(config, folder, records)
         (name,) = problem.records
-        console.print("searching for missing parts of the model ...", highlight=False)
-        point = _fit_point(problem)
-        found = explained(problem, name, point.optima, thorough=True)
+        with ProgressLine(console, "searching for missing parts of the model ..."):
+            point = _fit_point(problem)
+            found = explained(problem, name, point.optima, thorough=True)
         parts = likely_causes([cause for cause in found if cause.changes])
         if followed_causes(found) or not parts:
             break

@@ -1,7 +1,8 @@
-"""What a person sees while a run samples: how far, how fast, how long still, how well.
+"""What a person sees while something takes its time: what it is, how far, how long still, how well.
 
-On a terminal one line is kept up to date; elsewhere (a log file, a pipe) a line is printed now and
-then. Quiet means nothing at all. :func:`batch` makes many calls side by side, with such a line.
+On a terminal one line is kept up to date, which says for how long where nothing else is new;
+elsewhere (a log file, a pipe) a line is printed now and then. Quiet means nothing at all.
+:func:`batch` makes many calls side by side, with such a line.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from typing import Self
 
 import numpy as np
 from rich.console import Console
@@ -23,28 +25,45 @@ from bwbayes.sampling.plan import SamplingPlan
 
 
 class ProgressLine(Live):
-    """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere."""
+    """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere.
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console=console, transient=True, auto_refresh=console.is_terminal)
-        self.started_at = self.printed = time.monotonic()
+    It begins with the ``step`` that it is about, which is printed at once elsewhere. A terminal
+    says for how long it has been at it wherever a second brings nothing new.
+    """
+
+    def __init__(self, console: Console, step: str = "") -> None:
+        self.shown, self.step = step, step
+        self.started_at = self.printed = self.shown_at = time.monotonic()
+        redrawn = console.is_terminal and not console.quiet
+        super().__init__(console=console, transient=True, auto_refresh=redrawn)
+
+    def __enter__(self) -> Self:
+        """Begin with the step."""
+        if self.step and not self.console.is_terminal:
+            self.console.print(self.step, highlight=False, soft_wrap=True)
+        return super().__enter__()
 
     def show(self, line: str, *, printed: bool = True) -> None:
         """Show a line; without a terminal only if it may be ``printed`` and the time has come."""
         now = time.monotonic()
-        if self.console.is_terminal:
-            self.update(Text(line))
-        elif printed and now - self.printed >= 10.0:
+        self.shown, self.shown_at = line, now
+        if not self.console.is_terminal and printed and now - self.printed >= 10.0:
             self.printed = now
             self.console.print(line, highlight=False, soft_wrap=True)
+
+    def get_renderable(self) -> Text:
+        """Return the line as it is now."""
+        now = time.monotonic()
+        elapsed = f"   elapsed {_minutes(now - self.started_at)}"
+        return Text(self.shown + elapsed * bool(self.shown and now - self.shown_at >= 1.0))
 
 
 class StepProgress(ProgressLine):
     """Watches steps, one after the other, of which the share that is done is known."""
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console)
-        self.step, self.latest = "", self.started_at
+    def __init__(self, console: Console, step: str = "") -> None:
+        super().__init__(console, step)
+        self.latest = self.started_at
 
     def __call__(self, step: str, share: float) -> None:
         """Take note of how much of a step is done, from 0 to 1."""
@@ -61,6 +80,7 @@ class Progress(ProgressLine):
 
     def __init__(self, console: Console, plan: SamplingPlan) -> None:
         super().__init__(console)
+        self.shown = "sampling ..."
         self.plan = plan
         self.steps = 0.0  # of all ensembles together, since this was made
         self.check: Check | None = None
@@ -131,6 +151,7 @@ def batch[T](
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
     short = dict(short)
     with open_executor(count, executor=executor) as pool, ProgressLine(console) as line:
+        line.show(f"{kind} {done} of {total}   ETA unknown")
         together = side_by_side(pool, workers, len(arguments))
         for fresh, result in enumerate(as_done(pool, together, call, arguments), start=1):
             yield result

@@ -25,7 +25,7 @@ from bwbayes.app.running.explaining import find_map
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.progress import Progress, StepProgress
+from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine, choose
@@ -106,8 +106,7 @@ def resume(
             return fit
         result = known
         if result is None:
-            console.print("computing predictions ...", highlight=False)
-            with StepProgress(console) as watch:
+            with StepProgress(console, "computing predictions ...") as watch:
                 result = assemble(problem, chain, outcome, artist, watch)
         fit = fit.knowing(
             result=result, standing=result.standing, seconds=time.monotonic() - start_time
@@ -115,8 +114,8 @@ def resume(
         if answer is not None:
             answer(fit)
         if files and not folder.summary.exists():
-            console.print("writing figures and files ...", highlight=False)
-            write_files(fit, folder, artist)
+            with ProgressLine(console, "writing figures and files ..."):
+                write_files(fit, folder, artist)
     return fit
 
 
@@ -137,8 +136,8 @@ def _open_chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
-        console.print("computing the MAP estimate ...", highlight=False)
-        problem, point, why = find_map(problem)
+        with ProgressLine(console, "computing the MAP estimate ..."):
+            problem, point, why = find_map(problem)
         posterior, config = problem.posterior, problem.config
         if why:  # the noise was chosen
             console.print(why, highlight=False, soft_wrap=True)
