@@ -194,8 +194,9 @@ def test_a_record_whose_validation_file_was_changed_is_fitted_again(tmp_path: Pa
     first = folder.run("s000")
     assert folder.is_done(tmp_path / "records/s000.csv")
     before = json.loads((first / "summary.json").read_text())["validation"]["next"]
-    worse = record(0)
-    bw.write_record(replace(worse, displacement=1.2 * worse.displacement), tmp_path / "next.csv")
+    other = record(0)
+    assert other.displacement is not None
+    bw.write_record(replace(other, displacement=1.2 * other.displacement), tmp_path / "next.csv")
     assert not folder.is_done(tmp_path / "records/s000.csv")
     assert ended(folder).exit_status == 3
     after = json.loads((first / "summary.json").read_text())["validation"]["next"]

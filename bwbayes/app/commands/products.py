@@ -18,6 +18,7 @@ from bwbayes.app.commands.shared import (
     present,
     quiet_option,
     show_report,
+    working,
 )
 from bwbayes.errors import ColumnsError, InputError
 
@@ -37,9 +38,11 @@ def _saved(
 
     # What takes long is refused at once, and every single file when it is saved.
     refuse_existing([out / f"{job.__name__}.json"], overwrite=overwrite)
-    product = job(converged(folder), *arguments, **options)
-    files = product.save(out, overwrite=overwrite)
-    return present(product.report(), files, product.standing, quiet=quiet)
+    with working():
+        product = job(converged(folder), *arguments, **options)
+        files = product.save(out, overwrite=overwrite)
+        report = product.report()
+    return present(report, files, product.standing, quiet=quiet)
 
 
 @click.command()
@@ -63,15 +66,15 @@ def predict(
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
 
-    Beside the bands, their scores (JSON) and a figure. Exit status 3: validation failed on the
-    record; 5: it is inconclusive.
+    A record of the same columns as the run's is read as that was. Beside the bands, their scores
+    (JSON) and a figure. Exit status 3: validation failed on the record; 5: it is inconclusive.
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
     from bwbayes.app.fit.fitted import converged
     from bwbayes.app.jobs.predict import predict as predict_record
     from bwbayes.app.jobs.predict import write_prediction
-    from bwbayes.record import read_record
+    from bwbayes.record import Record, read_record
     from bwbayes.report.outputs import refuse_existing
     from bwbayes.report.report import Report, standing_banner
 
@@ -83,16 +86,19 @@ def predict(
     if table in files[1:]:
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
     refuse_existing(files, overwrite=overwrite)
-    fit = converged(folder)
-    try:
-        other = record and read_record(
-            record, need_displacement=False, columns=columns, units=units, fs=fs
-        )
-    except ColumnsError as error:
-        line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
-        raise error.in_command(line) from None
-    bands = predict_record(fit, other, name=name, own_offset=not same_offset, **options)
-    write_prediction(bands, files, fit.standing)
+    with working():
+        fit = converged(folder)
+        other: Record | Path | None = record
+        try:
+            if record and (columns or units or fs):
+                other = read_record(
+                    record, need_displacement=False, columns=columns, units=units, fs=fs
+                )
+            bands = predict_record(fit, other, name=name, own_offset=not same_offset, **options)
+        except ColumnsError as error:
+            line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
+            raise error.in_command(line) from None
+        write_prediction(bands, files, fit.standing)
     show_report(Report(title=name, banners=standing_banner(fit.standing)))
     # The worse of the two.
     own = bands.standing.holds is False or fit.standing.holds
@@ -177,7 +183,8 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
     from bwbayes.app.jobs.control import export as write
 
     out = out or folder / "export"
-    model = write(converged(folder), out, **options)
+    with working():
+        model = write(converged(folder), out, **options)
     for line in model.standing.said:
         click.echo(line, err=True)
     if model.without_inverse is not None:

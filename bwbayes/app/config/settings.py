@@ -125,6 +125,12 @@ class RecordConfig(_Source):
     """Times of single readings that are left out; a run with model.outliers writes them."""
     remarks: Texts | None = key(None, example='["my_record.csv:1: ignored columns: temperature_C"]')
     """What was noted when the record's files were read; a run writes it and shows it again."""
+    read_as: dict[str, dict[str, str] | list[str] | float | str] | None = key(
+        None, example='{ columns = { displacement = "U2" }, all_columns = ["t", "U1", "U2"] }'
+    )
+    """How the record's own file was read; a run writes it, and reads files of the same columns
+    alike.
+    """
     decimate: int = key(1, ge=1, example="5", called="thin downsample")
     """Of so many readings one is used."""
     train: Windows | None = key(

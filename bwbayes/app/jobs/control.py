@@ -20,6 +20,7 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.at_work import limits_of
+from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.exported import Exported, exported
@@ -35,6 +36,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thinned
+from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference
 from bwbayes.report.outputs import refuse_existing, write_summary
 
@@ -130,7 +132,8 @@ def compensate(
     shape = {"amplitude": amplitude, "frequency": frequency, "middle": middle, "periods": periods}
     options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
     options = {name: value for name, value in options.items() if value is not None}
-    desired = _reference(reference, problem.record.interval, options)
+    read_as = next(iter(problem.config.records.values())).read_as
+    desired = _reference(reference, problem.record.interval, options, read_as)
     alone = next(iter(problem.posterior.each(fit.flat_draws)))
     compensation = compensated(
         alone.posterior,
@@ -149,11 +152,13 @@ def compensate(
     return replace(compensation, remarks=remarks, standing=fit.standing)
 
 
-def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> Reference:
+def _reference(
+    requested: Any, interval: float, options: Mapping[str, Any], read_as: dict[str, Any] | None
+) -> Reference:
     """Return a reference: one that is made already, a shape, a file's, or displacements.
 
-    ``interval`` is that of samples where nothing says it, s. Refused are options that it cannot
-    have.
+    ``interval`` is that of samples where nothing says it, s; ``read_as`` how the record's file was
+    read. Refused are options that it cannot have.
     """
     shapes = ", ".join(SHAPES)
     if isinstance(requested, str) and requested in SHAPES:
@@ -176,7 +181,9 @@ def _reference(requested: Any, interval: float, options: Mapping[str, Any]) -> R
         if isinstance(requested, str) and not path.suffix and not path.exists():
             hint = suggestion(requested, SHAPES)
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
-        values, interval = read_reference(path)
+        alike = options_alike(path, read_as)
+        alike.pop("voltage_is", None)
+        values, interval = read_reference(path, Naming(**alike))
         return Reference(values, interval, path.stem, smoothed)
     try:
         values = np.asarray(requested, dtype=np.float64)

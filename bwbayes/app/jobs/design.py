@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -18,6 +19,7 @@ from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.jobs.at_work import limits_of
+from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
@@ -91,7 +93,8 @@ def design(
     if isinstance(target, str):
         quantity = parameter = target
     elif isinstance(target, Path):
-        quantity, drive = _drive(str(target), records[record].interval), str(target)
+        read_as = problem.config.records[record].read_as
+        quantity, drive = _drive(target, records[record].interval, read_as), str(target)
     else:
         quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
     promises = rank(
@@ -177,11 +180,11 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
     }
 
 
-def _drive(name: str, interval: float) -> FloatArray:
+def _drive(path: Path, interval: float, read_as: dict[str, Any] | None) -> FloatArray:
     """Return the voltage of a signal's name or of a record's file, at an interval."""
-    if name in signal_names():
-        return signal(name).sample(1 / interval)[1]
-    record = read_record(Path(name), need_displacement=False)
+    if str(path) in signal_names():
+        return signal(str(path)).sample(1 / interval)[1]
+    record = read_record(path, need_displacement=False, **options_alike(path, read_as))
     if np.isclose(record.interval, interval, rtol=1e-6):
         return record.voltage
     samples = np.arange(0.0, record.duration, interval) / record.interval

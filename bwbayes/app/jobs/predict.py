@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
 from bwbayes.diagnosis.validation import Standing
@@ -39,7 +40,8 @@ def predict(
     fit
         What is built on.
     record
-        The record or its file, at any sampling interval.
+        The record or its file, at any sampling interval. A file of the same columns as that of the
+        training record is read as that was.
     signal
         A signal to predict instead, by its name.
     name
@@ -97,7 +99,8 @@ def predict(
         record = Record(voltage, None, interval, origin=f"{signal} signal")
     elif not isinstance(record, Record):
         name = name or Path(str(record)).stem
-        record = read_record(str(record), need_displacement=False)
+        alike = options_alike(record or "", problem.config.records[of].read_as)
+        record = read_record(record or "", need_displacement=False, **alike)
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
     start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)

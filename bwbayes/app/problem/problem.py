@@ -21,6 +21,7 @@ from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ParameterConfig, RecordConfig
+from bwbayes.app.problem.alike import note
 from bwbayes.app.problem.parameters import (
     actuator_of,
     as_config,
@@ -255,7 +256,11 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     plan = _plan(config, posterior)
     truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth |= config.truth
-    explicit = _explicit(config, posterior, plan, truth, aside, list(dict.fromkeys(remarks)))
+    noted = {
+        name: source.read_as or (None if name in in_memory else note(source, folder))
+        for name, source in config.records.items()
+    }
+    explicit = _explicit(config, posterior, plan, truth, aside, noted, list(dict.fromkeys(remarks)))
     return Problem(explicit, fitted, posterior, plan, validations, defaults)
 
 
@@ -345,6 +350,7 @@ def _explicit(
     plan: SamplingPlan,
     truth: Mapping[str, float],
     outliers: Mapping[str, list[float] | None],
+    read_as: Mapping[str, dict[str, Any] | None],
     remarks: list[str],
 ) -> Config:
     """Return the config in explicit numbers and words, with records as files beside it."""
@@ -355,6 +361,7 @@ def _explicit(
             train=source.train,
             from_rest=source.from_rest,
             outliers=outliers[name],
+            read_as=read_as[name],
             # Said while all were read: the first has them.
             remarks=remarks or None if name == first else None,
         )

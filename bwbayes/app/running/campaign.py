@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from bwbayes.app.fit.fitted import Fit, finished
+from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
@@ -225,7 +226,8 @@ class Campaign(Product):
         first = self.fit(self.population.names[0])
         problem = first.problem
         if not isinstance(record, Record):
-            record = read_record(record, need_displacement=False)
+            alike = options_alike(record, next(iter(problem.config.records.values())).read_as)
+            record = read_record(record, need_displacement=False, **alike)
         source = generator(problem.config.seed, "next specimen")
         draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
         start, like = Start(from_rest, True, lead_in), next(iter(problem.records))

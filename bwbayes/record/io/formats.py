@@ -26,7 +26,7 @@ from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields,
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.record.io.series import array_source, damaged
+from bwbayes.record.io.series import Source, array_source, damaged
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
 
@@ -100,18 +100,18 @@ def read_record(
     return replace(record, truth=truth.displacement)
 
 
-def read_reference(path: str | Path) -> tuple[FloatArray, float]:
+def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[FloatArray, float]:
     """Read what a displacement is to be: its samples, um, and their interval, s.
 
-    The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes;
-    a voltage in it does not count.
+    The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes,
+    or as the ``naming`` says; a voltage in it does not count.
 
     Raises
     ------
     InputError
         For every problem, in one line, as of :func:`read_record`.
     """
-    return reference_fields(read_table(Path(path), Naming(), ("time", "displacement")))
+    return reference_fields(read_table(Path(path), naming or Naming(), ("time", "displacement")))
 
 
 def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
@@ -121,6 +121,17 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
     ------
     InputError
         The file cannot be read, or a column that is needed is not known.
+    """
+    return select(read_source(path), naming, needed)
+
+
+def read_source(path: Path) -> Source:
+    """Return what a file holds, whatever it is.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a directory; give the file in it")
@@ -137,22 +148,20 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
         raise InputError(f"{path}: a workbook or an archive; export it as CSV")
     try:
         if h5py.is_hdf5(path):
-            source = read_hdf5(path)
-        elif begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
-            source = read_mat(path)
-        elif begin.startswith(b"TDSm"):
-            source = read_tdms(path)
-        elif path.suffix.lower() in _BINARY:
+            return read_hdf5(path)
+        if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
+            return read_mat(path)
+        if begin.startswith(b"TDSm"):
+            return read_tdms(path)
+        if path.suffix.lower() in _BINARY:
             raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
-        else:
-            from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+        from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
 
-            source = read_text(path)
+        return read_text(path)
     except InputError:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
-    return select(source, naming, needed)
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:

@@ -1,0 +1,63 @@
+"""A file beside a run, read as the run's record was: the same columns, in the same units.
+
+A run stores its record under the package's own names. What was said of the columns of the file that
+it came from is noted, with the names of all of them: a file that has no others is of the same kind.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+from bwbayes.app.config.settings import RecordConfig
+from bwbayes.errors import InputWarning
+from bwbayes.record.io.formats import read_source
+from bwbayes.record.io.series import Series
+
+
+def note(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
+    """Return what to note of how a record's file, relative to ``folder``, was read, if anything.
+
+    Raises InputError: the file cannot be read.
+    """
+    stated = {
+        key: getattr(source, key)
+        for key in ("columns", "units", "fs", "voltage_is")
+        if getattr(source, key) is not None
+    }
+    if not stated or source.file is None:
+        return None
+    series = _series(folder / source.file)
+    names = [item.name for item in series]
+    labels = {item.label: item.name for item in series}
+    columns = {}
+    for quantity, column in (source.columns or {}).items():
+        word = column.strip()
+        by_number = word not in (*names, *labels) and word.isdecimal()
+        columns[quantity] = names[int(word) - 1] if by_number else labels.get(word, word)
+    return {**stated, "columns": columns, "all_columns": names}
+
+
+def options_alike(path: str | Path, noted: dict[str, Any] | None) -> dict[str, Any]:
+    """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.
+
+    None of one that has other columns than the record had. It may lack some, as a planned voltage
+    lacks the displacement.
+
+    Raises InputError: the file cannot be read.
+    """
+    if noted is None:
+        return {}
+    names = {item.name for item in _series(Path(path))}
+    if not names <= {*noted.get("all_columns", ())}:
+        return {}
+    columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
+    options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
+    return options | {"columns": columns}
+
+
+def _series(path: Path) -> tuple[Series, ...]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # said where the record is read
+        return read_source(path).series

@@ -1,0 +1,191 @@
+"""A file beside a run is read as the run's record was, if it has the same columns."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+import bwbayes as bw
+from bwbayes.app.config.config import dump, load, parse
+from bwbayes.app.config.settings import RecordConfig
+from bwbayes.app.problem.alike import note, options_alike
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.record import Record, read_record, write_record
+from tests.app.conftest import Type
+
+QUANTITIES = ("time", "voltage", "displacement")
+# What people call columns; none of them can be taken for a displacement.
+NAMES = ["a", "b", "U2", "ch 3", "ch 4", "t", "T1", "time_s", "voltage_mV"]
+SAMPLES = 12
+
+
+def written(path: Path, names: list[str], quantities: list[str], scale: float) -> None:
+    """Write a file with a column for each of the quantities; others are noise."""
+    steps = np.arange(SAMPLES)
+    series = {"time": steps, "voltage": np.sin(steps), "displacement": scale * np.cos(steps)}
+    columns = [series.get(quantity, 7.0 + 0.1 * steps**2) for quantity in quantities]
+    np.savetxt(path, np.transpose(columns), delimiter=",", header=",".join(names), comments="")
+
+
+@st.composite
+def kinds(draw: st.DrawFn) -> tuple[list[str], list[str], RecordConfig]:
+    """Draw a header, the quantities below it, and what a config says of them."""
+    quantities = draw(st.permutations([*QUANTITIES, *draw(st.lists(st.just(""), max_size=2))]))
+    count = len(quantities)
+    names = draw(st.lists(st.sampled_from(NAMES), min_size=count, max_size=count, unique=True))
+    by_number = draw(st.booleans())
+    where = {q: quantities.index(q) for q in QUANTITIES}
+    columns = {q: str(i + 1) if by_number else names[i] for q, i in where.items()}
+    keys: dict[str, Any] = {
+        "units": {
+            "time": "ms",
+            "voltage": "V",
+            "displacement": draw(st.sampled_from(["nm", "-um"])),
+        },
+        "voltage_is": draw(st.sampled_from([None, "command"])),
+    }
+    if draw(st.booleans()):
+        del columns["time"]
+        keys["fs"] = 50.0
+    return names, quantities, RecordConfig(file="first.csv", columns=columns, **keys)
+
+
+def readable(path: Path, **options: Any) -> Record:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", bw.InputWarning)  # ignored columns
+        return read_record(path, need_displacement=False, **options)
+
+
+@given(kinds(), st.booleans())
+def test_a_second_file_of_the_same_columns_is_read_as_the_first(
+    kind: tuple[list[str], list[str], RecordConfig], planned: bool
+) -> None:
+    """Also a planned voltage, whose file lacks what was measured."""
+    names, quantities, source = kind
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
+        written(folder / "first.csv", names, quantities, 1.0)
+        noted = note(source, folder)
+        kept = [i for i, q in enumerate(quantities) if q in ("time", "voltage") or not planned]
+        second = folder / "second.csv"
+        written(second, [names[i] for i in kept], [quantities[i] for i in kept], 3.0)
+        record = readable(second, **options_alike(second, noted))
+        whole = folder / "whole.csv"
+        written(whole, names, quantities, 3.0)
+        expected = readable(
+            whole,
+            columns=source.columns,
+            units=source.units,
+            fs=source.fs,
+            voltage_is=source.voltage_is,
+        )
+    np.testing.assert_array_equal(expected.voltage, record.voltage)
+    assert (expected.interval, expected.voltage_is) == (record.interval, record.voltage_is)
+    if planned:
+        assert record.displacement is None
+    else:
+        np.testing.assert_array_equal(expected.displacement, record.displacement)
+
+
+@given(kinds())
+def test_a_file_of_other_columns_is_read_by_itself(
+    kind: tuple[list[str], list[str], RecordConfig],
+) -> None:
+    """Whatever numbers and units the config gave; as is one of a run that noted nothing."""
+    names, quantities, source = kind
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
+        written(folder / "first.csv", names, quantities, 1.0)
+        second = folder / "second.csv"
+        written(second, ["time_s", "voltage_V", "displacement_um"], [*QUANTITIES], 3.0)
+        assert {} == options_alike(second, note(source, folder))
+        assert {} == options_alike(second, None)
+        assert note(RecordConfig(file="first.csv"), folder) is None
+
+
+def test_a_run_keeps_how_its_record_was_read(tmp_path: Path) -> None:
+    """Through its folder, where the record has the package's own columns."""
+    written(tmp_path / "first.csv", ["a", "b", "c"], [*QUANTITIES], 1.0)
+    text = """\
+[record]
+file = "first.csv"
+columns = { time = "a", voltage = "2", displacement = "c" }
+units = { time = "ms", voltage = "V", displacement = "nm" }
+[model]
+noise = "white"
+"""
+    folder = RunFolder.create(tmp_path / "run", resolve(parse(text, "text"), tmp_path))
+    problem = folder.problem()
+    assert {
+        "columns": {"time": "a", "voltage": "b", "displacement": "c"},
+        "units": {"time": "ms", "voltage": "V", "displacement": "nm"},
+        "all_columns": ["a", "b", "c"],
+    } == problem.config.records["record"].read_as
+    assert problem.config == resolve(problem.config, folder.path).config
+
+
+@pytest.fixture
+def renamed(copy: RunFolder, tmp_path: Path) -> Path:
+    """Return a file of the columns of a run's record, which a run can be told of alone."""
+    config = load(copy.config)
+    noted = {
+        "columns": {"time": "a", "voltage": "b", "displacement": "c"},
+        "units": {"time": "s", "voltage": "V", "displacement": "nm"},
+        "voltage_is": "command",
+        "all_columns": ["a", "b", "c"],
+    }
+    record = config.records["record"].model_copy(update={"read_as": noted})
+    copy.config.write_text(dump(config.model_copy(update={"record": record})))
+    other = read_record(copy.path / "records/sine.h5")
+    assert other.displacement is not None
+    columns = [other.time, other.voltage, 1000 * other.displacement]
+    np.savetxt(
+        tmp_path / "next.csv", np.transpose(columns), delimiter=",", header="a,b,c", comments=""
+    )
+    write_record(other, tmp_path / "same.csv")
+    return tmp_path / "next.csv"
+
+
+def test_predict_validates_on_a_second_file_of_the_same_kind(
+    bwbayes: Type, copy: RunFolder, renamed: Path
+) -> None:
+    """To the numbers of the file that says its units itself."""
+    for name in ("next", "same"):
+        said = bwbayes("predict", copy.path, "--record", renamed.with_name(f"{name}.csv"))
+        assert (0, "") == (said.status, said.err)
+    first, second = (
+        json.loads((copy.path / f"predictions/{name}.json").read_text())["scores"]
+        for name in ("next", "same")
+    )
+    assert first["max_error_um"] == pytest.approx(second["max_error_um"], rel=1e-6)
+    # What is said of the file itself counts alone.
+    own = "--column", "time=a", "--column", "voltage=b", "--column", "displacement=c"
+    said = bwbayes("predict", copy.path, "--record", renamed, *own, "--out", "own.csv")
+    said.assert_refused("which unit has", "--unit displacement=um")
+
+
+def test_compensate_and_design_read_a_file_alike(
+    bwbayes: Type, copy: RunFolder, renamed: Path
+) -> None:
+    """A reference without a voltage, and a drive."""
+    times = np.arange(50) / 50
+    rows = np.stack([times, 20_000 * np.sin(np.pi * times) ** 2], axis=1)
+    reference = renamed.with_name("path.csv")
+    np.savetxt(reference, rows, delimiter=",", header="a,c", comments="")
+    fit = bw.open_run(copy.path)
+    with pytest.warns(bw.InputWarning, match="between samples"):
+        compensation = fit.compensate(reference, from_rest=True)
+    assert np.max(
+        np.asarray(compensation.reference.displacement, dtype=np.float64)
+    ) == pytest.approx(20.0, rel=0.01)
+    said = bwbayes("design", copy.path, "--drive", renamed)
+    assert 0 == said.status, said.err
