@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -24,7 +24,8 @@ from bwbayes.errors import ColumnsError, InputError
 
 
 def _saved(
-    job: Callable[..., Any],
+    module: str,
+    name: str,
     folder: Path,
     out: Path,
     *arguments: Any,
@@ -33,12 +34,13 @@ def _saved(
     **options: Any,
 ) -> int:
     """Do a job with the run in a folder, save and show its product; return the exit status."""
-    from bwbayes.app.fit.fitted import converged
-    from bwbayes.report.outputs import refuse_existing
-
-    # What takes long is refused at once, and every single file when it is saved.
-    refuse_existing([out / f"{job.__name__}.json"], overwrite=overwrite)
     with working():
+        from bwbayes.app.fit.fitted import converged
+        from bwbayes.report.outputs import refuse_existing
+
+        # What takes long is refused at once, and every single file when it is saved.
+        refuse_existing([out / f"{name}.json"], overwrite=overwrite)
+        job = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
         product = job(converged(folder), *arguments, **options)
         files = product.save(out, overwrite=overwrite)
         report = product.report()
@@ -71,13 +73,6 @@ def predict(
 
     Example: bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
-    from bwbayes.app.fit.fitted import converged
-    from bwbayes.app.jobs.predict import predict as predict_record
-    from bwbayes.app.jobs.predict import write_prediction
-    from bwbayes.record import Record, read_record
-    from bwbayes.report.outputs import refuse_existing
-    from bwbayes.report.report import Report, standing_banner
-
     if (record is None) == (options["signal"] is None):
         raise InputError("predict: give either a record or a signal")
     name = options["signal"] if record is None else record.stem
@@ -85,12 +80,19 @@ def predict(
     files = [table, table.with_suffix(".json"), table.with_suffix(".png")]
     if table in files[1:]:
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
-    refuse_existing(files, overwrite=overwrite)
     with working():
+        from bwbayes.app.fit.fitted import converged
+        from bwbayes.app.jobs.predict import predict as predict_record
+        from bwbayes.app.jobs.predict import write_prediction
+        from bwbayes.record import Record, read_record
+        from bwbayes.report.outputs import refuse_existing
+        from bwbayes.report.report import Report, standing_banner
+
+        refuse_existing(files, overwrite=overwrite)
         fit = converged(folder)
         other: Record | Path | None = record
         try:
-            if record and (columns or units or fs):
+            if record and (columns or units or fs is not None):
                 other = read_record(
                     record, need_displacement=False, columns=columns, units=units, fs=fs
                 )
@@ -129,13 +131,11 @@ def compensate(
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    from bwbayes.app.jobs.control import compensate as invert
-
     requested = shape or reference
     if requested is None or (shape and reference):
         raise InputError("compensate: give either a shape or --reference")
     out = out or folder / "compensation" / Path(requested).stem
-    return _saved(invert, folder, out, requested, **options)
+    return _saved("control", "compensate", folder, out, requested, **options)
 
 
 @click.command()
@@ -158,12 +158,10 @@ def design(
 
     Example: bwbayes design results/ring_bender --parameter beta --slew 2000
     """
-    from bwbayes.app.jobs.design import design as rank
-
     target = parameter or drive
     if target is None or (parameter and drive):
         raise InputError("design: give either a parameter or a drive")
-    return _saved(rank, folder, out or folder / "design", target, **options)
+    return _saved("design", "design", folder, out or folder / "design", target, **options)
 
 
 @click.command()
@@ -178,12 +176,12 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 
     Example: bwbayes export results/ring_bender --rate 1000
     """
-    from bwbayes.app.fit.fitted import converged
-    from bwbayes.app.jobs.control import FILES
-    from bwbayes.app.jobs.control import export as write
-
     out = out or folder / "export"
     with working():
+        from bwbayes.app.fit.fitted import converged
+        from bwbayes.app.jobs.control import FILES
+        from bwbayes.app.jobs.control import export as write
+
         model = write(converged(folder), out, **options)
     for line in model.standing.said:
         click.echo(line, err=True)
@@ -210,6 +208,4 @@ def track(folder: Path, out: Path | None, **options: Any) -> int:
 
     Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
-    from bwbayes.app.jobs.control import track as simulate
-
-    return _saved(simulate, folder, out or folder / "track", **options)
+    return _saved("control", "track", folder, out or folder / "track", **options)

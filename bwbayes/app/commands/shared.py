@@ -186,9 +186,9 @@ def working() -> ProgressLine:
     # Here, because it is slow to load.
     from bwbayes.app.running.progress import ProgressLine
 
-    context, console = click.get_current_context(), Console(stderr=True)
-    console.quiet = context.params.get("quiet", False) or not console.is_terminal
-    return ProgressLine(console, f"{context.info_name} ...")
+    context = click.get_current_context()
+    console = Console(stderr=True, quiet=context.params.get("quiet", False))
+    return ProgressLine(console, f"{context.info_name} ...", announced=False)
 
 
 @contextmanager
@@ -230,10 +230,11 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
 
     ``options`` are those of :func:`~bwbayes.app.running.run.resume`.
     """
-    from bwbayes.app.running.folder import RunFolder
-    from bwbayes.app.running.run import resume
+    with working():
+        from bwbayes.app.running.folder import RunFolder
+        from bwbayes.app.running.run import resume
 
-    folder = RunFolder.open(path)
+        folder = RunFolder.open(path)
     with resumable(f"`bwbayes resume {path}`"):
         fit = resume(
             folder,

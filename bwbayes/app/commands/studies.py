@@ -67,10 +67,11 @@ def calibrate(
 
     Example: bwbayes calibrate runs/calibration.toml --replicates 500
     """
-    from bwbayes.app.config.config import load
-    from bwbayes.app.jobs.calibrate import resume, start
-    from bwbayes.app.running.folder import CalibrationFolder
-    from bwbayes.report.calibration import calibration_report
+    with working():
+        from bwbayes.app.config.config import load
+        from bwbayes.app.jobs.calibrate import resume, start
+        from bwbayes.app.running.folder import CalibrationFolder
+        from bwbayes.report.calibration import calibration_report
 
     new = {"out": out, "seed": seed, "overwrite": overwrite}
     require_new_or_resumed("calibrate", "a CONFIG or --resume FOLDER", config, resumed, new)
@@ -79,7 +80,8 @@ def calibrate(
     else:
         chosen = load(config).renamed(config.stem, seed)
         path = out or Path("results") / f"{config.stem}-calibration"
-        folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)
+        with working():
+            folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)
     with resumable(folder.resuming):
         console = Console(stderr=True, quiet=quiet)
         calibration = resume(folder, console, replicates=replicates, **options)
@@ -124,8 +126,9 @@ def campaign(
 
     Example: bwbayes campaign records/ --config my.toml --out results/batch
     """
-    from bwbayes.app.jobs.campaign import config_text, resume, start
-    from bwbayes.app.running.folder import CampaignFolder
+    with working():
+        from bwbayes.app.jobs.campaign import config_text, resume, start
+        from bwbayes.app.running.folder import CampaignFolder
 
     new = {"out": out, "config": config, "overwrite": overwrite, "pictures": no_pictures}
     require_new_or_resumed(
@@ -166,7 +169,9 @@ def compare(
 
     Example: bwbayes compare results/bender results/bender_plays
     """
-    from bwbayes.app.fit.calls import compare as compare_runs
+    with working():
+        import bwbayes.app.jobs.compare  # noqa: F401  # what takes long to load
+        from bwbayes.app.fit.calls import compare as compare_runs
 
     alone = len(paths) == 1 and not paths[0].is_dir()
     out = out or Path("results") / (f"{paths[0].stem}-comparison" if alone else "comparison")

@@ -181,7 +181,8 @@ def compare(
             raise InputError(f"compare: {name}: fits are compared as they are; leave it out")
         if len(listed) < 2:
             raise InputError("compare: one fit alone; give two or more, or a record")
-        fits = job.fits_of(listed)
+        with ProgressLine(console, "reading the runs ...", announced=False):
+            fits = job.fits_of(listed)
         comparison = job.compare(fits, console, future=future, workers=workers, executor=executor)
     else:
         where, records = Path(), dict[str, Record]()

@@ -95,9 +95,10 @@ def compare(
             open_executor(workers, fit.problem.posterior.engine, executor) as pool,
         ):
             candidate = _candidate(name, fit, pool, future=future)
-        standing = fit.standing if fit.converged else None
+            standing = fit.standing if fit.converged else None
         candidates.append(replace(candidate, standing=standing))
-    return _comparison(fits[first].problem, candidates)
+    with ProgressLine(console, "comparing ..."):
+        return _comparison(fits[first].problem, candidates)
 
 
 def compare_models(
@@ -130,7 +131,7 @@ def compare_models(
     run.
     """
     folders: dict[str, RunFolder] = {}
-    with ProgressLine(console, f"reading the records for {len(models)} models ..."):
+    with ProgressLine(console, f"reading records for {len(models)} models ...", announced=False):
         _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
         for name, model in models.items():
             named = config.model_copy(update={"name": name})
@@ -162,15 +163,16 @@ def compare_models(
         for candidate in batch(_sampled, runs, kind="models sampled", **together):
             candidates[candidate.name] = candidate
             console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
-        problem = next(iter(folders.values())).problem()
-        comparison = _comparison(problem, [candidates[name] for name in folders])
+        with ProgressLine(console, "comparing ..."):
+            problem = next(iter(folders.values())).problem()
+            comparison = _comparison(problem, [candidates[name] for name in folders])
         best = comparison.recommended
         if best is None or comparison[best].standing is not None:
             return comparison
         with ProgressLine(console, f"validating {best} ..."):
             standing = pool.submit(_standing, folders[best], files).result()
-    candidates[best] = replace(candidates[best], standing=standing)
-    return _comparison(problem, [candidates[name] for name in folders])
+            candidates[best] = replace(candidates[best], standing=standing)
+            return _comparison(problem, [candidates[name] for name in folders])
 
 
 def _require_same(pair: str, first: Problem, other: Problem) -> None:

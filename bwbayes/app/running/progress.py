@@ -27,19 +27,20 @@ from bwbayes.sampling.plan import SamplingPlan
 class ProgressLine(Live):
     """A line that is kept up to date on a terminal, and printed every ten seconds elsewhere.
 
-    It begins with the ``step`` that it is about, which is printed at once elsewhere. A terminal
-    says for how long it has been at it wherever a second brings nothing new.
+    It begins with the ``step`` that it is about, which is printed at once elsewhere if that is
+    ``announced``. A terminal says for how long it has been at it wherever a second brings nothing
+    new.
     """
 
-    def __init__(self, console: Console, step: str = "") -> None:
-        self.shown, self.step = step, step
+    def __init__(self, console: Console, step: str = "", *, announced: bool = True) -> None:
+        self.shown, self.step, self.announced = step, step, announced
         self.started_at = self.printed = self.shown_at = time.monotonic()
         redrawn = console.is_terminal and not console.quiet
         super().__init__(console=console, transient=True, auto_refresh=redrawn)
 
     def __enter__(self) -> Self:
         """Begin with the step."""
-        if self.step and not self.console.is_terminal:
+        if self.step and self.announced and not self.console.is_terminal:
             self.console.print(self.step, highlight=False, soft_wrap=True)
         return super().__enter__()
 
@@ -79,8 +80,7 @@ class Progress(ProgressLine):
     """Watches a sampling; use it as a context manager and as the sampler's watcher."""
 
     def __init__(self, console: Console, plan: SamplingPlan) -> None:
-        super().__init__(console)
-        self.shown = "sampling ..."
+        super().__init__(console, "sampling ...", announced=False)
         self.plan = plan
         self.steps = 0.0  # of all ensembles together, since this was made
         self.check: Check | None = None

@@ -85,7 +85,8 @@ def resume(
         with open_executor(workers, choose(sampling.engine), executor) as pool:
             if targets:
                 _rewrite(folder, config.model_copy(update={"sampling": sampling}))
-            problem = problem or folder.problem()
+            with ProgressLine(console, "reading the run ...", announced=False):
+                problem = problem or folder.problem()
             artist.rehearse(problem.posterior)
             problem, chain = _open_chain(folder, problem, console, engine)
             plan = problem.plan
