@@ -9,6 +9,8 @@ kept to one thread: more would only wait for each other, and could change the la
 
 from __future__ import annotations
 
+import atexit
+import gc
 import logging
 import multiprocessing
 import os
@@ -199,6 +201,8 @@ def _settle() -> None:
     import scipy.linalg  # noqa: F401, PLC0415
 
     one_thread()
+    # All that is left ends with the process: to look through it once more takes seconds.
+    atexit.register(gc.freeze)
     # The Ctrl-C that asks a run to stop in order must not kill its workers first.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
