@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +42,13 @@ def test_help_names_every_command(bwbayes: Type) -> None:
         assert (0, "") == (said.status, said.err)
         assert all(f"  {command} " in said.out for command in COMMANDS.split())
     assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", bwbayes("--version").out)
+
+
+def test_python_runs_the_package_as_the_command() -> None:
+    """Of the Python that is typed, whatever is first in the path."""
+    typed = [sys.executable, "-m", "bwbayes", "--version"]
+    done = subprocess.run(typed, capture_output=True, text=True, check=True)
+    assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", done.stdout)
 
 
 @pytest.mark.parametrize("command", ["models", "compare"])
