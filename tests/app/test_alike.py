@@ -173,6 +173,22 @@ def test_predict_validates_on_a_second_file_of_the_same_kind(
     said.assert_refused("which unit has", "--unit displacement=um")
 
 
+def test_predict_says_that_a_record_without_a_displacement_validates_nothing(
+    bwbayes: Type, copy: RunFolder, tmp_path: Path
+) -> None:
+    """As where nobody can tell which column it is; a signal has none."""
+    other = read_record(copy.path / "records/sine.h5")
+    columns = [other.time, other.voltage, 2 * other.voltage]
+    header = {"delimiter": ",", "header": "time_s,voltage_V,C", "comments": ""}
+    np.savetxt(tmp_path / "next.csv", np.transpose(columns), **header)
+    with pytest.warns(bw.InputWarning, match="ignored columns: C"):
+        said = bwbayes("predict", copy.path, "--record", "next.csv")
+    assert 0 == said.status
+    assert "note: next.csv: has no displacement that is recognized, so the bands" in said.out
+    signal = bwbayes("predict", copy.path, "--signal", "step50", "--from-rest")
+    assert "not validated" not in signal.out
+
+
 def test_compensate_and_design_read_a_file_alike(
     bwbayes: Type, copy: RunFolder, renamed: Path
 ) -> None:

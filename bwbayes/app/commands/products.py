@@ -86,7 +86,7 @@ def predict(
         from bwbayes.app.jobs.predict import write_prediction
         from bwbayes.record import Record, read_record
         from bwbayes.report.outputs import refuse_existing
-        from bwbayes.report.report import Report, standing_banner
+        from bwbayes.report.report import Report, remarks_banner, standing_banner
 
         refuse_existing(files, overwrite=overwrite)
         fit = converged(folder)
@@ -101,7 +101,14 @@ def predict(
             line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
             raise error.in_command(line) from None
         write_prediction(bands, files, fit.standing)
-    show_report(Report(title=name, banners=standing_banner(fit.standing)))
+    banners = standing_banner(fit.standing)
+    if record is not None and bands.measured is None:
+        unread = (
+            f"{record}: has no displacement that is recognized, so the bands are not validated; if "
+            "a column is one, say --column displacement=NAME"
+        )
+        banners += remarks_banner([unread])
+    show_report(Report(title=name, banners=banners))
     # The worse of the two.
     own = bands.standing.holds is False or fit.standing.holds
     worse = bands.standing if own else fit.standing
