@@ -123,6 +123,16 @@ def test_a_log_has_each_step_once() -> None:
     assert "judging ring ...\n" == log.getvalue()
 
 
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_others_print_goes_where_it_belongs(
+    capsys: pytest.CaptureFixture[str], quiet: bool
+) -> None:
+    """Whether the line is there or not; what is printed into a file does not go to the terminal."""
+    with ProgressLine(Console(force_terminal=True, quiet=quiet, file=StringIO()), "judging ..."):
+        print("printed")
+    assert "printed\n" == capsys.readouterr().out
+
+
 def test_of_many_calls_a_terminal_says_how_many_before_the_first_is_done() -> None:
     screen = StringIO()
     console = Console(force_terminal=True, width=100, file=screen)

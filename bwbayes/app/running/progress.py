@@ -8,6 +8,7 @@ elsewhere (a log file, a pipe) a line is printed now and then. Quiet means nothi
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -36,7 +37,14 @@ class ProgressLine(Live):
         self.shown, self.step, self.announced = step, step, announced
         self.started_at = self.printed = self.shown_at = time.monotonic()
         redrawn = console.is_terminal and not console.quiet
-        super().__init__(console=console, transient=True, auto_refresh=redrawn)
+        super().__init__(
+            console=console,
+            transient=True,
+            auto_refresh=redrawn,
+            # What others print stands above the line, but where there is none, and in a file.
+            redirect_stdout=redrawn and sys.stdout.isatty(),
+            redirect_stderr=redrawn,
+        )
 
     def __enter__(self) -> Self:
         """Begin with the step."""
