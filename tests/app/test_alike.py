@@ -16,7 +16,7 @@ from hypothesis import given
 import bwbayes as bw
 from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.alike import note, options_alike
+from bwbayes.app.problem.alike import options_alike, record_naming
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.record import Record, read_record, write_record
@@ -74,7 +74,7 @@ def test_a_second_file_of_the_same_columns_is_read_as_the_first(
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         written(folder / "first.csv", names, quantities, 1.0)
-        noted = note(source, folder)
+        noted = record_naming(source, folder)
         kept = [i for i, q in enumerate(quantities) if q in ("time", "voltage") or not planned]
         second = folder / "second.csv"
         written(second, [names[i] for i in kept], [quantities[i] for i in kept], 3.0)
@@ -107,9 +107,9 @@ def test_a_file_of_other_columns_is_read_by_itself(
         written(folder / "first.csv", names, quantities, 1.0)
         second = folder / "second.csv"
         written(second, ["time_s", "voltage_V", "displacement_um"], [*QUANTITIES], 3.0)
-        assert {} == options_alike(second, note(source, folder))
+        assert {} == options_alike(second, record_naming(source, folder))
         assert {} == options_alike(second, None)
-        assert note(RecordConfig(file="first.csv"), folder) is None
+        assert record_naming(RecordConfig(file="first.csv"), folder) is None
 
 
 def test_a_run_keeps_how_its_record_was_read(tmp_path: Path) -> None:

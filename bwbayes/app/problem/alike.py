@@ -16,7 +16,7 @@ from bwbayes.record.io.formats import read_source
 from bwbayes.record.io.series import Series
 
 
-def note(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
+def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     """Return what to note of how a record's file, relative to ``folder``, was read, if anything.
 
     Raises InputError: the file cannot be read.

@@ -21,7 +21,7 @@ from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ParameterConfig, RecordConfig
-from bwbayes.app.problem.alike import note
+from bwbayes.app.problem.alike import record_naming
 from bwbayes.app.problem.parameters import (
     actuator_of,
     as_config,
@@ -257,7 +257,7 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth |= config.truth
     noted = {
-        name: source.read_as or (None if name in in_memory else note(source, folder))
+        name: source.read_as or (None if name in in_memory else record_naming(source, folder))
         for name, source in config.records.items()
     }
     explicit = _explicit(config, posterior, plan, truth, aside, noted, list(dict.fromkeys(remarks)))
