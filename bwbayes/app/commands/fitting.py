@@ -132,6 +132,9 @@ def resume(folder: Path, quiet: bool, **options: Any) -> int:
     Example: bwbayes resume results/ring_bender --steps 40000
     """
     with artist_of(options["workers"]) as artist:
+        with working():
+            import bwbayes.app.running.run  # noqa: F401  # what takes long to load
+
         return finish(folder, quiet=quiet, artist=artist, **options)
 
 

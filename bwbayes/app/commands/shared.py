@@ -230,11 +230,10 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
 
     ``options`` are those of :func:`~bwbayes.app.running.run.resume`.
     """
-    with working():
-        from bwbayes.app.running.folder import RunFolder
-        from bwbayes.app.running.run import resume
+    from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.running.run import resume
 
-        folder = RunFolder.open(path)
+    folder = RunFolder.open(path)
     with resumable(f"`bwbayes resume {path}`"):
         fit = resume(
             folder,
