@@ -15,6 +15,7 @@ import ast
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,12 +84,23 @@ def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyComma
     ]
 
     def decorate(command: AnyCommand) -> AnyCommand:
+        @wraps(command)
+        def usable(*args: Any, **options: Any) -> Any:
+            # What computes is refused before the command does anything.
+            if options.get("executor") is not None:
+                # Here, because it is slow to load.
+                from bwbayes.app.running.workers import require_executor
+
+                require_executor(options["executor"])
+            return command(*args, **options)
+
+        decorated: AnyCommand = usable
         # The first decorator of a command is applied last.
         for key, hint, default in reversed(arguments):
             flag = flags.get(key, key).replace("_", "-")
             option = _option(flag, key, hint.removesuffix(" | None"), default, texts[key])
-            command = option(command)
-        return command
+            decorated = option(decorated)
+        return decorated
 
     return decorate
 
@@ -111,17 +123,6 @@ def _option(
         options = {"type": click.Choice(ast.literal_eval(hint.removeprefix("Literal")))}
     if key in RANGES:
         options = {"type": RANGES[key]}
-    if key == "executor":
-
-        def usable(_: click.Context, __: click.Parameter, executor: str | None) -> str | None:
-            from bwbayes.app.running.workers import require_executor  # slow to load
-
-            if executor is not None:
-                require_executor(executor)
-            return executor
-
-        # Refused before its command does anything.
-        options = {"callback": usable}
     return click.option(
         f"--{flag}", key, default=default, show_default=default is not None, help=text, **options
     )
