@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
@@ -84,6 +84,7 @@ def test_times_of_day_go_on_after_midnight(
     np.testing.assert_allclose(record.voltage, VOLTAGE)
 
 
+@settings(max_examples=25)
 @given(
     st.datetimes(datetime(2001, 1, 2), datetime(2059, 12, 29)),
     st.sampled_from(
