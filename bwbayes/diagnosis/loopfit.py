@@ -42,10 +42,13 @@ class LoopFit:
     start : float, um
         How far off the displacement starts in all: the decay, and what another state of the plays
         would change.
+    decay_share : float
+        Part of the decay's variance that loops and a trend do not imitate, at most 1; with little
+        of it neither `decay` nor `start` means anything.
     trend : float, um
         How far the displacement goes from the first reading to the last at equal voltages.
     trend_share : float
-        Part of a trend that loops do not imitate, at most 1; with little of it `trend` means none.
+        The same of the trend, that loops do not imitate.
     explained : float
         Part of the displacement's variance that the voltage explains, at most 1.
     without_loops : float
@@ -60,6 +63,7 @@ class LoopFit:
     decay: float
     decay_time: float
     start: float
+    decay_share: float
     trend: float
     trend_share: float
     explained: float
@@ -96,8 +100,6 @@ def fit_loop(record: Record) -> LoopFit:
     products = _products(design, centered[:, np.newaxis])
     among = _products(design, design)
     coefficients = _inverse(among) @ products[:, 0]
-    shared = among[:-2, -2]  # the products of the loops' columns with the trend's
-    imitated = float(shared @ _inverse(among[:-2, :-2]) @ shared)
     residual = centered - (design * coefficients).sum(axis=1)
     undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centered - undriven
@@ -129,8 +131,9 @@ def fit_loop(record: Record) -> LoopFit:
         float(times[which]),
         float(design[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :])
         + coefficients[-2] / 2,
+        _distinct(among),
         float(coefficients[-2]),
-        1 - imitated / float(trend_shape @ trend_shape),
+        _distinct(among[:-1, :-1]),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
         float(scipy.stats.f.sf(ratio, added, degrees)),
     )
@@ -196,6 +199,17 @@ def _products(first: FloatArray, second: FloatArray) -> FloatArray:
     """
     result: FloatArray = np.einsum("ni,nj->ij", first, second)
     return result
+
+
+def _distinct(products: FloatArray) -> float:
+    """Return the part of the last column's variance that the others do not imitate.
+
+    The first of the columns whose products these are is constant.
+    """
+    shared = products[:-1, -1]
+    total = products[-1, -1] - shared[0] ** 2 / products[0, 0]
+    remainder = products[-1, -1] - shared @ _inverse(products[:-1, :-1]) @ shared
+    return float(remainder / total)
 
 
 def _inverse(products: FloatArray) -> FloatArray:

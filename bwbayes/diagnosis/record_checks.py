@@ -246,7 +246,13 @@ def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -
 
 
 def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a displacement that comes from elsewhere at the start, whatever the voltage does."""
+    """Find a displacement that comes from elsewhere at the start, whatever the voltage does.
+
+    Loops would imitate 49 fiftieths of it at most: a drive of one swing shows the initial loading
+    alone, which no other one confirms.
+    """
+    if loop.decay_share < 0.02:
+        return
     size, time = loop.decay, loop.decay_time
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))

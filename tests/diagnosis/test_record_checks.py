@@ -17,7 +17,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.diagnosis.series_patterns import spikes
 from bwbayes.record import Record, read_record
-from tests.diagnosis.plants import FINE, RATE, drawn, hysteresis, limited, plant
+from tests.diagnosis.plants import FINE, RATE, drawn, hysteresis, limited, plant, plays
 from tests.record.spoilt import SPOILT, good, looping
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared/data/picma_stack_open_loop.csv"
@@ -179,6 +179,32 @@ def test_an_amplifier_at_its_limits_is_no_transient(kind: str) -> None:
             readings += 0.02 * np.random.default_rng(1).standard_normal(time.size)
             records.append(Record(voltage, readings, 0.002))
     assert not [r for r in records if findings_of("switch-on transient", r)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.sampled_from(["half", "quarter", "triangle", "cosine"]),
+    rate=st.sampled_from([100.0, 250.0, 1000.0]),
+    seconds=st.sampled_from([1.0, 4.0, 10.0]),
+    extent=st.floats(30.0, 150.0),
+    of_plays=st.booleans(),
+)
+def test_the_initial_loading_of_a_single_swing_is_no_transient(
+    seed: int, shape: str, rate: float, seconds: float, extent: float, of_plays: bool
+) -> None:
+    """No other swing shows where the voltage would have it, so that none can be told from it."""
+    rng, along = np.random.default_rng(seed), np.arange(round(seconds * rate)) / rate / seconds
+    voltage = extent * {
+        "half": np.sin(np.pi * along),
+        "quarter": np.sin(np.pi / 2 * along),
+        "triangle": 1 - np.abs(2 * along - 1),
+        "cosine": (1 - np.cos(2 * np.pi * along)) / 2,
+    }[shape]
+    part = drawn(rng)
+    driven = (plays if of_plays else hysteresis)(part, voltage)
+    readings = driven + part.offset + part.sensor * rng.standard_normal(voltage.size)
+    assert [] == findings_of("switch-on transient", Record(voltage, readings, 1 / rate))
 
 
 def test_a_planned_voltage_is_looked_at_too() -> None:
