@@ -336,20 +336,10 @@ def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentM
 def _remarks(chain: Chain) -> tuple[str, ...]:
     """Say what a user should know of the moves, and that a long chain is not used as a whole."""
     remarks = []
-    alone = "differential evolution and snooker moves alone made the draws that count"
-    first = chain.proposals["sampling"]
-    if first is None:
-        remarks.append(f"no proposal could be fitted to the draws of the tuning: {alone}")
-    elif chain.set_aside:
-        flat = [b for blocks in chain.history("sampling")[: chain.set_aside] for b in blocks]
-        log_weights = [b.log_density - first.log_density(b.coordinates) for b in flat]
-        shape = pareto_k(np.concatenate([weights.ravel() for weights in log_weights]))
-        steps = sum(len(block.log_density) for block in flat) // len(chain.starts)
-        followed = "one that was fitted to them made the draws that count"
+    if chain.proposal_in_use("sampling") is None:
         remarks.append(
-            f"the proposal served badly in the first {steps} steps (Pareto k {shape:.2f}), which "
-            f"gave too few effective draws: they are set aside, and "
-            f"{followed if chain.refit else alone}"
+            "no proposal covers the posterior: differential evolution and snooker moves alone made "
+            "the draws that count, which takes ten times the steps"
         )
     thin = thinning(chain.draws("sampling"))
     if thin > 1:

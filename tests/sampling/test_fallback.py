@@ -8,7 +8,6 @@ have a tail of shape 0.91: far above the limit of 0.7, that of a fitted one far 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -94,10 +93,7 @@ def test_proposals_that_do_not_cover_their_draws_are_given_up(
     np.testing.assert_array_equal(first, chain.coordinates("sampling")[: PLAN.block, 0])
     # And it is said.
     (remark,) = outcome.remarks
-    steps = chain.set_aside * PLAN.block
-    (shape,) = re.findall(rf"badly in the first {steps} steps \(Pareto k (0\.\d\d)\)", remark)
-    assert float(shape) > 0.7
-    assert remark.startswith("the proposal ")
+    assert remark.startswith("no proposal covers the posterior: ")
     assert "differential evolution and snooker moves alone" in remark
     assert outcome.check.pareto_k is None
 
@@ -153,7 +149,8 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
 ) -> None:
     """A proposal a third too narrow: k is at most 0.56, but walkers in the tails seldom leave them.
 
-    With the rule off, the same takes more than three times the steps.
+    With the rule off, the same takes more than three times the steps. Nobody can do anything about
+    it, and nothing is said.
     """
 
     def tuned(sampling: sampler._Sampling) -> None:
@@ -164,8 +161,7 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
     assert outcome.converged
     assert 0 < chain.set_aside
     assert chain.refit is not None
-    (shape,) = re.findall(r"\(Pareto k (0\.\d\d)\)", outcome.remarks[0])
-    assert float(shape) < 0.7
+    assert () == outcome.remarks
     monkeypatch.setattr(sampler, "LARGEST_SLOWDOWN", np.inf)
     slow, _ = run(LONG)
     assert 3 * len(chain.history("sampling")) < len(slow.history("sampling"))

@@ -77,7 +77,7 @@ def test_without_any_proposal_differential_evolution_goes_on(
     assert 20 == outcome.check.steps
     assert outcome.check.pareto_k is None
     (remark,) = outcome.remarks
-    assert remark.startswith("no proposal could be fitted to the draws of the tuning: ")
+    assert remark.startswith("no proposal covers the posterior: ")
 
 
 @pytest.mark.parametrize(
