@@ -92,11 +92,13 @@ def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
 def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return what a fit may have followed although the actuator has not done it.
 
-    What is beyond chance is enough by itself: parameters that followed it need not find back. Even
-    odds are enough where a parameter moves by three sds as well: a good fit hardly has both.
+    A likely cause is enough by itself: parameters that followed it need not find back. Where there
+    is none, even odds are enough if a parameter moves by three sds as well: a good fit hardly has
+    both.
     """
-    best = max((explanation.nats for explanation in ranked), default=0.0)
-    near = [explanation for explanation in ranked if explanation.nats > max(0.0, best - TIED)]
+    near = likely_causes(ranked) or [
+        explanation for explanation in ranked if explanation.nats > max(0.0, ranked[0].nats - TIED)
+    ]
     return tuple(
         explanation
         for explanation in near

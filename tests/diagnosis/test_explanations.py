@@ -83,7 +83,7 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     best = max(FAMILIES[kind](scene(kind, 0, tmp_path, 5.0)), key=lambda found: found.nats)
     assert best.kind in CAUSES[kind]
     assert best.nats > LIMIT
-    assert bool(followed_causes([best])) is (kind in {"transient", "drift", "outliers"})
+    assert bool(followed_causes([best])) is (kind in {"transient", "drift", "step", "outliers"})
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
@@ -125,3 +125,20 @@ def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:
     assert (creep, drift) == likely_causes([start, creep, drift])
     assert (start,) == likely_causes([start, worth("creep", LIMIT + 2)])
     assert () == likely_causes([worth("creep", LIMIT - 1)])
+
+
+def test_a_fit_has_not_followed_what_a_missing_part_explains_as_well() -> None:
+    """Creep to the mean of a drive from rest is a transient nearly: the part is tried first."""
+
+    def foreign(nats: float, shift: float = 0.0, *, removes: bool = True) -> Explanation:
+        return Explanation(
+            "foreign", "", "", nats=nats, removes=removes, shift=shift, foreign=True
+        )
+
+    creep = Explanation("creep", "creep", "do", nats=LIMIT + 20)
+    assert () == followed_causes([creep, foreign(LIMIT + 18)])
+    assert () == followed_causes([foreign(LIMIT + 21), creep])
+    assert 1 == len(followed_causes([foreign(LIMIT + 24), creep]))
+    assert 1 == len(followed_causes([creep, foreign(LIMIT + 18, removes=False)]))
+    assert 1 == len(followed_causes([foreign(1.0, shift=4.0)]))
+    assert () == followed_causes([foreign(1.0)])
