@@ -11,13 +11,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     Stuck,
     clipped,
     held,
+    jumps,
     repeated,
     scatter,
     spikes,
@@ -33,9 +34,9 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     """Return what is wrong with a record, in the order in which to deal with it.
 
     Findings are "wrong units", "no relation", "reversed sign", "swapped columns", "few readings",
-    "coarse sampling", "one amplitude", "held readings", "repeated samples", "clipping", "spikes",
-    "switch-on transient", "drift" and "no hysteresis". A planned voltage is looked at for its own
-    sake alone.
+    "coarse sampling", "one amplitude", "held readings", "repeated samples", "clipping", "jump",
+    "spikes", "switch-on transient", "drift" and "no hysteresis". A planned voltage is looked at for
+    its own sake alone.
 
     Examples
     --------
@@ -44,8 +45,14 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
     ['reversed sign']
     """
-    spiky: list[Finding] = []
-    if record.displacement is not None:
+    sudden, stuck = list[Finding](), list[Finding]()
+    if record.displacement is not None and record.readings >= 3:
+        stuck += _stuck(record)
+        # Readings that are held jump by themselves.
+        held_up = {"held readings", "repeated samples"} & {finding.kind for finding in stuck}
+        if not held_up and (jumped := _jumped(record)) is not None:
+            sudden.append(jumped[0])
+            record = record.without(jumped[1])
         outliers = isolated_outliers(record)
         if outliers.size:
             times, several = record.time[outliers], outliers.size > 1
@@ -53,20 +60,20 @@ def inspect(record: Record) -> tuple[Finding, ...]:
             text = f"{times.size} isolated outlier{'s' * several} of the displacement, at {shown} s"
             stop = float(times[-1]) + record.interval
             fix = "outliers = true under [model]"
-            spiky = [Finding("spikes", text, fix, float(times[0]), stop)]
+            sudden.append(Finding("spikes", text, fix, float(times[0]), stop))
         # All else is said of the others.
         record = record.without(outliers)
     findings = [*_plausibility(record)]
     if record.displacement is None or record.readings < 3:
-        return (*findings, *spiky)
+        return (*findings, *sudden)
     loop = fit_loop(record)
     unlike = [*_relation(record, loop)]
     if {"few readings", "coarse sampling"} & {finding.kind for finding in findings}:
         # Of so little only the most obvious can be said.
         obvious = [finding for finding in unlike if finding.kind == "no relation"]
-        return (*findings, *obvious, *spiky)
-    unlike += _stuck(record)
-    findings += [*unlike, *spiky]
+        return (*findings, *obvious, *sudden)
+    unlike += stuck
+    findings += [*unlike, *sudden]
     if not unlike:
         findings += [
             *_transient(record, loop),
@@ -133,12 +140,7 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     rows = retained = np.flatnonzero(record.has_reading)
     while retained.size >= 0.95 * rows.size:
         displacement, voltage = _readings(record)[np.isin(rows, retained)], record.voltage[retained]
-        extent, levels = _extent(displacement), np.unique(displacement)
-        resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
-        gain, middle = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
-        if middle > 0:  # no outlier makes this one larger
-            gain = min(gain, scatter(displacement) / middle)
-        near = spikes(displacement, gain * voltage, max(0.01 * extent, 6 * resolution))
+        near = spikes(displacement, *_driven(displacement, voltage))
         if not ends:
             others = np.delete(displacement, near)
             far = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
@@ -147,6 +149,59 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
             return np.setdiff1d(rows, retained)
         retained = np.delete(retained, near)
     return rows[:0]
+
+
+def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, float]:
+    """Return what a voltage (samples,) may do to the displacement, and the least that stands out.
+
+    Both in um: a gain times the voltage, and a hundredth of the range or six steps of the sensor.
+    """
+    extent, levels = _extent(displacement), np.unique(displacement)
+    resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
+    gain, middle = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
+    if middle > 0:  # no outlier makes this one larger
+        gain = min(gain, scatter(displacement) / middle)
+    return gain * voltage, max(0.01 * extent, 6 * resolution)
+
+
+def _jumped(record: Record) -> tuple[Finding, BoolArray] | None:
+    """Find jumps of the offset, and the samples (samples,) on the sides that hold fewer readings.
+
+    Sides between jumps belong together if these add up to nothing, as those of a dropout do.
+    """
+    rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
+    drive, least = _driven(displacement, record.voltage[rows])
+    gaps = np.diff(rows)
+    at = jumps(displacement, drive, gaps <= np.median(gaps), least)
+    if not at.size:
+        return None
+    sizes = displacement[at] - displacement[at - 1]
+    level = np.cumsum([0.0, *sizes])
+    equal = np.abs(np.subtract.outer(level, level)) < np.abs(sizes).min() / 2
+    edges = np.array([0, *at, rows.size])
+    shifted = ~equal[np.argmax(equal @ np.diff(edges))]
+    first, last = edges[:-1][shifted], edges[1:][shifted] - 1
+    times = [record.clock(time) for time in record.time[rows[at[:5]]]]
+    jumped = ", ".join(f"{size:+.3g} um at {t} s" for size, t in zip(sizes, times, strict=False))
+    text = f"the displacement jumps by {jumped}" + ", ..." * (at.size > 5)
+    fix = "look for what slips or is zeroed"
+    if first.size <= 5:
+        fix = _exclude(record, rows, Stuck(first, last))
+    samples = np.zeros(record.samples, dtype=np.bool_)
+    for start, stop in zip(rows[first], rows[last], strict=True):
+        samples[start : stop + 1] = True
+    start, stop = record.time[rows[at[0]]], record.time[rows[at[-1]]] + record.interval
+    return Finding("jump", text, fix, float(start), float(stop)), samples
+
+
+def _exclude(record: Record, rows: IntArray, stuck: Stuck) -> str:
+    """Return the line of config that leaves out runs of the readings at ``rows``."""
+    starts = record.time[rows[stuck.first]]
+    stops = record.time[rows[stuck.last]] + record.interval
+    windows = [
+        f"[{record.clock(a)}, {record.clock(b)}]" for a, b in zip(starts, stops, strict=True)
+    ]
+    return f"exclude = [{', '.join(windows)}] under [record]"
 
 
 def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
@@ -233,10 +288,7 @@ def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval
     if starts.size <= 5:
-        windows = [
-            f"[{record.clock(a)}, {record.clock(b)}]" for a, b in zip(starts, stops, strict=True)
-        ]
-        fix = f"exclude = [{', '.join(windows)}] under [record]"
+        fix = _exclude(record, rows, stuck)
     elif kind == "clipping":
         fix = "use a wider range"
     else:

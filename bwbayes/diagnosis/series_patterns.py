@@ -64,6 +64,23 @@ def spikes(values: FloatArray, drive: FloatArray, least: float) -> IntArray:
     return np.flatnonzero(isolated[half:])
 
 
+def jumps(values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: float) -> IntArray:
+    """Return the samples at which values (samples,) jump, and stay for longer than a spike does.
+
+    A jump is a spike of the differences, of those (samples - 1,) that are `adjacent`, and of twice
+    the largest that those of `drive` have anywhere: values may be late. The medians of the samples
+    before it and from it on lie apart too.
+    """
+    moved, pushed = (np.where(adjacent, np.diff(series), 0.0) for series in (values, drive))
+    pushed -= scipy.ndimage.median_filter(pushed, NEIGHBORS, mode="mirror")
+    least = max(least, 2 * float(np.max(np.abs(pushed))))
+    at = spikes(moved, np.zeros(moved.size), least) + 1
+    half = NEIGHBORS // 2
+    at = at[(at > half) & (at < values.size - half)]
+    middle = scipy.ndimage.median_filter(values - drive, NEIGHBORS, mode="nearest")
+    return at[2 * np.abs(middle[at + half] - middle[at - half - 1]) > np.abs(moved[at - 1])]
+
+
 class Stuck(NamedTuple):
     """Runs of samples that are stuck: the first and the last sample of each, (runs,)."""
 

@@ -173,6 +173,22 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
         assert isinstance(command("init", path, "--unit", unit).exception, InputError)
 
 
+def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write) -> None:
+    """A remedy that is followed leaves a config of one side, and says where the jump is."""
+
+    def jump(displacement: FloatArray) -> None:
+        displacement[400:] += 10.0
+
+    path = write(change=jump)
+    proposal = proposed(path)
+    time = proposal.record.time[400]
+    assert f"at {proposal.record.clock(time)} s" in proposal.text
+    windows = [*(proposal.config.records["record"].train or ())]
+    windows += proposal.config.validation["held_out"].window or ()
+    assert max(stop for _, stop in windows) <= time + 1e-9
+    assert () == resolve(proposal.config, path.parent).findings["record"]
+
+
 def test_readings_that_are_clipped_on_both_sides_are_left_out_together(write: Write) -> None:
     def clip(displacement: FloatArray) -> None:
         low, high = np.min(displacement), np.max(displacement)

@@ -131,9 +131,7 @@ def test_a_fit_has_not_followed_what_a_missing_part_explains_as_well() -> None:
     """Creep to the mean of a drive from rest is a transient nearly: the part is tried first."""
 
     def foreign(nats: float, shift: float = 0.0, *, removes: bool = True) -> Explanation:
-        return Explanation(
-            "foreign", "", "", nats=nats, removes=removes, shift=shift, foreign=True
-        )
+        return Explanation("foreign", "", "", nats=nats, removes=removes, shift=shift, foreign=True)
 
     creep = Explanation("creep", "creep", "do", nats=LIMIT + 20)
     assert () == followed_causes([creep, foreign(LIMIT + 18)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from ast import literal_eval
 from itertools import product
 from pathlib import Path
@@ -167,6 +168,41 @@ def test_the_windows_of_a_fix_hold_the_samples_that_they_name(
     assert length - 1 <= left_out <= length + 2
 
 
+@settings(max_examples=25, deadline=None)
+@given(
+    number=st.integers(0, 2**31),
+    edges=st.lists(st.floats(0.02, 0.98), min_size=1, max_size=2),
+    size=st.floats(0.1, 0.4),
+    sign=st.sampled_from([-1, 1]),
+)
+def test_a_jump_of_the_offset_is_named_with_its_time_and_its_shorter_side_left_out(
+    number: int, edges: list[float], size: float, sign: int
+) -> None:
+    """There, or there and back: what is left out is what stands apart from most readings."""
+    rng = np.random.default_rng(number)
+    time = 0.005 * np.arange(3000)
+    voltage = 80 * (1 - time / 30) * np.sin(2 * np.pi * rng.uniform(0.2, 1.0) * time)
+    part = drawn(rng)
+    readings = hysteresis(part, voltage) + part.sensor * rng.standard_normal(time.size)
+    rows = sorted({round(edge * time.size) for edge in edges})
+    if np.min(np.diff([0, *rows, time.size])) < 5:
+        return
+    jump = sign * size * float(np.ptp(readings))
+    for row, step in zip(rows, (jump, -jump), strict=False):
+        readings[row:] += step
+    record = Record(voltage, readings, 0.005)
+    (finding,) = inspect(record)
+    assert "jump" == finding.kind
+    named = [float(text) for text in re.findall(r"um at ([\d.]+) s", finding.text)]
+    np.testing.assert_allclose(named, time[rows], atol=1e-9)
+    windows = literal_eval(finding.fix.partition("= ")[2].removesuffix(" under [record]"))
+    corrected = record.exclude(windows)
+    assert [] == findings_of("jump", corrected)
+    shifted = rows[-1] - rows[0] if len(rows) > 1 else min(rows[0], time.size - rows[0])
+    shifted = min(shifted, time.size - shifted)
+    assert abs(record.readings - corrected.readings - shifted) <= 2
+
+
 @pytest.mark.parametrize("kind", ["saturation", "slew limit"])
 def test_an_amplifier_at_its_limits_is_no_transient(kind: str) -> None:
     records = [plant(kind, (seed, 1)) for seed in range(12)]
@@ -195,12 +231,15 @@ def test_the_initial_loading_of_a_single_swing_is_no_transient(
 ) -> None:
     """No other swing shows where the voltage would have it, so that none can be told from it."""
     rng, along = np.random.default_rng(seed), np.arange(round(seconds * rate)) / rate / seconds
-    voltage = extent * {
-        "half": np.sin(np.pi * along),
-        "quarter": np.sin(np.pi / 2 * along),
-        "triangle": 1 - np.abs(2 * along - 1),
-        "cosine": (1 - np.cos(2 * np.pi * along)) / 2,
-    }[shape]
+    voltage = (
+        extent
+        * {
+            "half": np.sin(np.pi * along),
+            "quarter": np.sin(np.pi / 2 * along),
+            "triangle": 1 - np.abs(2 * along - 1),
+            "cosine": (1 - np.cos(2 * np.pi * along)) / 2,
+        }[shape]
+    )
     part = drawn(rng)
     driven = (plays if of_plays else hysteresis)(part, voltage)
     readings = driven + part.offset + part.sensor * rng.standard_normal(voltage.size)

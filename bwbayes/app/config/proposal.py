@@ -105,13 +105,16 @@ def _text(
         table: "".join(f"{key} = {value}  # {kinds}\n" for key, (value, kinds) in keys.items())
         for table, keys in stated.items()
     }
-    held = _held_out(record)
+    usable = record
+    if "exclude" in stated["record"]:
+        usable = record.exclude(json.loads(stated["record"]["exclude"][0]))
+    held = _held_out(usable)
     # No fit sets aside the spikes that are held out.
     spikes = [s for s in isolated_outliers(record).tolist() for w in held if w.start <= s < w.stop]
     if spikes and "\nexclude" not in f"\n{fixes['record']}":
         windows = _windows(record, [slice(s, s + 1) for s in spikes])
         fixes["record"] += f"exclude = {windows}  # spikes in the part that is held out\n"
-    first, last = np.flatnonzero(record.has_reading)[[0, -1]].tolist()
+    first, last = np.flatnonzero(usable.has_reading)[[0, -1]].tolist()
     edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last + 1]
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     # A JSON string is a TOML string too, except for DEL, which no column's name has.
