@@ -17,6 +17,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.model import tail_nats
+from bwbayes.diagnosis.series_patterns import Line, strongest_line
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
@@ -48,6 +49,15 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "drift": (
         "a drift of the readings",
         "validate a shorter part: set window in [validation.{name}], or predict with --window",
+    ),
+    "step": (
+        "a step of the offset by {jump} um at {jumped} s",
+        "validate one side: set window in [validation.{name}] to end or begin at {jumped}, or "
+        "predict with --window",
+    ),
+    "oscillation": (
+        "an oscillation of {swing} um at {line}",
+        "look for the source: mains, ground loops, vibration",
     ),
     "offset": (
         "an offset of {size} um",
@@ -122,11 +132,13 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     errors = np.stack([np.full(rows.size, bands.common_sd), varying / (np.std(mean) or 1.0)])
     skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
 
-    def weigh(added: FloatArray, residual: FloatArray = residual) -> tuple[float, FloatArray]:
+    def weigh(
+        added: FloatArray, residual: FloatArray = residual
+    ) -> tuple[float, FloatArray, FloatArray]:
         """Explain a residual by shapes (shapes, readings) of standard normal sizes.
 
-        Returns its log density, up to what is the same for all shapes, and the innovations
-        (readings,) less what the shapes explain, in sds.
+        Returns its log density, up to what is the same for all shapes, the innovations (readings,)
+        less what the shapes explain, in sds, and the sizes (shapes,).
         """
         series = np.concatenate([[residual], errors, added])
         white = DiscrepancyNoise(interval).whiten(noise, series[np.newaxis], skipped)[0][0]
@@ -135,9 +147,9 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
         sizes = np.linalg.solve(precision, pull)
         squares = float(white[0] @ white[0] - pull @ sizes)
         log_volume = float(np.linalg.slogdet(precision)[1])
-        return -0.5 * (squares + log_volume), white[0] - sizes @ white[1:]
+        return -0.5 * (squares + log_volume), white[0] - sizes @ white[1:], sizes[len(errors) :]
 
-    plain, white = weigh(np.empty((0, rows.size)))
+    plain, white, _ = weigh(np.empty((0, rows.size)))
     along = (time - time[0]) / max(float(np.ptp(time)), interval)
     shapes = _shapes(bands, rows, along)
     nats = {kind: weigh(added)[0] - plain for kind, added in shapes.items()}
@@ -146,6 +158,15 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     starts = [weigh(3 * shapes["offset"] * np.exp(-along / decay))[0] for decay in DECAYS]
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
+    size = float(shapes["offset"][0, 0])
+    later = 1 + int(np.argmax(np.abs(white[1:])))
+    log_density, _, jump = weigh(size * (np.arange(rows.size) >= later)[np.newaxis])
+    nats["step"] = log_density - plain - np.log(rows.size)
+    line = strongest_line(white, bands.voltage[rows], rows - rows[0], interval) or Line(0.0, "")
+    phase = 2 * np.pi * line.frequency * time
+    waves: FloatArray = size / 10 * np.stack([np.sin(phase), np.cos(phase)])
+    log_density, _, swing = weigh(waves)
+    nats["oscillation"] = log_density - plain - np.log(rows.size / 2)
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
     settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
@@ -153,6 +174,10 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
         "name": bands.name,
         "settled": clock(settled, interval),
         "size": f"{np.mean(residual):+.3g}",
+        "jump": f"{size * jump[0]:+.2g}",
+        "jumped": clock(time[later], interval),
+        "swing": f"{size / 10 * np.hypot(*swing):.2g}",
+        "line": f"{line.frequency:.4g} Hz{line.source}",
         "spikes": ", ".join(
             f"[{clock(t, interval)}, {clock(t + interval, interval)}]"
             for t in time[np.abs(white) > 5][:3].tolist()

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator
 from itertools import accumulate
 
 import numpy as np
-import scipy
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import Effect, Simulate, climb
 from bwbayes.diagnosis.record_checks import settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate
 
 # Prior sd of an addition to the displacement, as a fraction of its range.
@@ -70,55 +71,41 @@ def transient(scene: Scene) -> Iterator[Explanation]:
 
 
 def step(scene: Scene) -> Iterator[Explanation]:
-    """Try A from a time on: that of the largest innovation, whose choice is paid for."""
-    readings = scene.posterior.only.readings
+    """Try A from a time on: that of the largest innovation, whose choice is paid for.
+
+    Where readings before it were not fitted, the largest of theirs says when it was.
+    """
+    rows = scene.posterior.only.readings.rows
     white = np.abs(scene.innovations)
     white[: max(white.size // 50, 1)] = 0.0
-    row = int(readings.rows[int(np.argmax(white))])
+    number = int(np.argmax(white))
+    between = scene.posterior.altered(training=(slice(rows[number - 1], rows[number] + 1),))
+    rows_between = between.only.readings.rows
+    white_between = np.abs(innovations(between, scene.fit.free).white)[1:]
+    later = 1 + int(np.argmax(white_between))
+    row = int(rows_between[later])
     after = (np.arange(scene.time.size) >= row).astype(np.float64)
     fit = scene.extended(add_shapes(after[np.newaxis], SIZE * scene.extent))
     size, time = SIZE * scene.extent * fit.sizes[0], scene.clock(scene.time[row])
     text = f"step of the offset by {size:.2g} um at {time} s"
-    cost = float(np.log(readings.rows.size))
-    yield scene.explained(
-        "step", text, f"fit one side: set train to end or begin at {time}", fit, cost
-    )
+    cost = float(np.log(rows.size))
+    fix = f"fit one side: set train to end or begin at {time}"
+    yield scene.explained("step", text, fix, fit, cost, foreign=True)
 
 
 def oscillation(scene: Scene) -> Iterator[Explanation]:
-    """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not.
-
-    A loop that is missed shows at harmonics of the drive, which rise and fall slowly with their
-    order: a line is stronger than any two of them on either side, and may lie on one.
-    """
-    readings = scene.posterior.only.readings
-    length = 4 * readings.samples
-    values = np.zeros((2, readings.samples))
-    values[0, readings.rows] = scene.innovations
-    drive = scene.voltage[readings.rows]
-    values[1, readings.rows] = drive - np.mean(drive)
-    power = np.abs(np.fft.rfft(values * np.hanning(readings.samples), length)) ** 2
-    frequency = np.fft.rfftfreq(length, scene.interval)
-    main = int(np.argmax(power[1]))
-    strongest = scipy.ndimage.maximum_filter1d(power[0], 5 * main + 1)
-    lines = (power[0] == strongest) & (np.arange(frequency.size) >= 3 * main)
-    best = float(frequency[int(np.argmax(lines * power[0]))])
-    if not best:
+    """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not."""
+    rows = scene.posterior.only.readings.rows
+    line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
+    if line is None:
         return
-    phase = 2 * np.pi * best * scene.time
+    phase = 2 * np.pi * line.frequency * scene.time
     sd = SIZE * scene.extent / 10
     fit = scene.extended(add_shapes(np.stack([np.sin(phase), np.cos(phase)]), sd))
-    source = ""
-    # Mains are right to a fifth of a percent; half the width of a line under the window.
-    width = max(2e-3 * best, 2 / scene.duration)
-    for mains in (50, 60):
-        harmonic = round(best / mains)
-        if 1 <= harmonic <= 10 and abs(best - harmonic * mains) <= width:
-            times = "" if harmonic == 1 else f"{harmonic} times "
-            source = source or f" (mains: {times}{mains} Hz)"
-    text = f"oscillation of {sd * float(np.hypot(*fit.sizes)):.2g} um at {best:.4g} Hz{source}"
+    size = sd * float(np.hypot(*fit.sizes))
+    text = f"oscillation of {size:.2g} um at {line.frequency:.4g} Hz{line.source}"
+    cost = float(np.log(rows.size / 2))
     fix = "look for the source: mains, ground loops, vibration"
-    cost = float(np.log(readings.rows.size / 2))
     yield scene.explained("oscillation", text, fix, fit, cost)
 
 

@@ -81,6 +81,40 @@ def jumps(values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: flo
     return at[2 * np.abs(middle[at + half] - middle[at - half - 1]) > np.abs(moved[at - 1])]
 
 
+class Line(NamedTuple):
+    """A line of a spectrum: its frequency, Hz, and a source of that frequency in words, or none."""
+
+    frequency: float
+    source: str
+
+
+def strongest_line(
+    white: FloatArray, drive: FloatArray, rows: IntArray, interval: float
+) -> Line | None:
+    """Return the strongest line of white noise (readings,) at ``rows`` that the drive has not.
+
+    A loop that is missed shows at harmonics of the drive (readings,), which rise and fall slowly
+    with their order: a line is stronger than any two of them on either side, and may lie on one.
+    """
+    samples = int(rows[-1]) + 1
+    values = np.zeros((2, samples))
+    values[:, rows] = white, drive - np.mean(drive)
+    power = np.abs(np.fft.rfft(values * np.hanning(samples), 4 * samples)) ** 2
+    frequency = np.fft.rfftfreq(4 * samples, interval)
+    main = int(np.argmax(power[1]))
+    strongest = scipy.ndimage.maximum_filter1d(power[0], 5 * main + 1)
+    lines = (power[0] == strongest) & (np.arange(frequency.size) >= 3 * main)
+    best = float(frequency[int(np.argmax(lines * power[0]))])
+    # Mains are right to a fifth of a percent; half the width of a line under the window.
+    width = max(2e-3 * best, 2 / (interval * max(samples - 1 - int(rows[0]), 1)))
+    for mains in (50, 60):
+        harmonic = round(best / mains)
+        if 1 <= harmonic <= 10 and abs(best - harmonic * mains) <= width:
+            times = "" if harmonic == 1 else f"{harmonic} times "
+            return Line(best, f" (mains: {times}{mains} Hz)")
+    return Line(best, "") if best else None
+
+
 class Stuck(NamedTuple):
     """Runs of samples that are stuck: the first and the last sample of each, (runs,)."""
 

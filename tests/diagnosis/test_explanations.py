@@ -92,6 +92,24 @@ def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
     assert found[0].text.endswith("(mains: 50 Hz)")
 
 
+@pytest.mark.parametrize("time", [1.7, 2.0, 2.335, 3.9])
+def test_a_step_among_readings_that_are_held_out_has_its_own_time(
+    time: float, tmp_path: Path
+) -> None:
+    """Not that of the first reading after them, where the fit comes upon it."""
+    write_record(plant("good", (5, 2), 5.0), tmp_path / "record.h5")
+    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    shifted = problem.posterior.only.displacement + 5.0 * (problem.record.time >= time)
+    windows = slice(0, 320), slice(480, 1000)
+    posterior = problem.posterior.altered(displacement=shifted, training=windows)
+    rng = np.random.default_rng(0)
+    optima = pointfit.fit(posterior, rng).optima
+    (found,) = effects.step(Scene.of(posterior, optima, rng, [slice(320, 480)]))
+    assert found.nats > LIMIT
+    assert found.text.endswith(f"um at {time:g} s")
+    assert found.fix.endswith(f"to end or begin at {time:g}")
+
+
 @pytest.mark.parametrize("kind", ["good", pytest.param("cubic", marks=pytest.mark.slow)])
 def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     kind: str, tmp_path: Path

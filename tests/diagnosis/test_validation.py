@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import WORDS
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.prediction.bands import Bands, LeadIn
+from bwbayes.record.io.grid import clock
 from tests.prediction.records import Made, bands_of, made
 
 FITTED = (-100.0, 100.0)
@@ -95,6 +98,8 @@ SPOILT: dict[str, Spoil] = {
     "sign": lambda g, r, sd: -2 * r.mean + 0 * g.normal() * sd,
     "start": lambda g, r, _: 20 * np.exp(-r.time / g.uniform(0.2, 0.8)),
     "offset": lambda g, r, sd: g.choice([-1, 1]) * 5 * sd + 0 * r.time,
+    "step": lambda g, r, sd: 6 * sd * (r.time > g.uniform(0.3, 0.7) * r.time[-1]),
+    "oscillation": lambda g, r, sd: 4 * sd * np.sin(2 * np.pi * 20.3 * r.time + g.uniform(0, 6)),
     "drift": lambda _, r, sd: 8 * sd * r.time / r.time[-1],
     "extrapolation": beyond,
     "outliers": outliers,
@@ -127,6 +132,31 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
         assert verdict.cause.fix in verdict.line
         causes.append(kind in verdict.cause.kind.split(" or "))
     assert sum(causes) >= 0.9 * records
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    number=st.integers(0, 2**31),
+    along=st.floats(0.1, 0.9),
+    mains=st.sampled_from([50, 60]),
+    size=st.floats(4.0, 10.0),
+)
+def test_a_step_is_named_with_its_time_and_a_hum_with_its_source(
+    number: int, along: float, mains: int, size: float
+) -> None:
+    """Of readings that were not fitted too; nothing of either is empty."""
+    record = made(np.random.default_rng(number), length=20.0, interval=0.005, sensor=0.1)
+    sd = float(record.sds["sensor"].mean())
+    row = round(along * record.time.size)
+    background = Background(record.memory, 0.0, FITTED)
+    shapes = {
+        f"um at {clock(record.time[row], 0.005)} s": record.time >= record.time[row],
+        f"(mains: {mains} Hz)": np.sin(2 * np.pi * mains * record.time),
+    }
+    for named, shape in shapes.items():
+        verdict = judged(bands_of(record, size * sd * shape), background)
+        assert verdict.cause is not None
+        assert named in verdict.cause.text
 
 
 def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
