@@ -160,12 +160,12 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     nats["outliers"] = tail_nats(white)
     size = float(shapes["offset"][0, 0])
     later = 1 + int(np.argmax(np.abs(white[1:])))
-    log_density, _, jump = weigh(size * (np.arange(rows.size) >= later)[np.newaxis])
+    after: FloatArray = np.where(np.arange(rows.size) >= later, size, 0.0)[np.newaxis]
+    log_density, _, jump = weigh(after)
     nats["step"] = log_density - plain - np.log(rows.size)
     line = strongest_line(white, bands.voltage[rows], rows - rows[0], interval) or Line(0.0, "")
     phase = 2 * np.pi * line.frequency * time
-    waves: FloatArray = size / 10 * np.stack([np.sin(phase), np.cos(phase)])
-    log_density, _, swing = weigh(waves)
+    log_density, _, swing = weigh(size / 10 * np.stack([np.sin(phase), np.cos(phase)]))
     nats["oscillation"] = log_density - plain - np.log(rows.size / 2)
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
