@@ -33,10 +33,10 @@ LONG_DECAY = 0.13
 def inspect(record: Record) -> tuple[Finding, ...]:
     """Return what is wrong with a record, in the order in which to deal with it.
 
-    Findings are "wrong units", "no relation", "reversed sign", "swapped columns", "few readings",
-    "coarse sampling", "one amplitude", "held readings", "repeated samples", "clipping", "jump",
-    "spikes", "switch-on transient", "drift" and "no hysteresis". A planned voltage is looked at for
-    its own sake alone.
+    Findings are "unlikely units", "no relation", "reversed sign", "swapped columns",
+    "few readings", "coarse sampling", "one amplitude", "held readings", "repeated samples",
+    "clipping", "jump", "spikes", "switch-on transient", "drift" and "no hysteresis". A planned
+    voltage is looked at for its own sake alone.
 
     Examples
     --------
@@ -101,20 +101,18 @@ def _extent(values: FloatArray) -> float:
 def _plausibility(record: Record) -> Iterator[Finding]:
     """Find what no piezo actuator does, and drives from which little is to be learnt."""
     volts, span = float(np.abs(record.voltage).max()), float(np.ptp(record.voltage))
-    names = "check the units in the names of the columns: voltage_V, voltage_mV, displacement_um, "
-    names += "displacement_nm, displacement_m"
-    if not 0.05 <= volts <= 2000:
-        yield _whole(record, "wrong units", f"voltages of up to {volts:.3g} V", names)
+    text, likely = f"voltages of up to {volts:.3g} V", 0.05 <= volts <= 2000
     if record.displacement is not None:
         extent = _extent(_readings(record))
-        if not 0.01 <= extent <= 5000:
-            text = f"a displacement that moves by {extent:.3g} um"
-            yield _whole(record, "wrong units", text, names)
-        elif not 1e-4 <= extent / span <= 1e3:
-            yield _whole(record, "wrong units", f"{extent / span:.3g} um per volt", names)
-        if record.readings < 100:
-            text = f"{record.readings} readings, some ten for each parameter"
-            yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
+        text += f" move the displacement by {extent:.3g} um, {extent / span:.3g} um per volt"
+        likely = likely and 0.01 <= extent <= 5000 and 1e-4 <= extent / span <= 1e3
+    if not likely:
+        fix = "check the units in the names of the columns (voltage_V, voltage_mV, "
+        fix += "displacement_um, displacement_nm, displacement_m), and keep them if they are right"
+        yield _whole(record, "unlikely units", text, fix)
+    if record.displacement is not None and record.readings < 100:
+        text = f"{record.readings} readings, some ten for each parameter"
+        yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
     spacing = np.diff(turning_points(record.voltage, 0.1 * span))
     if spacing.size >= 3 and np.median(spacing) < 6:
         text = f"{2 * np.median(spacing):.3g} samples a period, too few to resolve the reversals"

@@ -113,16 +113,12 @@ def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
             {"change": _turned},
             "reversed sign: the displacement falls by .* --unit displacement=-um`",
         ),
-        (
-            {"factors": (1.0, 1e3, 1.0)},
-            "wrong units: voltages of up to .*; check the units in the",
-        ),
         ({"rows": np.r_[0:200, 280:600]}, r"csv:202: time_s: gap of 0.81 s .*; give the voltage"),
         ({"header": "time_s,voltage_V,pos"}, "which unit has 'pos' .* --unit displacement=um"),
         ({"header": "time_s,a_V,b_V"}, "which column is the voltage"),
         ({"header": "time_s,voltage_V,displacement_in"}, "which unit has 'displacement_in'"),
     ],
-    ids=["sign", "mV", "gap", "no unit", "two voltages", "odd unit"],
+    ids=["sign", "gap", "no unit", "two voltages", "odd unit"],
 )
 def test_what_makes_a_fit_pointless_is_one_line(
     write: Write, written: dict[str, object], line: str
@@ -133,6 +129,20 @@ def test_what_makes_a_fit_pointless_is_one_line(
     assert re.search(line, str(done.exception)), str(done.exception)
     assert "" == done.output
     assert ["mine.csv"] == [one.name for one in path.parent.iterdir()]
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1e3, 1.0), (1.0, 1e-4, 1.0), (1.0, 1.0, 1e4)])
+def test_units_that_are_stated_are_doubted_and_not_refused(
+    write: Write, factors: tuple[float, float, float]
+) -> None:
+    """No magnitude is impossible: what was read is said once, and the user decides."""
+    proposal = proposed(write(factors=factors))
+    (finding,) = proposal.findings
+    assert "unlikely units" == finding.kind
+    assert re.match(
+        r"voltages of up to \S+ V move the displacement by \S+ um, \S+ um per volt$", finding.text
+    )
+    assert proposal.pointless is None
 
 
 def test_a_reversed_sign_is_turned_by_its_unit(

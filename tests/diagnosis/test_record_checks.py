@@ -249,7 +249,7 @@ def test_the_initial_loading_of_a_single_swing_is_no_transient(
 def test_a_planned_voltage_is_looked_at_too() -> None:
     steady = 5e4 * np.sin(np.arange(3000) / 30)
     kinds = [finding.kind for finding in inspect(Record(steady, None, 1e-3))]
-    assert ["wrong units", "one amplitude"] == kinds
+    assert ["unlikely units", "one amplitude"] == kinds
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -48,7 +48,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         for issues in problem.findings.values()
         for finding in issues
     ]
-    nothing = "there is no transient, spike, clipping, drift, wrong unit or the like in the record"
+    nothing = "there is no transient, spike, jump, clipping, drift or the like in the record"
     several = len(problem.records) > 1
     about = [fact for subject, fact in problem.facts.items() if subject.startswith("record")]
     about += [why] * bool(why)
