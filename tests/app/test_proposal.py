@@ -43,11 +43,14 @@ def write(tmp_path: Path, record: Record) -> Write:
         factors: tuple[float, float, float] = (1.0, 1.0, 1.0),
         change: Callable[[FloatArray], object] = lambda _: None,
         rows: slice | np.ndarray = slice(None),
+        rest: int = 0,
     ) -> Path:
         assert record.displacement is not None
         displacement = record.displacement.copy()
         change(displacement)
         columns = np.stack([record.time, record.voltage, displacement], axis=1) * factors
+        columns = np.pad(columns, ((rest, 0), (0, 0)), mode="edge")
+        columns[:, 0] = factors[0] * record.interval * np.arange(len(columns))
         lines = [",".join(f"{value:.9g}" for value in row) for row in columns[rows]]
         path = tmp_path / "mine.csv"
         path.write_text("\n".join([header, *lines]) + "\n")
@@ -71,6 +74,8 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
     assert "# No issues found." in text
     assert "# from_rest = true  # starts at 0 V, moving; say so if" in text
     assert '# voltage_is = "command"' in text
+    resting = write(rest=240)
+    assert "# from_rest = true  # starts at 0 V, at rest for 2.4" in proposed(resting).text
     text = proposed(write(rows=slice(20, None))).text
     assert re.search(
         r"# from_rest = false  # starts at 9\d\.\d V, moving; the initial state is", text
