@@ -77,8 +77,8 @@ def jumps(values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: flo
     at = spikes(moved, np.zeros(moved.size), least) + 1
     half = NEIGHBORS // 2
     at = at[(at > half) & (at < values.size - half)]
-    middle = scipy.ndimage.median_filter(values - drive, NEIGHBORS, mode="nearest")
-    return at[2 * np.abs(middle[at + half] - middle[at - half - 1]) > np.abs(moved[at - 1])]
+    medians = scipy.ndimage.median_filter(values - drive, NEIGHBORS, mode="nearest")
+    return at[2 * np.abs(medians[at + half] - medians[at - half - 1]) > np.abs(moved[at - 1])]
 
 
 class Line(NamedTuple):
