@@ -18,7 +18,7 @@ from bwbayes.diagnosis.series_patterns import (
     Stuck,
     clipped,
     held,
-    jumps,
+    lasting_jumps,
     repeated,
     scatter,
     spikes,
@@ -50,7 +50,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
         stuck += _stuck(record)
         # Readings that are held jump by themselves.
         held_up = {"held readings", "repeated samples"} & {finding.kind for finding in stuck}
-        if not held_up and (jumped := _jumped(record)) is not None:
+        if not held_up and (jumped := offset_jumps(record)) is not None:
             sudden.append(jumped[0])
             record = record.without(jumped[1])
         outliers = isolated_outliers(record)
@@ -162,32 +162,32 @@ def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, 
     return gain * voltage, max(0.01 * extent, 6 * resolution)
 
 
-def _jumped(record: Record) -> tuple[Finding, BoolArray] | None:
+def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     """Find jumps of the offset, and the samples (samples,) on the sides that hold fewer readings.
 
-    Sides between jumps belong together if these add up to nothing, as those of a dropout do.
+    Sides between jumps belong together if these add up to nothing, as those of a dropout do. Of
+    more than five windows none is left out.
     """
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     drive, least = _driven(displacement, record.voltage[rows])
     gaps = np.diff(rows)
-    at = jumps(displacement, drive, gaps <= np.median(gaps), least)
+    at = lasting_jumps(displacement, drive, gaps <= np.median(gaps), least)
     if not at.size:
         return None
     sizes = displacement[at] - displacement[at - 1]
-    level = np.cumsum([0.0, *sizes])
-    equal = np.abs(np.subtract.outer(level, level)) < np.abs(sizes).min() / 2
     edges = np.array([0, *at, rows.size])
-    shifted = ~equal[np.argmax(equal @ np.diff(edges))]
+    level = np.rint(np.cumsum([0.0, *sizes]) / np.abs(sizes).min())
+    _, side = np.unique(level, return_inverse=True)
+    shifted = side != np.argmax(np.bincount(side, np.diff(edges)))
     first, last = edges[:-1][shifted], edges[1:][shifted] - 1
     times = [record.clock(time) for time in record.time[rows[at[:5]]]]
     jumped = ", ".join(f"{size:+.3g} um at {t} s" for size, t in zip(sizes, times, strict=False))
     text = f"the displacement jumps by {jumped}" + ", ..." * (at.size > 5)
     fix = "look for what slips or is zeroed"
+    samples = np.zeros(record.samples, dtype=np.bool_)
     if first.size <= 5:
         fix = _exclude(record, rows, Stuck(first, last))
-    samples = np.zeros(record.samples, dtype=np.bool_)
-    for start, stop in zip(rows[first], rows[last], strict=True):
-        samples[start : stop + 1] = True
+        samples[rows[np.repeat(shifted, np.diff(edges))]] = True
     start, stop = record.time[rows[at[0]]], record.time[rows[at[-1]]] + record.interval
     return Finding("jump", text, fix, float(start), float(stop)), samples
 

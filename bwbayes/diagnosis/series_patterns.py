@@ -64,7 +64,9 @@ def spikes(values: FloatArray, drive: FloatArray, least: float) -> IntArray:
     return np.flatnonzero(isolated[half:])
 
 
-def jumps(values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: float) -> IntArray:
+def lasting_jumps(
+    values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: float
+) -> IntArray:
     """Return the samples at which values (samples,) jump, and stay for longer than a spike does.
 
     A jump is a spike of the differences, of those (samples - 1,) that are `adjacent`, and of twice
