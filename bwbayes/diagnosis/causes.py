@@ -159,7 +159,7 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
     size = float(shapes["offset"][0, 0])
-    later = 1 + int(np.argmax(np.abs(white[1:])))
+    later = int(np.argmax(np.abs(white) * (np.arange(white.size) > 0)))
     after: FloatArray = np.where(np.arange(rows.size) >= later, size, 0.0)[np.newaxis]
     log_density, _, jump = weigh(after)
     nats["step"] = log_density - plain - np.log(rows.size)
@@ -180,7 +180,7 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
         "line": f"{line.frequency:.4g} Hz{line.source}",
         "spikes": ", ".join(
             f"[{clock(t, interval)}, {clock(t + interval, interval)}]"
-            for t in time[np.abs(white) > 5][:3].tolist()
+            for t in np.sort(time[np.argsort(-np.abs(white))[:3]]).tolist()
         ),
     }
     return [

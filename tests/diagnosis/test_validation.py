@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import WORDS
+from bwbayes.diagnosis.causes import WORDS, cause
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.prediction.bands import Bands, LeadIn
@@ -166,6 +166,18 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
         verdict = judged(bands_of(wide), Background(record.memory, 0.0, FITTED))
         assert verdict.holds is False
         assert "times too wide" in verdict.reasons[-1]
+
+
+@pytest.mark.parametrize("readings", [1, 2, 3])
+def test_a_few_readings_that_are_far_off_have_a_cause_too(readings: int) -> None:
+    """With a fix whose blanks are filled in."""
+    record = made(np.random.default_rng(4), length=2.0)
+    bands = bands_of(record, np.where(np.arange(record.time.size) % 2, 50.0, -40.0))
+    assert bands.measured is not None
+    measured = np.where(np.arange(record.time.size) < readings, bands.measured, np.nan)
+    found = cause(replace(bands, measured=measured), record.memory)
+    assert "  " not in found.fix
+    assert "{" not in found.fix
 
 
 def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:

@@ -163,6 +163,13 @@ def _drifting(record: Record, g: Generator) -> Record:
     return _displaced(record, values + size * shape)
 
 
+def _jumping(record: Record, g: Generator) -> Record:
+    values = _readings(record)
+    size = float(g.choice([-1, 1])) * float(g.uniform(0.2, 0.5)) * np.ptp(values)
+    values[int(g.uniform(0.1, 0.9) * values.size) :] += size
+    return _displaced(record, values)
+
+
 def _coarse(_: Record, g: Generator) -> Record:
     samples = 400
     a_period = float(g.uniform(3, 9))
@@ -192,6 +199,7 @@ SPOILT: Mapping[str, Callable[[Record, Generator], Record]] = {
     "clipping": _clipped,
     "clipping of the tips": _clipped_tip,
     "drift": _drifting,
+    "jump": _jumping,
     "unlikely units: mV": lambda record, _: replace(record, voltage=1e3 * record.voltage),
     "unlikely units: nm": lambda record, _: _displaced(record, 1e3 * _readings(record)),
     "unlikely units: m": lambda record, _: _displaced(record, 1e-6 * _readings(record)),
