@@ -155,8 +155,6 @@ COMMANDS = {
     "report": ("copy",),
     "predict": ("copy", "--signal", "step50", "--from-rest"),
     "compensate": ("copy", "sine", "--amplitude", "20", "--frequency", "1", "--from-rest"),
-    "design": ("copy", "--parameter", "d"),
-    "track": ("copy", "--frequency", "2", "--draws", "5"),
     "export": ("copy",),
 }
 
