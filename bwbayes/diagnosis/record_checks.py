@@ -273,12 +273,21 @@ def _stuck(record: Record) -> Iterator[Finding]:
     elif (holds := held(voltage, displacement)) is not None:
         seen = f"readings {jump.format('', ', while the voltage moves')}"
         yield _where(record, rows, "held readings", seen, holds)
-    for side, sign in (("largest", 1.0), ("smallest", -1.0)):
+    limits: list[str] = []
+    stays: list[tuple[float, float, str]] = []
+    for side, sign in (("smallest", -1.0), ("largest", 1.0)):
         ends = clipped(sign * displacement, voltage)
         if ends is not None:
-            value = displacement[ends.first[0]]
-            seen = f"readings stay at the {side} value, {value:g} um, while the voltage moves"
-            yield _where(record, rows, "clipping", seen, ends)
+            limits.append(repr(float(f"{displacement[ends.first[0]]:.12g}")))
+            start, stop = record.time[rows[[ends.first[0], ends.last[-1]]]].tolist()
+            seen = f"{ends.samples} readings stay at the {side} value, {float(limits[-1]):g} um"
+            stays.append((start, stop + record.interval, seen))
+    if stays:
+        starts, stops, texts = zip(*stays, strict=True)
+        first = record.clock(min(starts))
+        text = f"{', and '.join(texts)}, while the voltage moves, first at {first} s"
+        fix = f"missing = [{', '.join(limits)}] under [record]"
+        yield Finding("clipping", text, fix, min(starts), max(stops))
 
 
 def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -> Finding:
@@ -287,8 +296,6 @@ def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -
     stops = record.time[rows[stuck.last]] + record.interval
     if starts.size <= 5:
         fix = _exclude(record, rows, stuck)
-    elif kind == "clipping":
-        fix = "use a wider range"
     else:
         fix = f"decimate = {stuck.length} under [record], or record at the sensor's own rate"
     text = f"{stuck.samples} {seen}, first at {record.clock(starts[0])} s"

@@ -289,6 +289,13 @@ class Record:
         displacement[left_out] = np.nan
         return replace(self, displacement=displacement)
 
+    def without_values(self, values: Sequence[float]) -> Record:
+        """Return the record without the readings that are one of `values`, um, to nine digits."""
+        if self.displacement is None or not values:
+            return self
+        columns = self.displacement[:, np.newaxis]
+        return self.without(np.isclose(columns, values, rtol=1e-9, atol=0.0).any(axis=1))
+
     def exclude(self, windows: Sequence[Window]) -> Record:
         """Return the record without the readings in `windows`, pairs (start, stop) in s.
 

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from bwbayes.app.commands import cli
-from bwbayes.app.config.config import load
+from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import resolve
 from bwbayes.arrays import FloatArray
@@ -204,15 +204,26 @@ def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write)
     assert () == resolve(proposal.config, path.parent).findings["record"]
 
 
-def test_readings_that_are_clipped_on_both_sides_are_left_out_together(write: Write) -> None:
+def test_readings_that_are_clipped_are_missing(write: Write) -> None:
+    """On both sides, however often; also in another record that the run predicts."""
+
     def clip(displacement: FloatArray) -> None:
         low, high = np.min(displacement), np.max(displacement)
         np.clip(displacement, 0.8 * low, 0.8 * high, out=displacement)
 
     path = write(change=clip)
     proposal = propose(path, path.parent, Naming())
-    clipped = [finding for finding in proposal.findings if finding.kind == "clipping"]
-    assert len(clipped) == 2
     (source,) = proposal.config.records.values()
-    windows = [re.findall(r"\[([\d.]+), [\d.]+\]", finding.fix) for finding in clipped]
-    assert sum(map(len, windows)) == len(source.exclude or [])
+    assert proposal.record.displacement is not None
+    limits = np.min(proposal.record.displacement), np.max(proposal.record.displacement)
+    assert limits == pytest.approx(source.missing)
+    again = f'{proposal.text}\n[validation.again]\nfile = "{path.name}"\n'
+    problem = resolve(parse(again, str(path)), path.parent)
+    assert () == problem.findings["record"]
+    another = problem.validations["again"].record
+    assert another is not None
+    for record in (problem.record, another):
+        assert record.displacement is not None
+        assert limits[0] < np.nanmin(record.displacement) < np.nanmax(record.displacement)
+        assert np.nanmax(record.displacement) < limits[1]
+    assert source.missing == problem.config.records["record"].missing

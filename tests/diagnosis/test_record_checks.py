@@ -45,7 +45,10 @@ def test_a_displacement_cut_off_at_its_limit_is_clipping(
     first, last = round(finding.start / 1e-3), round(finding.stop / 1e-3) - 1
     assert abs(cut[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
     assert abs(cut[[first - 1, last + 1]]).max() < 0.8
-    assert "use a wider range" == finding.fix
+    value = float(finding.fix.removeprefix("missing = [").removesuffix("] under [record]"))
+    rest = Record(SINE, cut, 1e-3).without_values([value])
+    assert cut.size - np.sum(np.isclose(cut, value)) == rest.readings
+    assert [] == findings_of("clipping", rest)
 
 
 TRAPEZOID = np.clip(SINE, -0.7, 0.7)

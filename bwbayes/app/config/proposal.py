@@ -106,8 +106,10 @@ def _text(
         for table, keys in stated.items()
     }
     usable = record
+    if "missing" in stated["record"]:
+        usable = usable.without_values(json.loads(stated["record"]["missing"][0]))
     if "exclude" in stated["record"]:
-        usable = record.exclude(json.loads(stated["record"]["exclude"][0]))
+        usable = usable.exclude(json.loads(stated["record"]["exclude"][0]))
     held = _held_out(usable)
     # No fit sets aside the spikes that are held out.
     spikes = [s for s in isolated_outliers(record).tolist() for w in held if w.start <= s < w.stop]

@@ -93,6 +93,10 @@ class _Source(ConfigTable):
     """
     fs: Positive | None = key(None, unit="Hz", example="1e3")
     """The file's sampling rate, in place of a time column."""
+    missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
+    """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
+    that is predicted by default those of the training record.
+    """
 
     @model_validator(mode="after")
     def _naming(self) -> Self:

@@ -101,6 +101,7 @@ def predict(
         name = name or Path(str(record)).stem
         alike = options_alike(record or "", problem.config.records[of].read_as)
         record = read_record(record or "", need_displacement=False, **alike)
+    record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
     start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)

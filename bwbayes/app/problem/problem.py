@@ -360,6 +360,7 @@ def _explicit(
             file=f"records/{name}.h5",
             train=source.train,
             from_rest=source.from_rest,
+            missing=source.missing,
             outliers=outliers[name],
             read_as=read_as[name],
             # Said while all were read: the first has them.

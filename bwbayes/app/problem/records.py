@@ -210,10 +210,11 @@ def _read(
 ) -> Record:
     """Return the record that is in memory, or else read the source's file."""
     if in_memory is not None:
-        return replace(in_memory, voltage_is=source.voltage_is or in_memory.voltage_is)
+        record = replace(in_memory, voltage_is=source.voltage_is or in_memory.voltage_is)
+        return record.without_values(source.missing or ())
     assert source.file is not None
     try:
-        return read_record(
+        record = read_record(
             folder / source.file,
             voltage_is=source.voltage_is,
             columns=source.columns,
@@ -222,6 +223,7 @@ def _read(
         )
     except ColumnsError as error:
         raise error.within(table) from None
+    return record.without_values(source.missing or ())
 
 
 def validations_of(
@@ -244,6 +246,8 @@ def validations_of(
             continue
         if source.signal is None:
             record = _read(source, folder, in_memory.get(name), table)
+            if source.missing is None:
+                record = record.without_values(config.records[of].missing or ())
         else:
             stand = stand_of(config, list(training.values()))
             record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))

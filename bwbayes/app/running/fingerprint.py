@@ -45,7 +45,7 @@ def fingerprint(config: Config) -> str:
     # its readings, not by its file's name.
     free_to_change = re.compile(
         r"(name|stand|truth|validation|sampling\.(engine|ess|steps|pilot_steps)"
-        r"|record\.([^.]+\.)?(file|remarks|signal|read_as)|parameters\..*\.(label|description))(\..*)?"
+        r"|record\.([^.]+\.)?(file|missing|remarks|signal|read_as)|parameters\..*\.(label|description))(\..*)?"
     )
     noted = {key: value for key, value in values.items() if not free_to_change.fullmatch(key)}
     return json.dumps({"coordinates": COORDINATES, **noted})
