@@ -251,7 +251,8 @@ class _Sampling:
                 return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
-            if at_end and not is_early and latest.steps_needed > 4 * budget * plan.block:
+            is_hopeless = latest.covered and latest.steps_needed > 4 * budget * plan.block
+            if is_hopeless and at_end and not is_early:
                 why = f"some {latest.steps_needed:.1e} steps would be needed: {'; '.join(missing)}"
                 return Outcome(False, f"step limit {plan.most_steps} out of reach: {why}", latest)
             first = not latest.shortcomings(plan.ess, FIRST_PART)
