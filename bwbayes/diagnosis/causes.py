@@ -159,9 +159,17 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
     size = float(shapes["offset"][0, 0])
-    later = int(np.argmax(np.abs(white) * (np.arange(white.size) > 0)))
-    after: FloatArray = np.where(np.arange(rows.size) >= later, size, 0.0)[np.newaxis]
-    log_density, _, jump = weigh(after)
+    # At the largest innovation or, where nothing is remembered, where the means before and from
+    # there on are farthest apart.
+    order = np.arange(white.size)
+    parted = np.cumsum(white) - white - np.mean(white) * order
+    apart = parted**2 / np.maximum(order * (white.size - order), 1)
+    steps = []
+    for later in (int(np.argmax(np.abs(white) * (order > 0))), int(np.argmax(apart))):
+        after = np.where(order >= later, size, 0.0)[np.newaxis]
+        log_density, _, sizes = weigh(after)
+        steps.append((log_density, later, size * float(sizes[0])))
+    log_density, later, jump = max(steps)
     nats["step"] = log_density - plain - np.log(rows.size)
     line = strongest_line(white, bands.voltage[rows], rows - rows[0], interval) or Line(0.0, "")
     phase = 2 * np.pi * line.frequency * time
@@ -174,7 +182,7 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
         "name": bands.name,
         "settled": clock(settled, interval),
         "size": f"{np.mean(residual):+.3g}",
-        "jump": f"{size * jump[0]:+.2g}",
+        "jump": f"{jump:+.2g}",
         "jumped": clock(time[later], interval),
         "swing": f"{size / 10 * np.hypot(*swing):.2g}",
         "line": f"{line.frequency:.4g} Hz{line.source}",

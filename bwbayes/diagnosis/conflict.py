@@ -107,15 +107,16 @@ def _disagreement(
     if abs(score) <= 3:
         return None
     side = "above" if score > 0 else "below"
-    text = (
-        f"posterior mean {np.mean(values):.3g} {parameter.unit} is {abs(score):.1f} SD {side} its "
-        f"prior {parameter.prior}"
-    )
+    mean = f"{np.mean(values):.3g} {parameter.unit}".rstrip(" -")
+    text = f"posterior mean {mean} is {abs(score):.1f} SD {side} its prior {parameter.prior}"
     wider = default or parameter.prior
-    if wider == parameter.prior:
-        widths = ("sd", "sigma", "scale")
-        double = {k: 2 * v if k in widths else v for k, v in wider.arguments.items()}
-        wider = Distribution(wider.name, double)
+    low, high = (np.asarray(end) for end in parameter.support)
+    if abs(float(np.mean(wider.to_normal(values, low, high)))) > 3:
+        widths, stated = ("sd", "sigma", "scale"), parameter.prior
+        double = {k: 2 * v if k in widths else v for k, v in stated.arguments.items()}
+        wider = Distribution(stated.name, double)
+    if wider == parameter.prior:  # it ends at a bound, which is said where the posterior is near
+        return None
     line = _line(parameter.name, wider)
     fix = f"check the units of prior and record; if both are right, give {line}"
     return Finding(parameter.name, text, fix)

@@ -118,9 +118,12 @@ def _lines(changes: Mapping[str, object]) -> str:
 
 
 def heavy_tails(scene: Scene) -> Iterator[Explanation]:
-    """Try innovations of a Student t distribution, of whatever scale."""
+    """Try innovations of a Student t distribution, of whatever scale, if any might be set aside."""
     white = scene.innovations
-    text = f"outliers ({int(np.sum(np.abs(white) > 5))} of {white.size} innovations beyond 5 SD)"
+    far = int(np.sum(np.abs(white) > 5))
+    if not far:
+        return
+    text = f"outliers ({far} of {white.size} innovations beyond 5 SD)"
     rmse = scene.without[0], scene.fit.rmse
     fix = "set outliers = true in [model]"
     nats = tail_nats(white) - scene.lead

@@ -233,8 +233,8 @@ def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
     # what is uncertain in nine of ten. Some of it may look like a lag.
     thinnest = 3 * np.sqrt(30 / loop.rows.size) * np.std(loop.residual) / _extent(_readings(record))
     if turns.size >= 3 and loop.without_loops > 0.01 and thinnest < 0.005:
-        text = "a curve and a lag explain rising and falling voltage alike"
-        fix = 'hysteresis = "linear" under [model], or drive over more volts'
+        text = "a curve and a lag explain rising and falling voltage alike, over these volts"
+        fix = 'hysteresis = "linear" under [model]'
         yield _whole(record, "no hysteresis", text, fix)
 
 

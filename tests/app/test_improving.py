@@ -88,9 +88,10 @@ def test_several_records_are_refused_in_one_line(tmp_path: Path) -> None:
 
 @given(st.floats(-5, 100), st.floats(0.01, 10), st.floats(0.1, 10))
 def test_nothing_explains_better_that_misses_more(nats: float, rmse: float, ratio: float) -> None:
+    """Nor what chance makes as good once in twenty times."""
     found = Explanation("gain", "a gain that moves", "fix it", nats=nats, rmse=(rmse, ratio * rmse))
     said = list(lines([found]))
-    assert (ratio <= 1 and nats > 0) <= bool(said) <= (ratio <= 1.2 and nats > 0)
+    assert (ratio <= 1 and nats > 3) <= bool(said) <= (ratio <= 1.2 and nats > 2.9)
 
 
 # ``noise = "auto"`` is the one that a record has evidence for, and the run says so

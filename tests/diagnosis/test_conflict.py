@@ -78,6 +78,24 @@ def test_posterior_some_sds_from_its_prior_is_said_with_the_default_as_fix(
     assert [] == said(with_prior("d", normal(mean, 0.08)))
 
 
+def test_a_prior_that_was_widened_is_not_to_be_narrowed_again() -> None:
+    """Where the default would be in conflict too, the advice is a prior twice as wide."""
+    prior = with_prior("d", lognormal(0.1, 0.4))
+    draws = posterior_draws(prior)
+    (finding,) = conflicts(prior, draws, {"d": lognormal(0.1, 0.2)})
+    assert 'give d = { prior = { distribution = "lognormal", median = 0.1, sigma = 0.8 } }' in (
+        finding.fix
+    )
+
+
+def test_a_prior_without_a_width_is_not_advised_again() -> None:
+    uniform = Distribution("uniform", {"lower": 0.0, "upper": 0.7017})
+    prior = with_prior("d", uniform)
+    high = np.random.default_rng(1).normal(0.7012, 1e-4, 2000)
+    findings = conflicts(prior, posterior_draws(prior, d=high), {"d": uniform})
+    assert [] == [found for found in findings if "SD above its prior" in found.text]
+
+
 @pytest.mark.parametrize(
     ("name", "given", "times"),
     [

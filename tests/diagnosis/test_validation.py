@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -166,6 +167,18 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
         verdict = judged(bands_of(wide), Background(record.memory, 0.0, FITTED))
         assert verdict.holds is False
         assert "times too wide" in verdict.reasons[-1]
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_a_step_where_nothing_is_remembered_is_named_with_its_time(number: int) -> None:
+    """Without a discrepancy every reading behind it is as far off, and none says where it was."""
+    generator = np.random.default_rng([9, number])
+    record = made(generator, 20.0, 0.02, 0.05, 1e-6, 0.1, 1e-3)
+    at = float(generator.uniform(0.3, 0.7) * record.time[-1])
+    found = cause(bands_of(record, 4.0 * (record.time > at)), record.memory)
+    assert "step" == found.kind
+    (named,) = re.findall(r"at ([\d.]+) s", found.text)
+    assert at <= float(named) <= at + 0.0201
 
 
 @pytest.mark.parametrize("readings", [1, 2, 3])

@@ -16,6 +16,7 @@ from bwbayes.app.commands.shared import (
     naming_options,
     options_of,
     quiet_option,
+    resumable,
     seed_option,
     show_report,
     working,
@@ -111,15 +112,17 @@ def run(
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
         with working():
             folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
-            problem = folder.problem()
-            remarks = problem.remarks
-        if not quiet:
-            # Of a record alone the remarks are shown already.
-            banners = [] if is_proposal else remarks_banner(remarks)
-            priors = priors_table(problem.posterior.prior)
-            show_report(Report(title="priors", banners=banners, blocks=[priors]))
-        options = {"workers": workers, "executor": executor, "artist": artist}
-        return finish(folder.path, quiet=quiet, problem=problem, **options)
+        with resumable(f"`bwbayes resume {path}`"):
+            with working():
+                problem = folder.problem()
+                remarks = problem.remarks
+            if not quiet:
+                # Of a record alone the remarks are shown already.
+                banners = [] if is_proposal else remarks_banner(remarks)
+                priors = priors_table(problem.posterior.prior)
+                show_report(Report(title="priors", banners=banners, blocks=[priors]))
+            options = {"workers": workers, "executor": executor, "artist": artist}
+            return finish(folder.path, quiet=quiet, problem=problem, **options)
 
 
 @click.command()

@@ -81,6 +81,8 @@ def predict(
     if table in files[1:]:
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
     with working():
+        import numpy as np
+
         from bwbayes.app.fit.fitted import converged
         from bwbayes.app.jobs.predict import predict as predict_record
         from bwbayes.app.jobs.predict import write_prediction
@@ -101,13 +103,20 @@ def predict(
             line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
             raise error.in_command(line) from None
         write_prediction(bands, files, fit.standing)
-    banners = standing_banner(fit.standing)
-    if record is not None and bands.measured is None:
-        unread = (
+    unmeasured, remarks = bands.measured is None, list[str]()
+    if unmeasured and record is not None:
+        remarks.append(
             f"{record}: has no displacement that is recognized, so the bands are not validated; if "
             "a column is one, say --column displacement=NAME"
         )
-        banners += remarks_banner([unread])
+    if unmeasured and not (options["from_rest"] or options["after"]):
+        width = bands.upper["sensor", 95] - bands.lower["sensor", 95]
+        remarks.append(
+            f"the state that the actuator starts from is unknown: the 95% sensor band is "
+            f"{width[0]:.3g} um wide at first, {np.median(width):.3g} um in the median; if it is "
+            "demagnetized, say --from-rest"
+        )
+    banners = [*standing_banner(fit.standing), *remarks_banner(remarks)]
     show_report(Report(title=name, banners=banners))
     # The worse of the two.
     own = bands.standing.holds is False or fit.standing.holds

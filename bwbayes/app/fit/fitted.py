@@ -382,6 +382,6 @@ def converged(path: Path) -> Fit:
     Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
     """
     fit = finished(RunFolder.open(path))
-    fit.require_converged()
     fit.folder.require_finished()
+    fit.require_converged()
     return fit

@@ -48,7 +48,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         for issues in problem.findings.values()
         for finding in issues
     ]
-    nothing = "there is no transient, spike, jump, clipping, drift or the like in the record"
+    nothing = "the record by itself shows no transient, spike, jump, clipping, drift or the like"
+    title = "No issues of the record" if remarks else "No issues found"
     several = len(problem.records) > 1
     about = [fact for subject, fact in problem.facts.items() if subject.startswith("record")]
     about += [why] * bool(why)
@@ -70,7 +71,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
         banners=[
             Banner("note", "Problems of the record", (), problems, (), "problem", name="findings")
             if problems
-            else Banner("good", "No issues found", [nothing]),
+            else Banner("good", title, [nothing]),
             *remarks_banner(remarks),
         ],
         blocks=[

@@ -97,6 +97,11 @@ def predict(
         if after:
             return predict_after(problem, fit.flat_draws, voltage, name, of)
         record = Record(voltage, None, interval, origin=f"{signal} signal")
+    elif not isinstance(record, Record | str | Path):
+        raise InputError(
+            f"predict: {type(record).__name__} is no record; give a file, or "
+            "`Record.from_arrays(voltage, interval=...)`"
+        )
     elif not isinstance(record, Record):
         name = name or Path(str(record)).stem
         alike = options_alike(record or "", problem.config.records[of].read_as)

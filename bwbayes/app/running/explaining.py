@@ -62,14 +62,14 @@ def explained(
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
-    """Write those of the best five explanations that are worth anything, a line each.
+    """Write those of the best five explanations that chance makes less probable, a line each.
 
     Not those with which the model misses more: their evidence is that of the discrepancy, which
     takes it up.
     """
     for explanation in explanations[:5]:
         without, with_it = explanation.rmse
-        if explanation.nats > 0 and not with_it > 1.1 * without:
+        if explanation.nats > TIED and not with_it > 1.1 * without:
             text = f"{explanation.text} ({explanation.worth})"
             yield f"explained better by: {text}. Fix: {explanation.fix}."
 
