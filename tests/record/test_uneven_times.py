@@ -168,6 +168,40 @@ def test_repeated_times_leave_a_record_as_it_was(
 
 
 @given(
+    st.integers(20, 600),
+    st.sampled_from(["all", "some", "one"]),
+    st.sampled_from([0.005, 0.0013, 0.0031]),
+    st.sampled_from([0.0, -3.0, 1.7e9]),
+    st.integers(0, 2**32),
+)
+@example(2000, "all", 0.005, 0.0, 0)
+def test_copied_rows_leave_a_record_as_it_was(
+    samples: int, which: str, interval: float, start: float, seed: int
+) -> None:
+    """Whether every row is written twice or some are any number of times, of a clock of 1 ms."""
+    rng = np.random.default_rng(seed)
+    index = np.arange(samples)
+    time = start + np.round(interval * index, 3)
+    voltage = 30 * np.sin(index / 40)
+    displacement = 0.4 * voltage + rng.normal(size=samples)
+    displacement[rng.random(samples) < 0.05] = np.nan
+    counts = np.full(samples, 2)
+    if which != "all":
+        counts = 1 + rng.integers(0, 3, samples) * (which == "some")
+        counts[rng.integers(samples)] = 2
+    rows = np.repeat(index, counts)
+    try:
+        whole = uneven(time, voltage, displacement)
+    except InputError:  # too short for its clock
+        return
+    with warnings.catch_warnings(record=True) as remarks:
+        warnings.simplefilter("always")
+        record = Record.from_arrays(voltage[rows], displacement[rows], time=time[rows])
+    assert f": {rows.size - samples} equal to the row above" in str(remarks[0].message)
+    assert whole.sha256 == record.sha256
+
+
+@given(
     st.integers(1, 60),
     st.floats(12, 400),
     st.floats(0, 2 * np.pi),

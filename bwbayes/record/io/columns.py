@@ -144,7 +144,7 @@ class ColumnTable:
     def only(self, rows: IntArray) -> ColumnTable:
         """Return the table of some of its rows."""
         columns = {q: replace(c, values=c.values[rows]) for q, c in self.columns.items()}
-        return replace(self, columns=columns, rows=rows)
+        return replace(self, columns=columns, rows=rows if self.rows is None else self.rows[rows])
 
 
 def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.series import MAXIMUM_SAMPLES
@@ -93,21 +93,30 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
     interval = float(elapsed[-1]) / steps.size
     sample = int(np.argmax(steps < 0))
     times = stamps[sample : sample + 2] - offset
-    before, after = (f"{clock(time, float(np.abs(steps).mean()))} s" for time in times)
+    earlier, later = (f"{clock(time, float(np.abs(steps).mean()))} s" for time in times)
     if steps[sample] < 0:
-        problem = f"time goes back from {before} to {after}; sort the rows, or cut the file there"
+        problem = f"time goes back from {earlier} to {later}; sort the rows, or cut the file there"
         raise table.error(problem, "time", sample + 1)
     if interval == 0:
-        problem = f"all times are {after}; give those of the samples, or `fs=HZ` for them"
+        problem = f"all times are {later}; give those of the samples, or `fs=HZ` for them"
         raise table.error(problem, "time")
     require_plausible(table, interval, elapsed.size)
     # What a number of the time column may be rounded off in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
+    is_repeat = np.append(False, steps == 0)
+    is_copy = is_repeat.copy()
+    for name in table.columns:
+        before, after = table.columns[name].values[:-1], table.columns[name].values[1:]
+        is_copy[1:] &= (after == before) | (np.isnan(after) & np.isnan(before))
+    # A coarse clock repeats times, but not all that is read at them.
+    if is_copy.any() and (is_copy == is_repeat).all():
+        table, elapsed = _without_repeats(table, elapsed, start - offset, is_copy)
+        stamps, steps, samples = start + elapsed, np.diff(elapsed), np.arange(elapsed.size)
     uniform = _uniform_interval(table, stamps, elapsed, samples, rounding)
     if uniform := uniform or _rounded_interval(table, elapsed):
         return table, Grid(start - offset, uniform, offset)
     if (steps == 0).any():
-        table, elapsed = _without_repeats(table, elapsed, start - offset)
+        table, elapsed = _without_repeats(table, elapsed, start - offset, is_copy)
         stamps = start + elapsed
     positions = _with_gaps(table, np.diff(elapsed))
     if uniform := _uniform_interval(table, stamps, elapsed, positions, rounding):
@@ -125,12 +134,13 @@ def require_plausible(table: ColumnTable, interval: float, samples: int) -> None
 
 
 def _without_repeats(
-    table: ColumnTable, elapsed: FloatArray, start: float
+    table: ColumnTable, elapsed: FloatArray, start: float, is_copy: BoolArray
 ) -> tuple[ColumnTable, FloatArray]:
     """Return a table in which no time is repeated, and its times, s after ``start``.
 
-    Of rows that are equal one is retained. Others of the same time go on or back to times where
-    samples are missing, as a logger writes them that is late, or are left out.
+    Rows that are a copy of the one above, ``is_copy`` (samples,), are left out. Others of the same
+    time go on or back to times where samples are missing, as a logger writes them that is late, or
+    are left out.
 
     Raises
     ------
@@ -144,10 +154,6 @@ def _without_repeats(
     """
     steps = np.diff(elapsed)
     is_repeat = np.append(False, steps == 0)
-    is_copy = is_repeat.copy()
-    for column in table.columns.values():
-        before, after = column.values[:-1], column.values[1:]
-        is_copy[1:] &= (after == before) | (np.isnan(after) & np.isnan(before))
     rows = np.flatnonzero(~is_copy)
     times, first, of = np.unique(elapsed[rows], return_index=True, return_inverse=True)
     counts = np.bincount(of)
