@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
+from bwbayes.record.io.columns import Naming, select
 from bwbayes.record.io.formats import require_readable
+from bwbayes.record.io.series import frame_source
 from bwbayes.record.io.units import power_of, unit_in
 
 TIME = np.arange(200) / 100
@@ -178,6 +180,24 @@ def test_units_of_time_are_asked_for_with_their_rates(
     line = rf"{name}' is 0.5 Hz for 398 s in s, 500 Hz for 0.398 s in ms, 500000 Hz for"
     with pytest.raises(ColumnsError, match=line):
         read_record(write(tmp_path / "a.csv", values), columns=columns)
+
+
+@given(
+    st.sampled_from([("time", "ms"), ("time", "us"), ("voltage", "mV"), ("displacement", "nm")]),
+    st.sampled_from(["{}_since_midnight", "logged {} of it", "raw.{}-now", "a ({}) b"]),
+    st.booleans(),
+)
+def test_a_unit_anywhere_in_a_name_is_the_guess(
+    unit: tuple[str, str], form: str, is_named: bool
+) -> None:
+    """It is only suggested, whether its column is named or guessed as well."""
+    quantity, name = unit[0], form.format(unit[1])
+    values = {"time_s": TIME, "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT}
+    usual = next(key for key in values if key.startswith(quantity))
+    frame = pd.DataFrame(values).rename(columns={usual: name})
+    with pytest.raises(ColumnsError) as caught:
+        select(frame_source(frame, "a"), Naming({quantity: name} if is_named else {}))
+    assert f"--unit {quantity}={unit[1]}" in str(caught.value.in_command("bwbayes run a.csv"))
 
 
 def test_a_sensors_volts_are_asked_for_with_their_sensitivity(tmp_path: Path) -> None:

@@ -273,6 +273,12 @@ def _unit_of(label: str, unit: str, quantity: str) -> str | None:
     return unit if power_of(unit, quantity) is not None else unit_in(label, quantity)
 
 
+def _guess(label: str, quantity: str) -> str:
+    """Return the unit that stands anywhere in a name, as in ``ms_since_midnight``, or the usual."""
+    words = (word for word in re.split(r"[\W_]+", label) if power_of(word, quantity) is not None)
+    return next(words, COMMON_UNITS[quantity][0])
+
+
 def _columns_error(
     source: Source,
     naming: Naming,
@@ -312,7 +318,7 @@ def _columns_error(
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
     columns, sensitivities = dict(naming.columns), []
-    units = {q: COMMON_UNITS[q][0] for q in unknown} | dict(naming.units)
+    units = {q: _guess(chosen[q].label, q) for q in unknown} | dict(naming.units)
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
         words = [word for word in _WORDS[quantity] if len(word) > 3]
@@ -325,7 +331,7 @@ def _columns_error(
         stated = [unit for q in QUANTITIES if (unit := _unit_of(pool[0].label, pool[0].unit, q))]
         if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
             clock = pool[0] if quantity == "time" else clock
-            guess = COMMON_UNITS[quantity][0]
+            guess = _guess(pool[0].label, quantity)
             if stated and quantity not in units:  # as of a sensor's volts
                 sensitivities.append(f"how many {guess} is 1 {stated[0]} of {pool[0].name!r}")
                 guess = f"1 {guess}"
