@@ -169,6 +169,10 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     units = {q: naming.units.get(q) or _unit_of(s.label, s.unit, q) for q, s in chosen.items()}
     if "time" in units:
         units["time"] = units["time"] or epoch_unit(chosen["time"].label, _finite(chosen["time"]))
+    for series in (chosen[q] for q in chosen if "V" in naming.units.get(q, "") and q != "voltage"):
+        if (stated := _unit_of(series.label, series.unit, "voltage")) not in (None, "V"):
+            advice = f"say how many um is 1 {stated}, as '0.35 um'"
+            raise InputError(f"{source.path}: {series.name}: in {stated}, not in V; {advice}")
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
         raise _columns_error(source, naming, chosen, missing, unknown)

@@ -34,15 +34,23 @@ def power_of(unit: str, quantity: str) -> int | None:
 def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
     """Return the factor and the power of ten that lead from a user's unit to s, V or um, or None.
 
-    A number before it is what 1 in the column stands for, a minus turns the sign: ``-0.35 um``.
+    A number before it is what 1 in the column stands for, a minus turns the sign: ``-0.35 um``. As
+    data sheets write a sensitivity, that is ``0.35 um/V`` or ``2.9 V/um``, or with counts, digits
+    or LSB. A voltage per V is none, as it may be an amplifier's gain or its monitor's.
     """
     number = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-    written = re.fullmatch(rf"(-?)({number}|)\s*(\S*)", unit.strip())
-    power = power_of(written[3], quantity) if written else None
+    reading = f"(?i:counts?|digits?|LSB{'|V' if quantity == 'displacement' else ''})"
+    written = re.fullmatch(
+        rf"(-?)({number}|)\s*(?:({reading})\s*/\s*(\S+)|(\S*?)(?:\s*/\s*{reading})?)", unit.strip()
+    )
+    power = power_of(written[4] or written[5], quantity) if written else None
     if written is None or power is None:
         return None
     factor = float(f"{written[1]}{written[2] or 1}")
-    return (factor, power) if 0 < abs(factor) < math.inf else None
+    if not 0 < abs(factor) < math.inf:
+        return None
+    factor = 1 / factor if written[3] else factor
+    return (factor, power) if abs(factor) < math.inf else None
 
 
 def unit_in(name: str, quantity: str) -> str | None:
