@@ -182,6 +182,8 @@ def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
         where = f"record.csv:17: {HEADER.split(',')[column]}: "
         word = text in ("OVERLOAD", "---", "no signal", "∞")
         problem = f"{text!r} is not a number" if word else "no number (empty or nan); give one, or"
+        if column == 1 and not word:  # left out, and its gap is not one to bridge
+            where, problem = "record.csv:18: time_s: ", "gap of 0.01 s after 0.07 s, about 1 miss"
         assert fault(tmp_path, cell(17, column, text)).startswith(where + problem)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record
+from bwbayes.record.io.fields import VoltageIs
 
 
 def uneven(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Record:
@@ -234,6 +235,40 @@ def test_a_gap_in_a_smooth_output_is_bridged_right_and_another_refused(
     assert (2000, index.size) == (record.samples, record.readings)
     np.testing.assert_allclose(record.voltage, voltage, atol=1.5)
     np.testing.assert_array_equal(record.voltage[index], arrays[0])
+
+
+@given(
+    st.sets(st.integers(1, 1998), min_size=1, max_size=200),
+    st.sampled_from([0, 3, 10]),
+    st.sampled_from([0.0, 0.1]),
+    st.sampled_from(["command", "output"]),
+    st.integers(0, 2**32),
+)
+def test_a_time_without_a_voltage_is_a_missing_sample(
+    places: set[int], every: int, jitter: float, kind: VoltageIs, seed: int
+) -> None:
+    """Wherever they are, at random or every few samples, of any clock, with other samples missing.
+
+    They are bridged as other gaps are, and have no reading; at an end, or without times, refused.
+    """
+    rng, index = np.random.default_rng(seed), np.delete(np.arange(2000), [100, 1500])
+    missing = sorted({*places, *range(1, 1999, every or 2000)} - {100, 1500})
+    voltage = 50 * np.sin(np.arange(2000) / 300)
+    is_missing = np.isin(index, missing)
+    time = 0.005 * (index + jitter * rng.uniform(-1, 1, index.size))
+    stated = np.where(is_missing, np.nan, voltage[index])
+    with warnings.catch_warnings(record=True) as remarks:
+        warnings.simplefilter("always")
+        record = Record.from_arrays(stated, 0.4 * voltage[index], time=time, voltage_is=kind)
+    assert f"{len(missing) + 2} samples are missing" in str(remarks[-1].message)
+    assert record.interval == pytest.approx(0.005, rel=1e-3)
+    assert sorted([*missing, 100, 1500]) == np.flatnonzero(~record.has_reading).tolist()
+    np.testing.assert_allclose(record.voltage, voltage, atol=0.5 if kind == "output" else 3.0)
+    stated[0] = np.nan
+    with pytest.raises(InputError, match=r"arrays:sample 0: voltage: no number \(empty or nan\)"):
+        uneven(time, stated, voltage[index])
+    with pytest.raises(InputError, match=r"voltage: no number \(empty or nan\)"):
+        Record.from_arrays(np.where(is_missing, np.nan, voltage[index]), voltage[index], interval=1)
 
 
 def test_a_gap_in_an_output_of_pulses_or_noise_is_refused() -> None:

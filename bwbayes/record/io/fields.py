@@ -2,9 +2,9 @@
 
 What all formats share is checked here: lengths, finite numbers, a voltage and a displacement that
 move. A displacement may be missing here and there (nan, or a number far from all others), and so
-may whole samples where the voltage is known: a command is held, and an output is interpolated where
-that is right elsewhere. A problem is one line, ``file:line: column: problem; what to do``; files
-without lines name the sample, counted from 0.
+may whole samples, as times without a voltage are, where the voltage is known: a command is held,
+and an output is interpolated where that is right elsewhere. A problem is one line,
+``file:line: column: problem; what to do``; files without lines name the sample, counted from 0.
 """
 
 from __future__ import annotations
@@ -58,6 +58,11 @@ def record_fields(
     except InputError as error:
         raise table.error(str(error)) from error
     table, grid = _grid(table)
+    is_missing = np.isnan(table.columns["voltage"].values) & ("time" in table.columns)
+    is_missing[[0, -1] if grid.sources is None else grid.sources[[0, -1]]] = False
+    if is_missing.any():
+        rows = np.flatnonzero(~is_missing)
+        table, grid = table.only(rows), grid.only(rows)
     if "displacement" in table.columns:
         table = _without_marks(table)
     values = {name: _converted(table, name) for name in table.columns if name != "time"}

@@ -35,6 +35,17 @@ class Grid(NamedTuple):
     sources: IntArray | None = None
     elapsed: FloatArray | None = None
 
+    def only(self, rows: IntArray) -> Grid:
+        """Return the grid of some of its samples, (rows,), with those at both its ends."""
+        if self.positions is None or self.sources is None:
+            return self._replace(positions=rows, sources=np.arange(rows.size))
+        has_sample = np.isin(self.sources, rows)
+        return self._replace(
+            positions=self.positions[has_sample],
+            sources=np.searchsorted(rows, self.sources[has_sample]),
+            elapsed=None if self.elapsed is None else self.elapsed[rows],
+        )
+
     def filled(self, values: FloatArray) -> FloatArray:
         """Return a column (samples,) at all times of the grid, nan where no sample is.
 
