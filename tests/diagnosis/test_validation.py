@@ -175,7 +175,7 @@ def test_a_step_where_nothing_is_remembered_is_named_with_its_time(number: int) 
     generator = np.random.default_rng([9, number])
     record = made(generator, 20.0, 0.02, 0.05, 1e-6, 0.1, 1e-3)
     at = float(generator.uniform(0.3, 0.7) * record.time[-1])
-    found = cause(bands_of(record, 4.0 * (record.time > at)), record.memory)
+    found = cause(bands_of(record, np.where(record.time > at, 4.0, 0.0)), record.memory)
     assert "step" == found.kind
     (named,) = re.findall(r"at ([\d.]+) s", found.text)
     assert at <= float(named) <= at + 0.0201
