@@ -258,6 +258,12 @@ def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None
     assert "VALIDATION FAILED" in repr(bands)
 
 
+def test_what_is_no_record_is_not_predicted(opened: Fit) -> None:
+    array: Any = np.zeros(20)
+    with pytest.raises(bw.InputError, match="ndarray is no record; give a file, or "):
+        opened.predict(array)
+
+
 # Keys
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,6 +62,18 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
         exact = multivariate_normal.logpdf(readings, center, covariance + added)
         fitted = climb(posterior, np.zeros((1, 2)), effect)
         np.testing.assert_allclose(fitted.log_evidence, exact, rtol=1e-6)
+
+
+def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
+    """Levels of a coarse sensor are not normal either, and none is far."""
+    coarse = np.zeros(3000)
+    coarse[::7], coarse[3::7] = 3.0, -3.0
+    assert model.tail_nats(coarse) > LIMIT
+    seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0)
+    seen.fit = SimpleNamespace(rmse=1.0)
+    assert [] == [*model.heavy_tails(seen)]
+    coarse[7] = 6.0
+    assert 1 == len([*model.heavy_tails(seen)])
 
 
 FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
