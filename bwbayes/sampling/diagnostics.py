@@ -78,8 +78,9 @@ class Check:
 
     @property
     def steps_needed(self) -> float:
-        """Steps after which walkers would agree, by how they differ now: R² − 1 ∝ 1/steps."""
-        return self.steps * (self.walker_rhat**2 - 1) / (LARGEST_WALKER_RHAT**2 - 1)
+        """Steps, to two digits, for walkers to agree, as they differ now: R² − 1 ∝ 1/steps."""
+        steps = self.steps * (self.walker_rhat**2 - 1) / (LARGEST_WALKER_RHAT**2 - 1)
+        return float(f"{steps:.1e}")
 
     def shortcomings(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.

@@ -253,7 +253,7 @@ class _Sampling:
                 return None
             is_hopeless = latest.covered and latest.steps_needed > 4 * budget * plan.block
             if is_hopeless and at_end and not is_early:
-                why = f"some {latest.steps_needed:.1e} steps would be needed: {'; '.join(missing)}"
+                why = f"about {latest.steps_needed:.0f} steps are needed: {'; '.join(missing)}"
                 return Outcome(False, f"step limit {plan.most_steps} out of reach: {why}", latest)
             first = not latest.shortcomings(plan.ess, FIRST_PART)
             ess = latest.lowest_ess

@@ -152,7 +152,7 @@ def test_budget_that_is_out_of_reach_is_not_used_up() -> None:
     plan, posterior = replace(PLAN, most_steps=8000), target(thin_rings, 2)
     chain, outcome = run(plan, 2, posterior, point_at([0.0, 0.0]))
     assert not outcome.converged
-    assert outcome.stop_reason.startswith("step limit 8000 out of reach: some ")
+    assert outcome.stop_reason.startswith("step limit 8000 out of reach: about ")
     steps = chain.steps("sampling")
     assert steps + chain.set_aside * plan.block < 0.3 * plan.most_steps
     with ThreadPoolExecutor(1) as pool:

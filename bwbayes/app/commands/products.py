@@ -112,7 +112,7 @@ def predict(
     if unmeasured and not (options["from_rest"] or options["after"]):
         width = bands.upper["sensor", 95] - bands.lower["sensor", 95]
         remarks.append(
-            f"the state that the actuator starts from is unknown: the 95% sensor band is "
+            "the state that the actuator starts from is unknown: the 95% sensor band is "
             f"{width[0]:.3g} um wide at first, {np.median(width):.3g} um in the median; if it is "
             "demagnetized, say --from-rest"
         )

@@ -188,8 +188,8 @@ class Fit(Shown):
 
     @property
     def _more_steps(self) -> int:
-        needed = float(f"{self.outcome.check.steps_needed:.1e}")
-        return max(2 * self.problem.config.sampling.steps, int(np.nan_to_num(needed, posinf=0.0)))
+        needed = np.nan_to_num(self.outcome.check.steps_needed, posinf=0.0)
+        return max(2 * self.problem.config.sampling.steps, int(needed))
 
     @property
     def numbers(self) -> dict[str, object]:

@@ -62,7 +62,7 @@ def explained(
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
-    """Write those of the best five explanations that chance makes less probable, a line each.
+    """Write those of the best five explanations whose odds are above twenty to one, a line each.
 
     Not those with which the model misses more: their evidence is that of the discrepancy, which
     takes it up.
