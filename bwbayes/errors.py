@@ -85,13 +85,18 @@ class ColumnsError(InputError):
 
     def in_command(self, command: str) -> InputError:
         """Return the error for the command line, with the whole command to copy."""
-        options = [
-            f"--{key.removesuffix('s')} {quantity}={quote(text)}"
-            for key, table in self.guess.items()
-            for quantity, text in table.items()
-        ]
-        options += [] if self.fs is None else [f"--fs {self.fs:g}"]
-        return InputError(f"{self.problem}; copy and correct: {' '.join([command, *options])}")
+        typed = with_naming(command, self.guess, self.fs)
+        return InputError(f"{self.problem}; copy and correct: {typed}")
+
+
+def with_naming(command: str, tables: Mapping[str, Mapping[str, str]], fs: float | None) -> str:
+    """Return a command with the options that say columns and units by quantity, and the rate."""
+    options = [
+        f"--{key.removesuffix('s')} {quantity}={quote(text)}"
+        for key, table in tables.items()
+        for quantity, text in table.items()
+    ]
+    return " ".join([command, *options, *([] if fs is None else [f"--fs {fs:.12g}"])])
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -134,6 +135,16 @@ def test_what_makes_a_fit_pointless_is_one_line(
     assert re.search(line, str(done.exception)), str(done.exception)
     assert "" == done.output
     assert ["mine.csv"] == [one.name for one in path.parent.iterdir()]
+
+
+def test_the_command_that_writes_the_config_has_the_options_that_were_given(write: Write) -> None:
+    path = write(header="time_s,voltage_V,pos 1", change=_turned)
+    given = "--column", "displacement=pos 1", "--unit", "displacement=0.5 um"
+    error = str(command("run", path, *given).exception)
+    (typed,) = re.findall("write a config with `bwbayes (.*)` and run that", error)
+    assert ["init", str(path), *given] == shlex.split(typed)
+    assert 0 == command(*shlex.split(typed)).return_value
+    assert path.with_suffix(".toml").exists()
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1e3, 1.0), (1.0, 1e-4, 1.0), (1.0, 1.0, 1e4)])

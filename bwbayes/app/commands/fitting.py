@@ -22,7 +22,13 @@ from bwbayes.app.commands.shared import (
     working,
 )
 from bwbayes.app.running.figure_worker import artist_of
-from bwbayes.errors import ColumnsError, InputError, NoNumbersError, refuse_unwritable
+from bwbayes.errors import (
+    ColumnsError,
+    InputError,
+    NoNumbersError,
+    refuse_unwritable,
+    with_naming,
+)
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
@@ -183,18 +189,19 @@ def _config_or_proposal(
             "of numbers"
         ) from None
     config = proposal.config
+    tables = {key: naming[key] for key in ("columns", "units")}
+    init = with_naming(f"bwbayes init {shlex.quote(str(path))}", tables, naming["fs"])
     if command != "check" and proposal.pointless is not None:
         raise InputError(
             f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "
-            f"with `bwbayes init {path}` and run that"
+            f"with `{init}` and run that"
         )
     if not quiet:
         train = ", ".join(f"{a:g} to {b:g}" for a, b in config.records["record"].train or ())
         held_out = "the rest" if "held_out" in config.validation else "nothing"
         _show(
             proposal,
-            f"training on {train} s, holding out {held_out}; "
-            f"save this config with `bwbayes init {path}`",
+            f"training on {train} s, holding out {held_out}; save this config with `{init}`",
         )
     return config if record is None else config.with_record(record), True
 
