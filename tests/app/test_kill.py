@@ -175,12 +175,26 @@ def test_killed_at_every_stage_it_resumes_to_the_same_bits(run: Path, tmp_path: 
     small.assert_same_end(run, folder)
 
 
-IN_A_CALLBACK = """
+# Where a request to stop would be lost: in what C calls, such as what loads a compiled function,
+# and in a library that, while it is loaded, takes whatever happens for something that is missing.
+LOSES_IT = {
+    "callback": "ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.{name}))()",
+    "import": "import loses_it",
+}
+LIBRARY = """
+import os, signal
+
+try:
+    os.kill(os.getpid(), signal.{name})
+except BaseException:
+    pass
+"""
+ASKED = """
 import ctypes, os, signal, time
 from bwbayes.app.commands import cli
 
 def wait(*_, **__):
-    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    {loses_it}
     time.sleep({seconds})
 
 cli.cli.main = wait
@@ -188,10 +202,13 @@ cli.main()
 """
 
 
-def test_a_request_that_falls_into_a_callback_is_not_lost() -> None:
-    """What C calls cannot raise, such as what loads a compiled function."""
-    code = IN_A_CALLBACK.format(seconds=PATIENCE)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("where", LOSES_IT)
+def test_no_request_to_stop_is_lost(where: str, name: str, tmp_path: Path) -> None:
+    (tmp_path / "loses_it.py").write_text(LIBRARY.format(name=name))
+    code = ASKED.format(loses_it=LOSES_IT[where].format(name=name), seconds=PATIENCE)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (130, "bwbayes: interrupted\n") == (done.returncode, done.stderr)
 
 

@@ -16,6 +16,7 @@ import threading
 import warnings
 from concurrent.futures import BrokenExecutor
 from concurrent.futures.process import BrokenProcessPool
+from types import FrameType
 
 import click
 
@@ -102,23 +103,41 @@ def _failure(error: BaseException) -> tuple[str, int]:
     return f"bwbayes: {as_typed(text)}", status
 
 
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """End what is under way, but a library that is being loaded only once it is there.
+
+    What it loads in C may lose an interruption, or take it for a module that is missing.
+    """
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    if frame is None:
+        raise KeyboardInterrupt
+    _ask_again()
+
+
+def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+    """End what is under way, where the request fell into a callback, which cannot raise."""
+    if ignored.exc_type is KeyboardInterrupt:
+        _ask_again()
+    else:
+        sys.__unraisablehook__(ignored)
+
+
+def _ask_again() -> None:
+    """Ask this process to stop, a little later."""
+    threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
+
+
 def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
     # To load libraries and to compile makes hundreds of thousands of objects that stay: to look for
     # garbage among them again and again would take a twentieth of a run.
     gc.set_threshold(50_000, 1_000)
     # A polite request to stop ends a run as Ctrl-C does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-    def interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
-        # The request fell into a callback, which cannot raise.
-        if ignored.exc_type is KeyboardInterrupt:
-            # Later: raised in here it would be lost too.
-            threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
-        else:
-            sys.__unraisablehook__(ignored)
-
-    sys.unraisablehook = interrupt_again
+    signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # nohup ignores it
+        signal.signal(signal.SIGINT, _interrupt)
+    sys.unraisablehook = _interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"bwbayes: {as_typed(str(message))}\n"
     try:
         status = cli.main(sys.argv[1:] or ["--help"], standalone_mode=False)
