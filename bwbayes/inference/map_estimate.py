@@ -216,7 +216,7 @@ def _mode(
         # Each round measures in the units of the last curvature: finite differences need them.
         solution = scipy.optimize.minimize(
             surface.value,
-            surface.inwards(position),
+            np.zeros(position.size),
             jac=surface.gradient,
             hess=surface.hessian,
             method="trust-exact",
@@ -228,9 +228,8 @@ def _mode(
         surface = surface.rescaled(position, curvature)
         if settled:
             break
-    return _Mode(
-        position, surface.axes @ surface.axes.T, -float(surface.value(surface.inwards(position)))
-    )
+    height = -surface.value(np.zeros(position.size))
+    return _Mode(position, surface.axes @ surface.axes.T, height)
 
 
 def _units(posterior: Posterior, position: FloatArray, spread: FloatArray) -> FloatArray:
@@ -269,13 +268,6 @@ class _Surface:
     def outwards(self, w: FloatArray) -> FloatArray:
         position: FloatArray = self.center + w @ self.axes.T
         return position
-
-    def inwards(self, position: FloatArray) -> FloatArray:
-        with warnings.catch_warnings():
-            # Axes of very different lengths are as they should be.
-            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-            w: FloatArray = scipy.linalg.solve(self.axes, position - self.center)
-        return w
 
     def values(self, w: FloatArray) -> FloatArray:
         # A finite wall keeps the trust region's arithmetic alive where the density is zero.
