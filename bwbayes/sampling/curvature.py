@@ -3,18 +3,24 @@
 Along a ridge that a record hardly tells, other parameters follow the one that is free, and seldom
 in a straight line: the ridge is a hundred times as long as wide, and bent by many times its width.
 No few ellipsoids cover it. A :class:`QuadraticMap` takes the draws' principal coordinates, longest
-first, and lets each bend quadratically with those before it. That changes no volume, so a
+first, and lets each bend quadratically with those before it. Of two sds a record may tell hardly
+more than what they are together: the ridge is then two legs at a right angle, which a
+:class:`TotalMap` puts in line. Neither changes volumes, but for the units of the first, so a
 distribution of the straight coordinates is one of the bent ones, density and all.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
+from bwbayes.inference.parameters import JointPrior
 
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
@@ -119,6 +125,79 @@ class QuadraticMap:
                     last += 1
                 chunk[:, j] -= products[:, :end] @ self.bends[:end, j]
         return z.reshape(bent.shape)
+
+
+@dataclass(frozen=True)
+class TotalMap:
+    """The map from straight coordinates y to those x of pairs of sds a and b that add up.
+
+    With ln a = c₁ + s₁ x₁ and ln b = c₂ + s₂ x₂,
+
+        s₁ y₁ = ln √(a² + b²),   s₂ y₂ = ln (b / a),
+
+    and all other coordinates stay what they are.
+
+    Parameters
+    ----------
+    rows
+        The coordinates of a and b, (pairs, 2).
+    center
+        c, (pairs, 2).
+    scale
+        s, (pairs, 2).
+    """
+
+    rows: IntArray
+    center: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of_noise(cls, prior: JointPrior) -> TotalMap | None:
+        """Take the sds of each record's sensor and discrepancy, where both are free and lognormal.
+
+        None if there are no such pairs.
+        """
+        forms = {
+            (p.plain, p.record): (row, p.formula)
+            for row, p in enumerate(prior.free)
+            if p.formula is not None and p.formula.logarithmic
+        }
+        records = dict.fromkeys(record for _, record in forms)
+        wanted = [[(sd.name, record) for sd in (SENSOR_SD, DISCREPANCY_SD)] for record in records]
+        pairs = [[forms[key] for key in pair] for pair in wanted if forms.keys() >= {*pair}]
+        if not pairs:
+            return None
+        rows = [[row for row, _ in pair] for pair in pairs]
+        scales = [[(math.log(form.center), form.scale) for _, form in pair] for pair in pairs]
+        center, scale = np.moveaxis(np.array(scales), -1, 0)
+        return cls(np.array(rows), center, scale)
+
+    def to_curved(self, straight: FloatArray) -> FloatArray:
+        """Return x (..., free) of y (..., free)."""
+        x = straight.copy()
+        total, ratio = np.moveaxis(self.scale * straight[..., self.rows], -1, 0)
+        a = total - 0.5 * np.logaddexp(0.0, 2 * ratio)
+        x[..., self.rows] = (np.stack([a, a + ratio], axis=-1) - self.center) / self.scale
+        return x
+
+    def to_straight(self, bent: FloatArray) -> FloatArray:
+        """Return y (..., free) of x (..., free)."""
+        y = bent.copy()
+        a, b = np.moveaxis(self.center + self.scale * bent[..., self.rows], -1, 0)
+        together = np.stack([0.5 * np.logaddexp(2 * a, 2 * b), b - a], axis=-1)
+        y[..., self.rows] = together / self.scale
+        return y
+
+    def slopes(self, bent: FloatArray) -> FloatArray:
+        """Return ∂y/∂x (places, free, free) at x (places, free)."""
+        free = bent.shape[1]
+        slopes = np.broadcast_to(np.eye(free), (len(bent), free, free)).copy()
+        for (i, j), center, (s_i, s_j) in zip(self.rows, self.center, self.scale, strict=True):
+            a, b = (center + (s_i, s_j) * bent[:, [i, j]]).T
+            share = scipy.special.expit(2 * (b - a))
+            slopes[:, i, i], slopes[:, i, j] = 1 - share, share * s_j / s_i
+            slopes[:, j, i] = -s_i / s_j
+        return slopes
 
 
 def subsample(draws: FloatArray, count: int) -> FloatArray:

@@ -3,13 +3,12 @@
 A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian. A
 skewed one, with a long tail along some ridge, takes a few of them: a mixture fitted by expectation
 maximization, in coordinates that straighten the ridge if it is curved
-(:class:`~bwbayes.sampling.curvature.QuadraticMap`). Heavy tails on every component keep the ratio
+(:mod:`bwbayes.sampling.curvature`). Heavy tails on every component keep the ratio
 of posterior to proposal bounded.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -19,10 +18,11 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.curvature import QuadraticMap, subsample
+from bwbayes.sampling.curvature import QuadraticMap, TotalMap, subsample
 from bwbayes.shown import brief
 
 _ARRAYS = ("weights", "centers", "factors", "freedom")
+_MAPS = {"bend": QuadraticMap, "totals": TotalMap}
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class StudentMixture:
         Lⱼ, lower triangular, (components, free, free).
     bend
         What makes the coordinates in which they are straight; None for the coordinates themselves.
+    totals
+        What puts pairs of sds in line before that; None if there are none.
     freedom
         ν; small enough for tails heavier than the posterior's.
     """
@@ -53,6 +55,7 @@ class StudentMixture:
     centers: FloatArray
     factors: FloatArray
     bend: QuadraticMap | None = None
+    totals: TotalMap | None = None
     freedom: float = 6.0
 
     @classmethod
@@ -67,9 +70,9 @@ class StudentMixture:
         Of three components, or up to six where draws are many: few would be followed too closely.
         With their log densities (count,) under what they are drawn from, the mixture gets one more
         component, of the draws where log p − log q is largest: a walker that is there would hardly
-        be led away. Modes that a first ``guess`` has beside the most probable one get a component
-        each, and as much as a twentieth of the draws would give it, however few there are: a mode
-        that is not proposed is not found again. What bends the coordinates is the first mode.
+        be led away. Modes that a first ``guess`` has beside the most probable one get a twentieth
+        each besides, as the guess has them: a mode that is not proposed is not found again. What
+        bends the coordinates is the first mode; pairs of sds are in line as in the guess.
 
         Raises
         ------
@@ -77,20 +80,22 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
-        count, straightened, modes = len(draws), draws, draws[:0]
-        if guess is not None and guess._lesser:
-            likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
-            straightened = draws[np.asarray(guess._modes)[likeliest] == 0]
-            draws = np.concatenate([draws, guess._stand_ins(count // 20)])
-            modes = guess.centers[guess._lesser]
+        totals, straightened, modes = None, draws, []
+        if guess is not None:
+            totals = guess.totals
+            straightened = draws = draws if totals is None else totals.to_straight(draws)
+            modes = [guess._stand_ins(mode) for mode in guess._lesser]
+            if modes:
+                likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
+                straightened = draws[np.asarray(guess._modes)[likeliest] == 0]
         bend = QuadraticMap.fitted(straightened)
         if bend is not None:
-            draws, modes = bend.to_straight(draws), bend.to_straight(modes)
+            draws, modes = bend.to_straight(draws), [bend.to_straight(mode) for mode in modes]
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
         # A draw belongs at first to the nearest of a few, or of the modes, in units of their sds.
-        at = np.linspace(0, len(sample) - 1, min(max(count // 4_000, 3), 6)).astype(int)
-        few = np.concatenate([sample[at], modes])
+        at = np.linspace(0, len(sample) - 1, min(max(len(draws) // 4_000, 3), 6)).astype(int)
+        few = np.stack([*sample[at], *(np.mean(mode, axis=0) for mode in modes)])
         away = (few[:, np.newaxis] - sample) / np.std(sample, axis=0)
         nearest = np.argmin(np.sum(away**2, axis=2), axis=0)
         mixture = _of_shares(sample, np.equal.outer(np.arange(len(few)), nearest))
@@ -99,51 +104,61 @@ class StudentMixture:
         sample = subsample(draws, 10_000)
         for _ in range(5):
             mixture = mixture._fitted_on(sample)
+        for mode in modes:
+            mixture = mixture._with(_of_shares(mode, np.ones((1, len(mode)))), 0.05)
         if log_density is not None:
-            draws = draws[:count]
             log_ratio = log_density - mixture.log_density(draws)
             # The 2% of draws with the largest log p − log q.
             worst = log_ratio >= np.quantile(log_ratio, 0.98)
-            added = _of_shares(draws, np.stack([worst, ~worst]))
-            mixture = StudentMixture(
-                np.append(0.9 * mixture.weights, 0.1),
-                np.concatenate([mixture.centers, added.centers[:1]]),
-                np.concatenate([mixture.factors, added.factors[:1]]),
-            )
-        return replace(mixture, bend=bend)
+            mixture = mixture._with(_of_shares(draws, np.stack([worst, ~worst])), 0.1)
+        return replace(mixture, bend=bend, totals=totals)
 
     @classmethod
     def around(
-        cls, optima: FloatArray, covariances: FloatArray, shares: FloatArray
+        cls,
+        optima: FloatArray,
+        covariances: FloatArray,
+        shares: FloatArray,
+        totals: TotalMap | None = None,
     ) -> StudentMixture:
         """Take modes' places (modes, free), covariances (modes, free, free) and shares (modes,).
 
         The first three modes; of fewer, the same ones again, twice and three times as wide. No
         component gets less than a twelfth: the shares of modes are a guess.
         """
+        if totals is not None:
+            slopes = totals.slopes(optima)
+            covariances = slopes @ covariances @ slopes.transpose(0, 2, 1)
+            optima = totals.to_straight(optima)
         modes = np.arange(3) % len(optima)
         widths = 1.0 + np.arange(3) // len(optima)
         factors = widths[:, np.newaxis, np.newaxis] * np.linalg.cholesky(covariances)[modes]
         split_shares = shares[modes] / np.bincount(modes)[modes]
         weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / 3
-        return cls(weights, optima[modes], factors)
+        return cls(weights, optima[modes], factors, totals=totals)
 
     def arrays(self) -> dict[str, Any]:
         """Return what it is made of, by name, to be written to a file."""
         arrays = {name: value for name, value in vars(self).items() if name in _ARRAYS}
-        if self.bend is None:
-            return arrays
-        return arrays | {f"bend_{f.name}": getattr(self.bend, f.name) for f in fields(self.bend)}
+        maps = {name: getattr(self, name) for name in _MAPS}
+        return arrays | {
+            f"{name}_{f.name}": getattr(map_, f.name)
+            for name, map_ in maps.items()
+            if map_ is not None
+            for f in fields(map_)
+        }
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, Any]) -> StudentMixture | None:
         """Return the mixture that was written to a file as :meth:`arrays`, if any was."""
         if "weights" not in arrays:
             return None
-        bend = None
-        if "bend_bends" in arrays:
-            bend = QuadraticMap(**{f.name: arrays[f"bend_{f.name}"] for f in fields(QuadraticMap)})
-        return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend)
+        maps = {
+            name: kind(**{f.name: arrays[f"{name}_{f.name}"] for f in fields(kind)})
+            for name, kind in _MAPS.items()
+            if f"{name}_center" in arrays
+        }
+        return cls(**{name: arrays[name] for name in _ARRAYS}, **maps)
 
     @cached_property
     def _whitening(self) -> FloatArray:
@@ -178,8 +193,7 @@ class StudentMixture:
         density, lost = np.empty(len(flat)), 0.0 if self.bend is None else self.bend.log_volume
         for start in range(0, len(flat), 1 << 15):  # the components take memory
             chunk = flat[start : start + (1 << 15)]
-            straight = chunk if self.bend is None else self.bend.to_straight(chunk)
-            parts = self.log_parts(self.squares(straight))
+            parts = self.log_parts(self.squares(self._to_straight(chunk)))
             density[start : start + len(chunk)] = np.logaddexp.reduce(parts) - lost
         return density.reshape(coordinates.shape[:-1])
 
@@ -191,8 +205,18 @@ class StudentMixture:
         normal = random.standard_normal((count, self.centers.shape[1]))
         spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
         steps = (self.factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
-        drawn: FloatArray = self.centers[chosen] + steps
-        return drawn if self.bend is None else self.bend.to_curved(drawn)
+        return self._to_curved(self.centers[chosen] + steps)
+
+    def _to_straight(self, coordinates: FloatArray) -> FloatArray:
+        """Return the coordinates in which the components are, (..., free)."""
+        for map_ in (self.totals, self.bend):
+            coordinates = coordinates if map_ is None else map_.to_straight(coordinates)
+        return coordinates
+
+    def _to_curved(self, straight: FloatArray) -> FloatArray:
+        for map_ in (self.bend, self.totals):
+            straight = straight if map_ is None else map_.to_curved(straight)
+        return straight
 
     @cached_property
     def _modes(self) -> list[int]:
@@ -205,17 +229,22 @@ class StudentMixture:
         """The first component of each mode but the first."""
         return [self._modes.index(mode) for mode in range(1, max(self._modes) + 1)]
 
-    def _stand_ins(self, count: int) -> FloatArray:
-        """Return points (some, free) that stand for ``count`` draws of each mode but the first.
+    def _stand_ins(self, component: int) -> FloatArray:
+        """Return points (some, free) that stand for draws of a component.
 
         With the columns lₖ of L, the points μ ± lₖ √p have the component's mean and covariance.
         """
-        points = [self.centers[:0]]
-        for component in self._lesser:
-            steps = np.sqrt(self.centers.shape[1]) * self.factors[component].T
-            around = self.centers[component] + np.concatenate([steps, -steps])
-            points.append(np.tile(around, (math.ceil(count / len(around)), 1)))
-        return np.concatenate(points)
+        steps = np.sqrt(self.centers.shape[1]) * self.factors[component].T
+        points: FloatArray = self.centers[component] + np.concatenate([steps, -steps])
+        return points
+
+    def _with(self, other: StudentMixture, weight: float) -> StudentMixture:
+        """Return the mixture with the first component of another one, which gets a weight."""
+        return StudentMixture(
+            np.append((1 - weight) * self.weights, weight),
+            np.concatenate([self.centers, other.centers[:1]]),
+            np.concatenate([self.factors, other.factors[:1]]),
+        )
 
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
         """Take a round of expectation maximization."""

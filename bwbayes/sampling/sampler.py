@@ -40,6 +40,7 @@ from bwbayes.inference.map_estimate import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning
+from bwbayes.sampling.curvature import TotalMap
 from bwbayes.sampling.diagnostics import (
     LARGEST_PARETO_K,
     LENGTH,
@@ -93,7 +94,8 @@ def first_chain(
         )
     seeds = generator.spawn(plan.ensembles)
     chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
-    chain.freeze("pilot", StudentMixture.around(point.optima, *peaks(posterior, point)))
+    totals = TotalMap.of_noise(posterior.prior)
+    chain.freeze("pilot", StudentMixture.around(point.optima, *peaks(posterior, point), totals))
     return chain
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import QuadraticMap
+from bwbayes.sampling.curvature import QuadraticMap, TotalMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
@@ -55,7 +55,9 @@ def proposal(phase: Phase) -> StudentMixture:
     bends = np.zeros((FREE * (FREE + 1) // 2, FREE))
     bends[0, 1] = generator.standard_normal()
     bend = QuadraticMap(centers[0], factors[0], bends) if phase == "sampling" else None
-    return StudentMixture(generator.dirichlet(np.ones(4)), centers, factors, bend)
+    totals = TotalMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
+    weights = generator.dirichlet(np.ones(4))
+    return StudentMixture(weights, centers, factors, bend, None if bend is None else totals)
 
 
 def new(path: Path) -> ChainFile:

@@ -20,6 +20,7 @@ from emcee.moves import Move
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.proposals import StudentMixture
@@ -30,9 +31,10 @@ ALARM = 7.0
 
 @dataclass(frozen=True)
 class Unchanged:
-    """A prior whose coordinates are the parameters."""
+    """A prior whose coordinates are the parameters, none of them a noise's."""
 
     dimensions: int
+    free: tuple[Parameter, ...] = ()
 
     def constrain(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the coordinates (models, free), and no density."""
