@@ -51,7 +51,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "validate a shorter part: set window in [validation.{name}], or predict with --window",
     ),
     "step": (
-        "a step of the offset by {jump} um at {jumped} s",
+        "a jump of the offset by {jump} um at {jumped} s",
         "validate one side: set window in [validation.{name}] to end or begin at {jumped}, or "
         "predict with --window",
     ),

@@ -87,7 +87,7 @@ def step(scene: Scene) -> Iterator[Explanation]:
     after = (np.arange(scene.time.size) >= row).astype(np.float64)
     fit = scene.extended(add_shapes(after[np.newaxis], SIZE * scene.extent))
     size, time = SIZE * scene.extent * fit.sizes[0], scene.clock(scene.time[row])
-    text = f"step of the offset by {size:.2g} um at {time} s"
+    text = f"jump of the offset by {size:.2g} um at {time} s"
     cost = float(np.log(rows.size))
     fix = f"fit one side: set train to end or begin at {time}"
     yield scene.explained("step", text, fix, fit, cost, foreign=True)

@@ -174,7 +174,8 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     at = lasting_jumps(displacement, drive, gaps <= np.median(gaps), least)
     if not at.size:
         return None
-    sizes = displacement[at] - displacement[at - 1]
+    # Less what the voltage moves meanwhile.
+    sizes = np.diff(displacement - drive)[at - 1]
     edges = np.array([0, *at, rows.size])
     level = np.rint(np.cumsum([0.0, *sizes]) / np.abs(sizes).min())
     _, side = np.unique(level, return_inverse=True)

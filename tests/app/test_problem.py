@@ -105,6 +105,7 @@ def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
         first.record.has_reading
     ).tolist()
     assert (slice(100, 200 if train else 299),) == first.posterior.only.training
+    assert first.facts["record"].endswith("90 readings, none from 0 to 1 s")
     again = RunFolder.create(folder / "run", first, overwrite=False).problem()
     assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
     assert again.posterior.only.training == first.posterior.only.training

@@ -198,6 +198,9 @@ def test_a_jump_of_the_offset_is_named_with_its_time_and_its_shorter_side_left_o
     assert "jump" == finding.kind
     named = [float(text) for text in re.findall(r"um at ([\d.]+) s", finding.text)]
     np.testing.assert_allclose(named, time[rows], atol=1e-9)
+    # What the voltage moves meanwhile is no part of it, but for some of the loop's width.
+    sizes = [float(text) for text in re.findall(r"([+-][\d.e+]+) um at", finding.text)]
+    np.testing.assert_allclose(sizes, [jump, -jump][: len(rows)], rtol=0.1)
     windows = literal_eval(finding.fix.partition("= ")[2].removesuffix(" under [record]"))
     corrected = record.exclude(windows)
     assert [] == findings_of("jump", corrected)
