@@ -56,13 +56,11 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
     record, together = (voltage, likelihood.values, gaps), shared(actuator, voltage)
+    sections = actuator.sections(column)
     for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
-        named = physics(actuator, column, equilibrium, voltage) | filtering
-        responses = actuator.sections(column).recursions[0].free
-        for unknown, tap in np.ndindex(responses.shape[1:]):
-            named[f"free_{unknown + 1}{tap + 1}"] = responses[:, unknown, tap]
+        named = physics(actuator, sections, column, equilibrium, voltage) | filtering
         result = kernels.sums(
             *record, lanes.in_lanes(lanes.by_rows(named)[rows]), _over_gaps(steps[rows]), second,
             stage.kind, lanes.in_lanes(stage.group), stage.plan, *together, *unknowns,

@@ -20,6 +20,7 @@ from bwbayes.inference.compiled.lanes import (
 # isort: on
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
+from bwbayes.model.linear import Sections
 
 # Samples that pass the stages together: their drives fit into the first cache.
 PIECE = 64
@@ -42,13 +43,16 @@ def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def physics(
-    actuator: Actuator, column: Values, equilibrium: FloatArray, voltage: FloatArray
+    actuator: Actuator,
+    sections: Sections,
+    column: Values,
+    equilibrium: FloatArray,
+    voltage: FloatArray,
 ) -> dict[str, FloatArray]:
     """Return what models (models,) are without a noise, by the names of ``PARAMETERS``.
 
-    ``equilibrium`` (models,) is w₀ without gain, um.
+    ``sections`` are the actuator's; ``equilibrium`` (models,) is w₀ without gain, um.
     """
-    sections = actuator.sections(column)
     if actuator.gain is not None:
         equilibrium = equilibrium + actuator.gain.displacement(column, voltage[:1])[:, 0]
     level, rows = column["offset"] + equilibrium, {"equilibrium": equilibrium}
@@ -59,6 +63,8 @@ def physics(
     dynamics = sections.recursions[0]
     rows |= dict(zip(("b0", "b1", "b2"), dynamics.numerator.T, strict=False))
     rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
+    for unknown, tap in np.ndindex(dynamics.free.shape[1:]):
+        rows[f"free_{unknown + 1}{tap + 1}"] = dynamics.free[:, unknown, tap]
     rows |= {f"strength_{k}": gain for k, gain in enumerate(sections.gains[1:], 1)}
     rows |= {"level": level}
     others = {"growth": "creep_growth", "quadratic": "quadratic", "cubic": "cubic"}

@@ -39,8 +39,10 @@ def walk(
     memory = actuator.begin(column, voltage, from_rest=from_rest)
     compiled, advance = prepared(operator, column, voltage, memory), advance_of(operator)
     stage = compiled or given(advance(operator, column, voltage[:1], memory)[0])
-    models = by_rows(physics(actuator, column, stage.rest, voltage), STATE // LANES)
-    moving, *crept = actuator.sections(column).begin(unrest)
+    sections = actuator.sections(column)
+    named = physics(actuator, sections, column, stage.rest, voltage)
+    models = by_rows(named, STATE // LANES)
+    moving, *crept = sections.begin(unrest)
     models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
     for row, lag in enumerate(crept, LAG // LANES):
         models[:, row] = lag[:, 0]
