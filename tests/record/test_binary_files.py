@@ -1,4 +1,4 @@
-"""Records in HDF5 and MATLAB files: what is accepted, one line for what is not."""
+"""Records in HDF5, MATLAB and NumPy files: what is accepted, one line for what is not."""
 
 from __future__ import annotations
 
@@ -23,12 +23,15 @@ VOLTAGE = np.sin(np.arange(SAMPLES))
 DISPLACEMENT = 20 * np.cos(1.3 * np.arange(SAMPLES))
 GOOD: dict[str, Any] = {"time_s": TIME, "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT}
 
-Kind = Literal["h5", "mat", "compressed", "7.3"]
-KINDS: list[Kind] = ["h5", "mat", "compressed", "7.3"]
+Kind = Literal["h5", "mat", "compressed", "7.3", "npz"]
+KINDS: list[Kind] = ["h5", "mat", "compressed", "7.3", "npz"]
 
 
 def store(folder: Path, kind: Kind, arrays: dict[str, Any]) -> Path:
     """Store arrays as another program would, without anything of bwbayes."""
+    if kind == "npz":
+        np.savez(folder / "record.npz", **arrays)
+        return folder / "record.npz"
     path = folder / ("record.h5" if kind == "h5" else "record.mat")
     if kind in ("mat", "compressed"):
         scipy.io.savemat(path, arrays, do_compression=kind == "compressed")
@@ -265,3 +268,19 @@ def test_a_list_is_no_note(tmp_path: Path) -> None:
         texts = np.array([np.arange(3, dtype="u1"), None], dtype=object)[:1]
         file.attrs.create("origin", texts, dtype=h5py.vlen_dtype("u1"))
     assert read_record(path).origin == "a.h5"
+
+
+def test_an_array_of_columns_is_read_by_their_numbers(tmp_path: Path) -> None:
+    np.save(tmp_path / "record.npy", np.column_stack([TIME, VOLTAGE, DISPLACEMENT]))
+    columns = {"time": "1", "voltage": "2", "displacement": "3"}
+    units = {"time": "s", "voltage": "V", "displacement": "um"}
+    record = read_record(tmp_path / "record.npy", columns=columns, units=units)
+    np.testing.assert_array_equal(DISPLACEMENT, record.displacement)
+    rows = np.rec.fromarrays([TIME, VOLTAGE, DISPLACEMENT], names=[*GOOD])
+    np.save(tmp_path / "rows.npy", rows)
+    np.testing.assert_array_equal(VOLTAGE, read_record(tmp_path / "rows.npy").voltage)
+
+
+def test_an_archive_with_python_objects_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "record.npz", **GOOD, settings=np.array([{}], dtype=object))
+    assert fault(tmp_path / "record.npz").startswith(": damaged or cut off (Object arrays")

@@ -70,7 +70,7 @@ class _Source(ConfigTable):
     """Where samples come from: a file, or a signal on the virtual test stand."""
 
     file: str | None = key(None, example='"my_record.csv"', called="path data filename")
-    """A record's file (text, HDF5, MATLAB, LVM or TDMS), relative to the config; this or signal."""
+    """A record's file (text, HDF5, MATLAB, NumPy, LVM, TDMS), relative to the config; or signal."""
     signal: str | SignalConfig | None = key(
         None,
         example="{ amplitude = 100.0, frequency = 1.0, duration = 16.0, decay = 0.1 }",

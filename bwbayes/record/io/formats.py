@@ -1,4 +1,4 @@
-"""Read and write records: text of any kind, HDF5, MATLAB and LabVIEW files.
+"""Read and write records: text of any kind, HDF5, MATLAB, NumPy and LabVIEW files.
 
 What a file is, its content says, not its suffix. Records are written by the suffix: ``.csv``,
 ``.txt``, ``.h5``, ``.hdf5``, ``.mat``. The noise-free displacement of a simulated record travels
@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import h5py
 import numpy as np
@@ -26,14 +27,14 @@ from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields,
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.record.io.series import Source, array_source, damaged
+from bwbayes.record.io.series import Source, array_source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
 
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
 # What a folder of records is searched for.
-SUFFIXES = (*_TEXT, *_BINARY, ".lvm", ".tdms", ".gz")
+SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".gz")
 
 
 def read_record(
@@ -50,11 +51,11 @@ def read_record(
     Parameters
     ----------
     path : path
-        Text of any layout, packed by gzip or not, HDF5, MATLAB, LabVIEW's LVM or TDMS; the content
-        says which. Columns may carry their units in their names, `time_s`, `voltage_V`,
-        `displacement_um` or with other SI prefixes. Other names are recognized where they can mean
-        nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``. Times that are not uniform are taken as
-        the nearest that are.
+        Text of any layout, packed by gzip or not, HDF5, MATLAB, NumPy's arrays, LabVIEW's LVM or
+        TDMS; the content says which. Columns may carry their units in their names, `time_s`,
+        `voltage_V`, `displacement_um` or with other SI prefixes. Other names are recognized where
+        they can mean nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``. Times that are not uniform
+        are taken as the nearest that are.
     voltage_is : "command", "output" or None
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
@@ -144,9 +145,12 @@ def read_source(path: Path) -> Source:
             begin = file.read(8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
-    if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+    has_arrays = begin.startswith(b"\x93NUMPY") or _is_npz(path)
+    if not has_arrays and begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise InputError(f"{path}: a workbook or an archive; export it as CSV")
     try:
+        if has_arrays:
+            return read_numpy(path)
         if h5py.is_hdf5(path):
             return read_hdf5(path)
         if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
@@ -162,6 +166,15 @@ def read_source(path: Path) -> Source:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
+
+
+def _is_npz(path: Path) -> bool:
+    """Tell whether a file is an archive of arrays alone."""
+    try:
+        with ZipFile(path) as archive:
+            return all(name.endswith(".npy") for name in archive.namelist())
+    except (BadZipFile, OSError, ValueError):
+        return False
 
 
 def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = "5") -> None:

@@ -178,6 +178,21 @@ def array_source(
     return Source(Path(origin), tuple(series), groups, interval=interval, start=start)
 
 
+def read_numpy(path: Path) -> Source:
+    """Return the series of NumPy's ``.npy`` or ``.npz``, whatever error it raises if damaged."""
+    with path.open("rb") as file:
+        loaded = np.load(file, allow_pickle=False)
+        arrays = {"array": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    notes = {name: note(values) for name, values in arrays.items() if name in NOTES}
+    series = [
+        one
+        for name, values in arrays.items()
+        if name not in notes
+        for one in vectors("", name, values.shape, values.dtype, partial(in_seconds, values))
+    ]
+    return Source(path, tuple(series), {"": notes})
+
+
 def frame_source(frame: Any, origin: str) -> Source:
     """Return the columns of a pandas table, called ``origin``.
 
