@@ -263,6 +263,17 @@ class Record:
             f"within {self.clock(self.start)} to {self.clock(end)} s"
         )
 
+    @property
+    def longest_gap(self) -> tuple[float, float] | None:
+        """The longest time without readings, s, from its first sample on; None if all are alike."""
+        edges = np.concatenate([[-1], np.flatnonzero(self.has_reading), [self.samples]])
+        gaps = np.diff(edges)
+        if np.max(gaps) <= 2 * np.median(gaps):
+            return None
+        first = int(edges[np.argmax(gaps)]) + 1
+        stop = first + int(np.max(gaps)) - 1
+        return self.start + first * self.interval, self.start + stop * self.interval
+
     def clock(self, time: float) -> str:
         """Return a time in s with the decimals that tell neighboring samples apart."""
         return clock(time, self.interval)

@@ -22,7 +22,6 @@ from bwbayes.sampling.curvature import QuadraticMap, TotalMap, subsample
 from bwbayes.shown import brief
 
 _ARRAYS = ("weights", "centers", "factors", "freedom")
-_MAPS = {"bend": QuadraticMap, "totals": TotalMap}
 
 
 @dataclass(frozen=True)
@@ -140,25 +139,25 @@ class StudentMixture:
     def arrays(self) -> dict[str, Any]:
         """Return what it is made of, by name, to be written to a file."""
         arrays = {name: value for name, value in vars(self).items() if name in _ARRAYS}
-        maps = {name: getattr(self, name) for name in _MAPS}
-        return arrays | {
-            f"{name}_{f.name}": getattr(map_, f.name)
-            for name, map_ in maps.items()
-            if map_ is not None
-            for f in fields(map_)
-        }
+        for name, map_ in (("bend", self.bend), ("totals", self.totals)):
+            if map_ is not None:
+                arrays |= {f"{name}_{f.name}": getattr(map_, f.name) for f in fields(map_)}
+        return arrays
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, Any]) -> StudentMixture | None:
         """Return the mixture that was written to a file as :meth:`arrays`, if any was."""
         if "weights" not in arrays:
             return None
-        maps = {
-            name: kind(**{f.name: arrays[f"{name}_{f.name}"] for f in fields(kind)})
-            for name, kind in _MAPS.items()
-            if f"{name}_center" in arrays
-        }
-        return cls(**{name: arrays[name] for name in _ARRAYS}, **maps)
+
+        def read[T: QuadraticMap | TotalMap](kind: type[T], name: str) -> T | None:
+            keys = {f.name: f"{name}_{f.name}" for f in fields(kind)}
+            if not arrays.keys() >= {*keys.values()}:
+                return None
+            return kind(**{key: arrays[stored] for key, stored in keys.items()})
+
+        bend, totals = read(QuadraticMap, "bend"), read(TotalMap, "totals")
+        return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend, totals=totals)
 
     @cached_property
     def _whitening(self) -> FloatArray:

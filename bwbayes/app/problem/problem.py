@@ -19,8 +19,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import ParameterConfig, RecordConfig
 from bwbayes.app.problem.alike import record_naming
@@ -146,14 +144,15 @@ class Problem:
         for name, record in self.records.items():
             which = "" if len(self.records) == 1 else f" {name}"
             low, high = record.range_voltage
-            facts[f"record{which}"] = (
+            said = (
                 f"{record.origin}: {record.samples} samples every {record.interval:g} s, "
                 f"{low:.4g} to {high:.4g} V ({record.voltage_is}), {record.readings} readings"
-                f"{_longest_gap(record)}"
             )
+            if gap := record.longest_gap:
+                said += f", none from {record.clock(gap[0])} to {record.clock(gap[1])} s"
             if missing := self.config.records[name].missing:
-                values = " and ".join(f"{value:g}" for value in missing)
-                facts[f"record{which}"] += f" ({values} um are none)"
+                said += f" ({' and '.join(f'{value:g}' for value in missing)} um are none)"
+            facts[f"record{which}"] = said
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.alone(name).only.training
@@ -235,17 +234,6 @@ class Problem:
         """Return the windows of a training record that were held out, by name."""
         validations = self.validations.items()
         return {name: v.windows for name, v in validations if v.windows and v.of == record}
-
-
-def _longest_gap(record: Record) -> str:
-    """Say where there are no readings for the longest time, if it is long among the others."""
-    edges = np.concatenate([[-1], np.flatnonzero(record.has_reading), [record.samples]])
-    gaps = np.diff(edges)
-    first = edges[np.argmax(gaps)] + 1
-    if np.max(gaps) <= 2 * np.median(gaps):
-        return ""
-    start, stop = record.start + record.interval * np.array([first, first + np.max(gaps) - 1])
-    return f", none from {record.clock(start)} to {record.clock(stop)} s"
 
 
 def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
