@@ -293,6 +293,14 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
     assert "\n" not in str(error.value)
 
 
+def test_a_config_is_fitted_as_the_command_does(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    bw.fit(tmp_path / "small.toml", folder=tmp_path / "a", progress=False)
+    small.assert_same_end(run, tmp_path / "a")
+    with pytest.raises(bw.InputError, match="fit: ess: say it in the config, or give a record"):
+        bw.fit(tmp_path / "small.toml", ess=100)
+
+
 @pytest.mark.usefixtures("_no_run")
 def test_what_is_no_record_is_one_line(record: Record) -> None:
     with pytest.raises(bw.InputError, match=r"ndarray is not a record; make one with Record"):

@@ -17,6 +17,7 @@ from bwbayes.app.config import USUAL_MODELS
 from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
+    from bwbayes.app.config.config import Config
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.running.campaign import Campaign
     from bwbayes.comparison.compared import Comparison
@@ -42,7 +43,7 @@ def fit(
         The training record, or its file, whose columns are recognized unless ``columns`` says them.
         Several records of one actuator are fitted jointly: a list of them, or a dict by name, in
         which a record may be a dict of the keys of [record.NAME], with ``record`` the record
-        itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``.
+        itself: ``{"loops": loops, "step": {"record": step, "train": (0, 3)}}``. Or a config's file.
     folder
         Where the run is kept, as ``bwbayes run`` keeps it; what was computed is kept after
         Ctrl-C too, for :func:`resume`. By default nothing is left but the fit.
@@ -75,20 +76,19 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
-    from bwbayes.app.config.keywords import config_of
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve
     from bwbayes.app.running import run
     from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
 
-    config, records = config_of(record, keys)
+    config, where, records = _asked(record, keys, "fit")
     path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
     if improve:
         RunFolder.require_free(path, overwrite)
-        config = improve_model(config, Path(), console, records)
-    problem = resolve(config, Path(), records)
+        config = improve_model(config, where, console, records)
+    problem = resolve(config, where, records)
     warn(problem.remarks, 3)
     result = run.resume(
         RunFolder.create(path, problem, overwrite),
@@ -159,13 +159,11 @@ def compare(
         comparison.recommended, comparison.caveats
         comparison = bwbayes.compare(fit, other_fit, "results/bender")
     """
-    from bwbayes.app.config.config import is_config, load
-    from bwbayes.app.config.keywords import config_of, models_of
+    from bwbayes.app.config.keywords import models_of
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.jobs import compare as job
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
     from bwbayes.app.running.progress import ProgressLine
-    from bwbayes.record import Record
     from bwbayes.report.outputs import refuse_existing
 
     path, scratch = folder_or_scratch(folder, "comparison")
@@ -185,13 +183,7 @@ def compare(
             fits = job.fits_of(listed)
         comparison = job.compare(fits, console, future=future, workers=workers, executor=executor)
     else:
-        where, records = Path(), dict[str, Record]()
-        if isinstance(compared_runs, str | Path) and is_config(Path(compared_runs)):
-            config, where = load(compared_runs), Path(compared_runs).parent
-            for name in keys:
-                raise InputError(f"compare: {name}: say it in the config, or give a record")
-        else:
-            config, records = config_of(compared_runs, keys, "compare")
+        config, where, records = _asked(compared_runs, keys, "compare")
         named_models = USUAL_MODELS if models is None else models
         text = named_models if isinstance(named_models, str) else "; ".join(named_models)
         comparison = job.compare_models(
@@ -212,6 +204,22 @@ def compare(
         with ProgressLine(console, "writing the comparison ..."):
             comparison.save(path, overwrite=True)
     return comparison
+
+
+def _asked(
+    given: Any, keys: Mapping[str, Any], call: str
+) -> tuple[Config, Path, dict[str, Record]]:
+    """Return what is to be fitted, where its files are, and the records in memory by name."""
+    from bwbayes.app.config.config import is_config, load
+    from bwbayes.app.config.keywords import config_of
+
+    if not isinstance(given, str | Path) or not is_config(Path(given)):
+        config, records = config_of(given, keys, call)
+        return config, Path(), records
+    for name in keys:
+        raise InputError(f"{call}: {name}: say it in the config, or give a record")
+    path = Path(given)
+    return load(path).renamed(path.stem, None), path.parent, {}
 
 
 def open_run(folder: str | Path) -> Fit:
