@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.map_estimate import PointFit, fit, peaks
 from bwbayes.inference.posterior import Posterior
+from tests.diagnosis.plants import bench
+from tests.diagnosis.test_fixes import CONFIG, put
 from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.problems import short_posterior
+from tests.prediction.runs import problem_of
 
 CASES = ("white", "discrepancy", "lag")
 
@@ -97,3 +101,14 @@ def test_both_modes_of_a_record_of_one_amplitude_are_seen(
         free, _ = problem.posterior.prior.constrain(point.optima)
         np.testing.assert_allclose([0.71, 0.95], np.sort(free[:, 0]), atol=0.02)
         assert least < min(peaks(problem.posterior, point)[1])
+
+
+def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: Path) -> None:
+    """A record of the wrong sign, with a place where d and alpha are all but one parameter.
+
+    Axes there are so unlike in length that nothing can be solved for.
+    """
+    put(bench("sign", (6, 25)).records, tmp_path)
+    posterior = problem_of(parse(CONFIG, "config"), tmp_path).posterior
+    point = fit(posterior, np.random.default_rng((6, 25)))
+    assert point.log_density == pytest.approx(np.max(posterior.log_density(point.optima)))
