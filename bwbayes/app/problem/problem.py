@@ -144,15 +144,15 @@ class Problem:
         for name, record in self.records.items():
             which = "" if len(self.records) == 1 else f" {name}"
             low, high = record.range_voltage
-            said = (
+            fact = (
                 f"{record.origin}: {record.samples} samples every {record.interval:g} s, "
                 f"{low:.4g} to {high:.4g} V ({record.voltage_is}), {record.readings} readings"
             )
             if gap := record.longest_gap:
-                said += f", none from {record.clock(gap[0])} to {record.clock(gap[1])} s"
+                fact += f", none from {record.clock(gap[0])} to {record.clock(gap[1])} s"
             if missing := self.config.records[name].missing:
-                said += f" ({' and '.join(f'{value:g}' for value in missing)} um are none)"
-            facts[f"record{which}"] = said
+                fact += f" ({' and '.join(f'{value:g}' for value in missing)} um taken as missing)"
+            facts[f"record{which}"] = fact
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.alone(name).only.training

@@ -182,7 +182,13 @@ def read_numpy(path: Path) -> Source:
     """Return the series of NumPy's ``.npy`` or ``.npz``, whatever error it raises if damaged."""
     with path.open("rb") as file:
         loaded = np.load(file, allow_pickle=False)
-        arrays = {"array": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+        arrays = {"array": loaded} if isinstance(loaded, np.ndarray) else {}
+        for name in () if arrays else loaded.files:
+            try:
+                arrays[name] = loaded[name]
+            except ValueError as error:  # of Python's objects, which are passed over
+                if "allow_pickle" not in str(error):
+                    raise
     notes = {name: note(values) for name, values in arrays.items() if name in NOTES}
     series = [
         one
