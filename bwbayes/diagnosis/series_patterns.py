@@ -78,7 +78,8 @@ def lasting_jumps(
     least = max(least, 2 * float(np.max(np.abs(pushed))))
     at = spikes(moved, np.zeros(moved.size), least) + 1
     half = NEIGHBORS // 2
-    at = at[(at > half) & (at < values.size - half)]
+    # With as many samples on either side as a median takes.
+    at = at[(at >= NEIGHBORS) & (at <= values.size - NEIGHBORS)]
     medians = scipy.ndimage.median_filter(values - drive, NEIGHBORS, mode="nearest")
     return at[2 * np.abs(medians[at + half] - medians[at - half - 1]) > np.abs(moved[at - 1])]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -103,6 +103,16 @@ def resolved(path: Path, naming: Naming | None = None) -> Problem:
     periods=st.floats(1.5, 12),
     seed=st.integers(0, 2**32 - 1),
 )
+@example(
+    samples=200,
+    rate=1.0,
+    start=0.0,
+    units=("s", "V", "um"),
+    separator=",",
+    kind="decaying",
+    periods=5.0,
+    seed=200,
+)  # no jump at its third sample
 def test_any_ordinary_record_gets_a_config_that_resolves(
     tmp_path: Path,
     samples: int,
