@@ -1,17 +1,21 @@
-"""Coordinates in which a curved posterior is straight.
+"""Coordinates in which a curved posterior is straight, and nearly normal.
 
 Along a ridge that a record hardly tells, other parameters follow the one that is free, and seldom
 in a straight line: the ridge is a hundred times as long as wide, and bent by many times its width.
-No few ellipsoids cover it. A :class:`QuadraticMap` takes the draws' principal coordinates, longest
-first, and lets each bend quadratically with those before it. Of two sds a record may tell hardly
-more than what they are together: the ridge is then two legs at a right angle, which a
-:class:`TotalMap` puts in line. Neither changes volumes, but for the units of the first, so a
-distribution of the straight coordinates is one of the bent ones, density and all.
+Tails are longer on one side, and an offset is the less known the larger the discrepancy. No few
+ellipsoids cover that, least of all where there are few draws. Three maps take it out, one after the
+other. Of two sds a record may tell hardly more than what they are together: the ridge is then two
+legs at a right angle, which a :class:`TotalMap` puts in line. A :class:`SkewMap` makes both tails
+of each coordinate alike. A :class:`BendMap` takes of each coordinate what those before it leave
+open, longest first, and lets it bend quadratically with them, and widen. Each tells how much it
+stretches, so that a distribution of the straight coordinates is one of the bent ones, density and
+all.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,34 +31,39 @@ FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown 
 
 
 @dataclass(frozen=True)
-class QuadraticMap:
+class BendMap:
     """The map from straight coordinates z to bent ones x.
 
-    With c = clip(z) to five sds, over coordinates in the order of their lengths,
+    With c = clip(z) to five sds, over coordinates in an order of their own,
 
-        yⱼ = zⱼ + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
+        yⱼ = zⱼ exp(Σ_{i < j} sᵢⱼ cᵢ) + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
 
     Parameters
     ----------
     center
         μ, (free,).
     factor
-        F, (free, free): its columns are the principal axes of the draws, as long as their sds.
+        F, (free, free), F Fᵀ the covariance of the draws; lower triangular in the order of the
+        coordinates.
     bends
         bᵢₖⱼ, (pairs, free), zero unless i ≤ k < j; the pairs (0, 0), (0, 1), (1, 1), (0, 2), … of
         the first twelve coordinates.
+    scales
+        sᵢⱼ, (twelve at most, free), zero unless i < j; None if nothing widens.
     """
 
     center: FloatArray
     factor: FloatArray
     bends: FloatArray
+    scales: FloatArray | None = None
 
     @classmethod
-    def fitted(cls, draws: FloatArray) -> QuadraticMap | None:
-        """Fit to draws (count, free), or 20,000 of them, by least squares; None if not bent.
+    def fitted(cls, draws: FloatArray) -> BendMap | None:
+        """Fit to draws (count, free), or 20,000 of them; None if not bent and of one width.
 
-        A coordinate bends if that explains a tenth of its variance, and with as many others as
-        leave fifty draws to a coefficient.
+        A coordinate bends if that explains a tenth of its variance, by least squares and with as
+        many others as leave fifty draws to a coefficient. It widens if that makes the draws more
+        probable, by a hundredth of a nat each.
 
         Raises
         ------
@@ -64,12 +73,14 @@ class QuadraticMap:
         draws = subsample(draws, 20_000)
         count, free = draws.shape
         center = np.mean(draws, axis=0)
-        # Singular values keep the digits of directions that variances would lose.
-        _, lengths, axes = np.linalg.svd(np.linalg.qr(draws - center, mode="r"))
-        factor = axes.T * (lengths / np.sqrt(count))
+        # Next is always the one of which those before it leave open most. A decomposition of the
+        # draws keeps digits that one of their covariance would lose.
+        triangle, order = scipy.linalg.qr(draws - center, mode="r", pivoting=True)
+        factor = np.empty((free, free))
+        factor[order] = triangle[:free].T / np.sqrt(count)
         z = np.linalg.solve(factor, (draws - center).T).T
         longest = min(free, LONGEST)
-        bends = np.zeros((longest * (longest + 1) // 2, free))
+        bends, scales = np.zeros((longest * (longest + 1) // 2, free)), np.zeros((longest, free))
         products = np.empty((count, 0))
         for j in range(1, free):
             if j <= LONGEST and (products.shape[1] + j) * 50 <= count:
@@ -81,16 +92,21 @@ class QuadraticMap:
             straight = z[:, j] - products @ coefficients
             if np.var(straight) < 0.9 * np.var(z[:, j]):
                 z[:, j], bends[:terms, j] = straight, coefficients
-        return cls(center, factor, bends) if bends.any() else None
-
-    @cached_property
-    def log_volume(self) -> float:
-        """Log |det F|: what a density loses on the way to x."""
-        return float(np.linalg.slogdet(self.factor)[1])
+            near = np.clip(z[:, : min(j, LONGEST)], -FARTHEST, FARTHEST)
+            scale = scales[: near.shape[1], j] = _widening(near, z[:, j])
+            z[:, j] *= np.exp(-near @ scale)
+        if not bends.any() and not scales.any():
+            return None
+        return cls(center, factor, bends, scales if scales.any() else None)
 
     @cached_property
     def _inverse(self) -> FloatArray:
         return np.ascontiguousarray(np.linalg.inv(self.factor).T)
+
+    @cached_property
+    def _log_volume(self) -> float:
+        """Log |det F|."""
+        return float(np.linalg.slogdet(self.factor)[1])
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
@@ -99,32 +115,109 @@ class QuadraticMap:
         return i, k
 
     @cached_property
-    def _curved(self) -> tuple[tuple[int, int], ...]:
-        """The coordinates that bend, and how many pairs bend them."""
-        bent = [(j, np.flatnonzero(column)) for j, column in enumerate(self.bends.T)]
-        return tuple((j, int(rows[-1]) + 1) for j, rows in bent if rows.size)
+    def _curved(self) -> tuple[tuple[int, int, int], ...]:
+        """The coordinates that bend or widen, how many pairs bend them, how many others widen."""
+        scales = np.zeros((1, self.center.size)) if self.scales is None else self.scales
+        ends = [
+            [int(np.max(np.flatnonzero(column), initial=-1)) + 1 for column in table.T]
+            for table in (self.bends, scales)
+        ]
+        numbered = zip(range(self.center.size), *ends, strict=True)
+        return tuple((j, pairs, others) for j, pairs, others in numbered if pairs or others)
 
-    def to_curved(self, straight: FloatArray) -> FloatArray:
-        """Return x (..., free) of z (..., free)."""
+    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return x (..., free) of z (..., free), and log |∂x/∂z| (...)."""
         i, k = self._pairs
-        near = np.clip(straight, -FARTHEST, FARTHEST)
-        products = near[..., i] * near[..., k] - (i == k)
-        x: FloatArray = self.center + (straight + products @ self.bends) @ self.factor.T
-        return x
+        near = np.clip(straight[..., :LONGEST], -FARTHEST, FARTHEST)
+        y, log_slope = straight, np.full(straight.shape[:-1], self._log_volume)
+        if self.scales is not None:
+            widths = near @ self.scales
+            y, log_slope = y * np.exp(widths), log_slope + np.sum(widths, axis=-1)
+        if self.bends.any():
+            y = y + (near[..., i] * near[..., k] - (i == k)) @ self.bends
+        return self.center + y @ self.factor.T, log_slope
 
-    def to_straight(self, bent: FloatArray) -> FloatArray:
-        """Return z (..., free) of x (..., free)."""
+    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z (..., free) of x (..., free), and log |∂z/∂x| (...)."""
         z = ((bent - self.center) @ self._inverse).reshape(-1, self.center.size)
+        log_slope = np.full(len(z), -self._log_volume)
         for start in range(0, len(z), 4096):  # products take memory
             chunk = z[start : start + 4096]
             products = np.empty((len(chunk), 0))
             last = 0
-            for j, end in self._curved:
+            for j, end, others in self._curved:
                 while products.shape[1] < end:
                     products = np.concatenate([products, _products(chunk, last)], axis=1)
                     last += 1
-                chunk[:, j] -= products[:, :end] @ self.bends[:end, j]
-        return z.reshape(bent.shape)
+                if end:
+                    chunk[:, j] -= products[:, :end] @ self.bends[:end, j]
+                if self.scales is not None and others:
+                    near = np.clip(chunk[:, :others], -FARTHEST, FARTHEST)
+                    width = near @ self.scales[:others, j]
+                    chunk[:, j] *= np.exp(-width)
+                    log_slope[start : start + 4096] -= width
+        return z.reshape(bent.shape), log_slope.reshape(bent.shape[:-1])
+
+
+@dataclass(frozen=True)
+class SkewMap:
+    """The map from straight coordinates y to those x of which one tail is longer, each by itself.
+
+    With z = (x − μ) / σ and a power e = λ where z is positive, 2 − λ where not,
+
+        |y| = σ ((1 + |z|)ᵉ − 1) / e,
+
+    of the sign of z, after Yeo and Johnson (2000), Biometrika 87, 954-959.
+
+    Parameters
+    ----------
+    center
+        μ, (free,).
+    scale
+        σ, (free,).
+    powers
+        λ, (free,), between 0 and 2; 1 where both tails are alike.
+    """
+
+    center: FloatArray
+    scale: FloatArray
+    powers: FloatArray
+
+    @classmethod
+    def fitted(cls, draws: FloatArray) -> SkewMap:
+        """Fit to draws (count, free), or 5,000 of them: each coordinate is to be normal.
+
+        By maximum likelihood. Powers keep away from 0 and 2, where a tail would be exponential.
+        """
+        draws = subsample(draws, 5_000)
+        center, scale = np.median(draws, axis=0), np.std(draws, axis=0)
+        powers = [
+            scipy.optimize.minimize_scalar(
+                lambda power, z=z: -float(scipy.stats.yeojohnson_llf(power, z)),
+                bounds=(0.1, 1.9),
+                method="bounded",
+                options={"xatol": 0.01},
+            ).x
+            for z in ((draws - center) / scale).T
+        ]
+        return cls(center, scale, np.array(powers))
+
+    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return x (..., free) of y (..., free), and log |∂x/∂y| (...)."""
+        power = self._power(straight)
+        log = np.log1p(power * np.abs(straight) / self.scale) / power
+        x = self.center + self.scale * np.sign(straight) * np.expm1(log)
+        return x, np.sum((1 - power) * log, axis=-1)
+
+    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return y (..., free) of x (..., free), and log |∂y/∂x| (...)."""
+        z = (bent - self.center) / self.scale
+        power, log = self._power(z), np.log1p(np.abs(z))
+        y = np.sign(z) * self.scale * np.expm1(power * log) / power
+        return y, np.sum((power - 1) * log, axis=-1)
+
+    def _power(self, values: FloatArray) -> FloatArray:
+        return np.where(values >= 0, self.powers, 2 - self.powers)
 
 
 @dataclass(frozen=True)
@@ -172,21 +265,21 @@ class TotalMap:
         center, scale = np.moveaxis(np.array(scales), -1, 0)
         return cls(np.array(rows), center, scale)
 
-    def to_curved(self, straight: FloatArray) -> FloatArray:
-        """Return x (..., free) of y (..., free)."""
+    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return x (..., free) of y (..., free), and log |∂x/∂y| (...), which is zero."""
         x = straight.copy()
         total, ratio = np.moveaxis(self.scale * straight[..., self.rows], -1, 0)
         a = total - 0.5 * np.logaddexp(0.0, 2 * ratio)
         x[..., self.rows] = (np.stack([a, a + ratio], axis=-1) - self.center) / self.scale
-        return x
+        return x, np.zeros(straight.shape[:-1])
 
-    def to_straight(self, bent: FloatArray) -> FloatArray:
-        """Return y (..., free) of x (..., free)."""
+    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return y (..., free) of x (..., free), and log |∂y/∂x| (...), which is zero."""
         y = bent.copy()
         a, b = np.moveaxis(self.center + self.scale * bent[..., self.rows], -1, 0)
         together = np.stack([0.5 * np.logaddexp(2 * a, 2 * b), b - a], axis=-1)
         y[..., self.rows] = together / self.scale
-        return y
+        return y, np.zeros(bent.shape[:-1])
 
     def slopes(self, bent: FloatArray) -> FloatArray:
         """Return ∂y/∂x (places, free, free) at x (places, free)."""
@@ -198,6 +291,46 @@ class TotalMap:
             slopes[:, i, i], slopes[:, i, j] = 1 - share, share * s_j / s_i
             slopes[:, j, i] = -s_i / s_j
         return slopes
+
+
+type Map = TotalMap | SkewMap | BendMap
+
+
+def straightening(draws: FloatArray) -> list[Map]:
+    """Return the maps, one after the other, that make draws (count, free) straight.
+
+    A tail may be longer because of a bend, and is taken for one then: the maps are those after
+    which the draws are the most probable ones of a normal distribution, with skews or without.
+    """
+    found: list[tuple[float, list[Map]]] = []
+    for skewed in (False, True):
+        maps: list[Map] = [SkewMap.fitted(draws)] if skewed else []
+        straight, log_slope = to_straight(maps, draws)
+        if (bend := BendMap.fitted(straight)) is not None:
+            maps.append(bend)
+            straight, slope = bend.to_straight(straight)
+            log_slope = log_slope + slope
+        _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(straight, rowvar=False)))
+        found.append((float(np.mean(log_slope) - 0.5 * log_volume), maps))
+    return max(found, key=lambda probable: probable[0])[1]
+
+
+def to_straight(maps: Sequence[Map], bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return coordinates z (..., free) of x (..., free) after all maps, and log |∂z/∂x| (...)."""
+    log_slope = np.zeros(bent.shape[:-1])
+    for map_ in maps:
+        bent, slope = map_.to_straight(bent)
+        log_slope = log_slope + slope
+    return bent, log_slope
+
+
+def to_curved(maps: Sequence[Map], straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return coordinates x (..., free) of z (..., free) before all maps, and log |∂x/∂z| (...)."""
+    log_slope = np.zeros(straight.shape[:-1])
+    for map_ in reversed(maps):
+        straight, slope = map_.to_curved(straight)
+        log_slope = log_slope + slope
+    return straight, log_slope
 
 
 def subsample(draws: FloatArray, count: int) -> FloatArray:
@@ -212,3 +345,27 @@ def _products(z: FloatArray, last: int) -> FloatArray:
     products: FloatArray = near * near[:, -1:]
     products[:, -1] -= 1.0
     return products
+
+
+def _widening(near: FloatArray, values: FloatArray) -> FloatArray:
+    """Return s (others,) of which values (count,) are as wide as exp(s·c) of c (count, others).
+
+    By maximum likelihood of normal values; zeros unless a value is more probable by that than with
+    one width, by a hundredth of a nat on average.
+    """
+    count, others = near.shape
+    design = np.column_stack([np.ones(count), near])
+    # A value far out would tell more than all others.
+    squares = np.minimum(np.abs(values) / np.std(values), FARTHEST) ** 2
+
+    def unlikely(logs: FloatArray) -> tuple[float, FloatArray]:
+        width = design @ logs
+        with np.errstate(over="ignore"):
+            left = squares * np.exp(-2 * width)
+        # Drawn to zero by a hundredth of a draw each.
+        loss = np.mean(width + 0.5 * left) + 0.005 * logs @ logs
+        return float(loss), design.T @ (1 - left) / count + 0.01 * logs
+
+    found = scipy.optimize.minimize(unlikely, np.zeros(1 + others), jac=True, method="L-BFGS-B")
+    gain = 0.5 + 0.5 * np.log(np.mean(squares)) - found.fun
+    return found.x[1:] if gain > 0.01 else np.zeros(others)

@@ -202,15 +202,14 @@ def _independent_steps(
     proposed: Sequence[FloatArray],
     chances: Sequence[FloatArray],
 ) -> Generator[FloatArray, FloatArray, None]:
-    """Make steps of an independence proposal, whose places are known already."""
+    """Make steps of an independence proposal, whose straight places are known already."""
     walkers, free = path.here.shape
-    places = np.concatenate([path.here, *proposed])
-    weight = -move.proposal.log_density(places)
-    offered = yield places[walkers:]
-    here = path.density + weight[:walkers]
+    here = path.density - move.proposal.log_density(path.here)
+    places, log_density = move.proposal.placed(np.concatenate(proposed))
+    offered = yield places
     shape = (len(chances), move.places, walkers)
-    weight = (offered + weight[walkers:]).reshape(shape)
-    offered, places = offered.reshape(shape), places[walkers:].reshape(*shape, free)
+    weight = (offered - log_density).reshape(shape)
+    offered, places = offered.reshape(shape), places.reshape(*shape, free)
     rows = np.arange(walkers)
     for step, chance in enumerate(chances):
         which, accepted, log_weight = move.choose(here, weight[step], chance)

@@ -41,7 +41,7 @@ class SamplingPlan:
     walkers: int = 24
     block: int = 50
     most_steps: int = 20_000
-    least_pilot_steps: int = 50
+    least_pilot_steps: int = 25
     most_pilot_steps: int = 3_000
     together: int = 1
     places: int = 1

@@ -1,10 +1,9 @@
 """Distributions that propose places independently of where a walker is.
 
-A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian. A
-skewed one, with a long tail along some ridge, takes a few of them: a mixture fitted by expectation
-maximization, in coordinates that straighten the ridge if it is curved
-(:mod:`bwbayes.sampling.curvature`). Heavy tails on every component keep the ratio
-of posterior to proposal bounded.
+A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian.
+Others take a few of them: a mixture fitted by expectation maximization, in coordinates in which
+ridges are straight and tails alike (:mod:`bwbayes.sampling.curvature`). Heavy tails on every
+component keep the ratio of posterior to proposal bounded.
 """
 
 from __future__ import annotations
@@ -18,19 +17,29 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.curvature import QuadraticMap, TotalMap, subsample
+from bwbayes.sampling.curvature import (
+    BendMap,
+    Map,
+    SkewMap,
+    TotalMap,
+    straightening,
+    subsample,
+    to_curved,
+    to_straight,
+)
 from bwbayes.shown import brief
 
-_ARRAYS = ("weights", "centers", "factors", "freedom")
+# By the name in a file, in the order in which they make coordinates straight.
+_MAPS: dict[str, type[Map]] = {"totals": TotalMap, "skew": SkewMap, "bend": BendMap}
 
 
 @dataclass(frozen=True)
 class StudentMixture:
     """A mixture of multivariate Student-t distributions as an independence proposal.
 
-    Over p coordinates z, straight ones if there is a bend, with ν degrees of freedom,
+    Over p straight coordinates z of x, with ν degrees of freedom,
 
-        log q = log Σ wⱼ |Lⱼ|⁻¹ (1 + |Lⱼ⁻¹(z − μⱼ)|² / ν)^(−(ν + p)/2) + constant.
+        log q = log Σ wⱼ |Lⱼ|⁻¹ (1 + |Lⱼ⁻¹(z − μⱼ)|² / ν)^(−(ν + p)/2) + log |∂z/∂x| + constant.
 
     Parameters
     ----------
@@ -40,10 +49,8 @@ class StudentMixture:
         μⱼ, (components, free).
     factors
         Lⱼ, lower triangular, (components, free, free).
-    bend
-        What makes the coordinates in which they are straight; None for the coordinates themselves.
-    totals
-        What puts pairs of sds in line before that; None if there are none.
+    maps
+        What makes the straight coordinates, one after the other.
     freedom
         ν; small enough for tails heavier than the posterior's.
     """
@@ -53,9 +60,8 @@ class StudentMixture:
     weights: FloatArray
     centers: FloatArray
     factors: FloatArray
-    bend: QuadraticMap | None = None
-    totals: TotalMap | None = None
-    freedom: float = 6.0
+    maps: tuple[Map, ...] = ()
+    freedom: float = 12.0
 
     @classmethod
     def fitted(
@@ -70,8 +76,9 @@ class StudentMixture:
         With their log densities (count,) under what they are drawn from, the mixture gets one more
         component, of the draws where log p − log q is largest: a walker that is there would hardly
         be led away. Modes that a first ``guess`` has beside the most probable one get a twentieth
-        each besides, as the guess has them: a mode that is not proposed is not found again. What
-        bends the coordinates is the first mode; pairs of sds are in line as in the guess.
+        each besides, as the guess has them: a mode that is not proposed is not found again. The
+        coordinates are those in which the first mode is straight; pairs of sds are in line as in
+        the guess.
 
         Raises
         ------
@@ -79,17 +86,17 @@ class StudentMixture:
             The draws do not span the space.
         """
         _require_spread(draws)
-        totals, straightened, modes = None, draws, []
+        maps, modes = [], []
         if guess is not None:
-            totals = guess.totals
-            straightened = draws = draws if totals is None else totals.to_straight(draws)
-            modes = [guess._stand_ins(mode) for mode in guess._lesser]
-            if modes:
-                likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
-                straightened = draws[np.asarray(guess._modes)[likeliest] == 0]
-        bend = QuadraticMap.fitted(straightened)
-        if bend is not None:
-            draws, modes = bend.to_straight(draws), [bend.to_straight(mode) for mode in modes]
+            maps, modes = [*guess.maps], [guess._stand_ins(mode) for mode in guess._lesser]
+        draws, log_slope = to_straight(maps, draws)
+        first = draws
+        if guess is not None and modes:
+            likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
+            first = draws[np.asarray(guess._modes)[likeliest] == 0]
+        further = straightening(first)
+        draws, slope = to_straight(further, draws)
+        modes = [to_straight(further, mode)[0] for mode in modes]
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
         # A draw belongs at first to the nearest of a few, or of the modes, in units of their sds.
@@ -106,11 +113,11 @@ class StudentMixture:
         for mode in modes:
             mixture = mixture._with(_of_shares(mode, np.ones((1, len(mode)))), 0.05)
         if log_density is not None:
-            log_ratio = log_density - mixture.log_density(draws)
+            log_ratio = log_density - log_slope - slope - mixture.log_density(draws)
             # The 2% of draws with the largest log p − log q.
             worst = log_ratio >= np.quantile(log_ratio, 0.98)
             mixture = mixture._with(_of_shares(draws, np.stack([worst, ~worst])), 0.1)
-        return replace(mixture, bend=bend, totals=totals)
+        return replace(mixture, maps=(*maps, *further))
 
     @classmethod
     def around(
@@ -128,20 +135,22 @@ class StudentMixture:
         if totals is not None:
             slopes = totals.slopes(optima)
             covariances = slopes @ covariances @ slopes.transpose(0, 2, 1)
-            optima = totals.to_straight(optima)
+            optima = totals.to_straight(optima)[0]
         modes = np.arange(3) % len(optima)
         widths = 1.0 + np.arange(3) // len(optima)
         factors = widths[:, np.newaxis, np.newaxis] * np.linalg.cholesky(covariances)[modes]
         split_shares = shares[modes] / np.bincount(modes)[modes]
         weights = 0.75 * split_shares / np.sum(split_shares) + 0.25 / 3
-        return cls(weights, optima[modes], factors, totals=totals)
+        maps = () if totals is None else (totals,)
+        return cls(weights, optima[modes], factors, maps, freedom=6.0)
 
     def arrays(self) -> dict[str, Any]:
         """Return what it is made of, by name, to be written to a file."""
-        arrays = {name: value for name, value in vars(self).items() if name in _ARRAYS}
-        for name, map_ in (("bend", self.bend), ("totals", self.totals)):
-            if map_ is not None:
-                arrays |= {f"{name}_{f.name}": getattr(map_, f.name) for f in fields(map_)}
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "maps"}
+        names = {kind: name for name, kind in _MAPS.items()}
+        for map_ in self.maps:
+            named = {f"{names[type(map_)]}_{f.name}": getattr(map_, f.name) for f in fields(map_)}
+            arrays |= {name: array for name, array in named.items() if array is not None}
         return arrays
 
     @classmethod
@@ -149,15 +158,13 @@ class StudentMixture:
         """Return the mixture that was written to a file as :meth:`arrays`, if any was."""
         if "weights" not in arrays:
             return None
-
-        def read[T: QuadraticMap | TotalMap](kind: type[T], name: str) -> T | None:
-            keys = {f.name: f"{name}_{f.name}" for f in fields(kind)}
-            if not arrays.keys() >= {*keys.values()}:
-                return None
-            return kind(**{key: arrays[stored] for key, stored in keys.items()})
-
-        bend, totals = read(QuadraticMap, "bend"), read(TotalMap, "totals")
-        return cls(**{name: arrays[name] for name in _ARRAYS}, bend=bend, totals=totals)
+        maps: list[Map] = []
+        for name, kind in _MAPS.items():
+            keys = {field.name: f"{name}_{field.name}" for field in fields(kind)}
+            if stored := {key: arrays[stored] for key, stored in keys.items() if stored in arrays}:
+                maps.append(kind(**stored))
+        own = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
+        return cls(**own, maps=tuple(maps))
 
     @cached_property
     def _whitening(self) -> FloatArray:
@@ -188,34 +195,33 @@ class StudentMixture:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free)."""
-        flat = coordinates.reshape(-1, coordinates.shape[-1])
-        density, lost = np.empty(len(flat)), 0.0 if self.bend is None else self.bend.log_volume
-        for start in range(0, len(flat), 1 << 15):  # the components take memory
-            chunk = flat[start : start + (1 << 15)]
-            parts = self.log_parts(self.squares(self._to_straight(chunk)))
-            density[start : start + len(chunk)] = np.logaddexp.reduce(parts) - lost
-        return density.reshape(coordinates.shape[:-1])
+        straight, log_slope = to_straight(self.maps, coordinates)
+        return self._straight_density(straight) + log_slope
+
+    def placed(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return coordinates (..., count, free) of straight ones, and log density (..., count)."""
+        coordinates, log_slope = to_curved(self.maps, straight)
+        return coordinates, self._straight_density(straight) - log_slope
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
-        """Draw coordinates (count, free) with emcee's generator."""
+        """Draw straight coordinates (count, free) with emcee's generator."""
         # As ``random.choice`` does with these weights, without its checks of them.
         ends = np.cumsum(self.weights)
         chosen = (ends / ends[-1]).searchsorted(random.random_sample(count), side="right")
         normal = random.standard_normal((count, self.centers.shape[1]))
         spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
         steps = (self.factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
-        return self._to_curved(self.centers[chosen] + steps)
-
-    def _to_straight(self, coordinates: FloatArray) -> FloatArray:
-        """Return the coordinates in which the components are, (..., free)."""
-        for map_ in (self.totals, self.bend):
-            coordinates = coordinates if map_ is None else map_.to_straight(coordinates)
-        return coordinates
-
-    def _to_curved(self, straight: FloatArray) -> FloatArray:
-        for map_ in (self.bend, self.totals):
-            straight = straight if map_ is None else map_.to_curved(straight)
+        straight: FloatArray = self.centers[chosen] + steps
         return straight
+
+    def _straight_density(self, straight: FloatArray) -> FloatArray:
+        """Log density (..., count) of straight coordinates (..., count, free)."""
+        flat = straight.reshape(-1, straight.shape[-1])
+        density = np.empty(len(flat))
+        for start in range(0, len(flat), 1 << 15):  # the components take memory
+            rows = slice(start, start + (1 << 15))
+            density[rows] = np.logaddexp.reduce(self.log_parts(self.squares(flat[rows])))
+        return density.reshape(straight.shape[:-1])
 
     @cached_property
     def _modes(self) -> list[int]:

@@ -108,8 +108,8 @@ def _tried(
     count: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Draw places (count, free) of a proposal; log density of the posterior over its (count,)."""
-    places = proposal.draw(random, count)
-    ratio: FloatArray = posterior.log_density(places) - proposal.log_density(places)
+    places, proposed = proposal.placed(proposal.draw(random, count))
+    ratio: FloatArray = posterior.log_density(places) - proposed
     return places, ratio
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import QuadraticMap, TotalMap
+from bwbayes.sampling.curvature import BendMap, SkewMap, TotalMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
@@ -52,12 +52,15 @@ def proposal(phase: Phase) -> StudentMixture:
     generator = np.random.default_rng(PHASES.index(phase))
     factors = np.tril(generator.standard_normal((4, FREE, FREE)))
     centers = generator.standard_normal((4, FREE))
-    bends = np.zeros((FREE * (FREE + 1) // 2, FREE))
-    bends[0, 1] = generator.standard_normal()
-    bend = QuadraticMap(centers[0], factors[0], bends) if phase == "sampling" else None
-    totals = TotalMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
     weights = generator.dirichlet(np.ones(4))
-    return StudentMixture(weights, centers, factors, bend, None if bend is None else totals)
+    if phase != "sampling":
+        return StudentMixture(weights, centers, factors)
+    bends, scales = np.zeros((FREE * (FREE + 1) // 2, FREE)), np.zeros((FREE, FREE))
+    bends[0, 1], scales[0, 1] = generator.standard_normal(2)
+    totals = TotalMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
+    skew = SkewMap(centers[1], np.exp(centers[2]), np.full(FREE, 0.8))
+    bend = BendMap(centers[0], factors[0], bends, scales)
+    return StudentMixture(weights, centers, factors, (totals, skew, bend))
 
 
 def new(path: Path) -> ChainFile:

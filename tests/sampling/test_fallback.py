@@ -149,19 +149,23 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
 ) -> None:
     """A proposal a third too narrow: k is at most 0.56, but walkers in the tails seldom leave them.
 
-    With the rule off, the same takes more than three times the steps. Nobody can do anything about
-    it, and nothing is said.
+    With the rule off, five samplings take more than twice the steps, mostly more than three times.
+    Nobody can do anything about it, and nothing is said.
     """
 
     def tuned(sampling: sampler._Sampling) -> None:
         tuned_to_a_narrow_one(sampling, 0.66)
 
+    def samplings() -> list[tuple[Chain, Outcome]]:
+        return [run(LONG, seed) for seed in range(1, 6)]
+
     monkeypatch.setattr(sampler._Sampling, "_tune", tuned)
-    chain, outcome = run(LONG)
-    assert outcome.converged
-    assert 0 < chain.set_aside
-    assert chain.refit is not None
-    assert () == outcome.remarks
+    first = samplings()
+    for chain, outcome in first:
+        assert outcome.converged
+        assert 0 < chain.set_aside
+        assert chain.refit is not None
+        assert () == outcome.remarks
     monkeypatch.setattr(sampler, "LARGEST_SLOWDOWN", np.inf)
-    slow, _ = run(LONG)
-    assert 3 * len(chain.history("sampling")) < len(slow.history("sampling"))
+    fast, slow = (sum(len(c.history("sampling")) for c, _ in x) for x in (first, samplings()))
+    assert 2 * fast < slow

@@ -56,8 +56,8 @@ def share_by_weights(posterior: Posterior, point: PointFit) -> tuple[float, floa
     around = StudentMixture.around(point.optima, *map_estimate.peaks(posterior, point))
     # Twice as wide as the modes: what is between them is reached too.
     proposal = replace(around, factors=2**0.5 * around.factors, freedom=3.0)
-    places = proposal.draw(np.random.RandomState(1), 400_000)
-    weights = scipy.special.softmax(posterior.log_density(places) - proposal.log_density(places))
+    places, proposed = proposal.placed(proposal.draw(np.random.RandomState(1), 400_000))
+    weights = scipy.special.softmax(posterior.log_density(places) - proposed)
     inside = without_discrepancy(posterior, places)
     share = float(weights @ inside)
     return share, float(np.sqrt(np.sum(weights**2 * (inside - share) ** 2)))
