@@ -83,6 +83,8 @@ def fit_loop(record: Record) -> LoopFit:
     trend_shape = elapsed / elapsed[-1] - 0.5
     times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, 20)
     decays = np.exp(-elapsed[:, np.newaxis] / times)
+    columns = np.column_stack([decays, centered])
+    among_columns = _products(columns, columns)
 
     # None, and from half an interval to a part of a half turn.
     turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
@@ -94,7 +96,7 @@ def fit_loop(record: Record) -> LoopFit:
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), has_reading), strict=True):
         basis = np.column_stack([loops, trend_shape])
-        fits.append((*_best_decay(basis, decays, centered), basis, float(lag)))
+        fits.append((*_best_decay(basis, columns, among_columns), basis, float(lag)))
     remainder, which, basis, lag = min(fits, key=lambda fit: fit[0])
     design = np.column_stack([basis, decays[:, which]])
     products = _products(design, centered[:, np.newaxis])
@@ -109,8 +111,8 @@ def fit_loop(record: Record) -> LoopFit:
         """Return the sum of squares that a curve leaves behind a lag, and no loops."""
         u = _lagged(record.voltage, samples)[rows[has_reading]]
         u = (u - u.mean()) / max(float(np.ptp(u)), 1e-300)
-        columns = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
-        return _best_decay(columns, decays, centered)[0]
+        curve = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
+        return _best_decay(curve, columns, among_columns)[0]
 
     # Loops imitate what is left of a lag: it is found between those above.
     samples = lags / record.interval
@@ -118,7 +120,8 @@ def fit_loop(record: Record) -> LoopFit:
     between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
     optimum = scipy.optimize.minimize_scalar(curved, bounds=between, method="bounded")
     (loops,) = _bases(_lagged(record.voltage, optimum.x)[np.newaxis, rows], has_reading)
-    behind_lag = _best_decay(np.column_stack([loops, trend_shape]), decays, centered)[0]
+    basis_behind = np.column_stack([loops, trend_shape])
+    behind_lag = _best_decay(basis_behind, columns, among_columns)[0]
     remainder = min(remainder, behind_lag)
     added, degrees = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
     ratio = (optimum.fun - remainder) / added / max(remainder / degrees, 1e-300)
@@ -180,13 +183,17 @@ def _bases(voltages: FloatArray, has_reading: BoolArray) -> Iterator[FloatArray]
         yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[has_reading]
 
 
-def _best_decay(basis: FloatArray, decays: FloatArray, values: FloatArray) -> tuple[float, int]:
-    """Return the least sum of squares with the basis and one decay, and which decay that is."""
-    columns = np.column_stack([decays, values])
+def _best_decay(
+    basis: FloatArray, columns: FloatArray, among_columns: FloatArray
+) -> tuple[float, int]:
+    """Return the least sum of squares with the basis and one decay, and which decay that is.
+
+    ``columns`` are the decays and the values; ``among_columns`` are their products.
+    """
     among = _products(basis, columns)
-    remainder = _products(columns, columns) - among.T @ _inverse(_products(basis, basis)) @ among
+    remainder = among_columns - among.T @ _inverse(_products(basis, basis)) @ among
     power = np.diag(remainder)[:-1]
-    distinct = power > 1e-3 * (decays**2).sum(axis=0)
+    distinct = power > 1e-3 * np.diag(among_columns)[:-1]
     gained = np.where(distinct, remainder[-1, :-1] ** 2 / np.maximum(power, 1e-300), 0.0)
     which = int(np.argmax(gained))
     return float(remainder[-1, -1] - gained[which]), which

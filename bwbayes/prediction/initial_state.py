@@ -314,8 +314,8 @@ def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> fl
     readings = histories.likelihoods[0].readings.rows
     p = scipy.stats.chi2.sf(squares, readings.size)
     if readings.size > 20:
-        # As polynomials of the time up to the third degree, of a hundred draws.
-        few = slice(None, None, -(-len(theta) // 100))
+        # As polynomials of the time up to the third degree, of a few draws.
+        few = slice(None, None, -(-len(theta) // 25))
         relative_time = 2 * (readings - readings[0]) / (readings[-1] - readings[0]) - 1
         shapes = np.polynomial.legendre.legvander(relative_time, 3).T[1:]
         tested = replace(histories, which=histories.which[few])

@@ -1,9 +1,10 @@
 """Draw what a page shows, if possible in a process beside this one, which predicts and writes.
 
 That process compiles what every likelihood needs while this one loads what samples, and compiles
-what simulates while this one compiles the rest of the likelihood; then it loads what draws. It
-begins with each picture as soon as what it shows is known: the draws before predictions are made,
-the bands before they are judged. The pictures are the same as drawn in one process.
+what simulates while this one compiles the rest of the likelihood; it loads what draws after that,
+or before if all is compiled. It begins with each picture as soon as what it shows is known: the
+draws before predictions are made, the bands before they are judged. The pictures are the same as
+drawn in one process.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Artist:
         self.pool = pool
         self.begun: dict[str, Future[Any]] = {}
         if pool is not None:
-            pool.submit(_compile_common)
+            pool.submit(_begin)
 
     def rehearse(self, posterior: Posterior) -> None:
         """Let the other process compile what this one needs later, and load what draws."""
@@ -80,15 +81,20 @@ class Artist:
         return images, plots
 
 
-def _compile_common() -> None:
+def _begin() -> None:
+    """Compile what every likelihood needs; if that is there, load what draws."""
     if choose() == "numba":
         from bwbayes.inference.compiled.kernels import compile_common  # noqa: PLC0415
 
-        compile_common()
+        if not compile_common():
+            return
+    _load()
 
 
 def _load() -> None:
     """Load what draws, and what its work is made of."""
+    if "bwbayes.report.figures.interactive" in sys.modules:
+        return  # before
     from bwbayes.report import result  # noqa: F401, PLC0415
     from bwbayes.report.figures import prepare  # noqa: PLC0415
 

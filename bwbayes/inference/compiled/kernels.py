@@ -270,13 +270,16 @@ def sums(
     return result
 
 
-def compile_common() -> None:
+def compile_common() -> bool:
     """Compile what :func:`sums` needs of every operator, with a noise of one state.
 
     What one process has compiled is there for others, such as one that compiles the operator.
+    Returns whether all was there already.
     """
     flat, table, integers = float64[::1], float64[:, ::1], int64[::1]
     _begin.compile((flat, int64, int64, int64))
     _one_by_one.compile((flat, none, flat, integers, table, flat, table, int64, int64, table))
     noise.follow.compile((flat, none, flat, flat, flat, integers))
     displace.compile((flat, table, table, flat, int64, int64, flat))
+    compiled_now = (_begin, _one_by_one, noise.follow, displace)
+    return not any(sum(function.stats.cache_misses.values()) for function in compiled_now)
