@@ -195,11 +195,16 @@ class StudentMixture:
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
         """Log density (..., count) at coordinates (..., count, free)."""
-        straight, log_slope = to_straight(self.maps, coordinates)
-        return self._straight_density(straight) + log_slope
+        flat = coordinates.reshape(-1, coordinates.shape[-1])
+        density = np.empty(len(flat))
+        for start in range(0, len(flat), 1 << 15):  # maps and components take memory
+            rows = slice(start, start + (1 << 15))
+            straight, log_slope = to_straight(self.maps, flat[rows])
+            density[rows] = self._straight_density(straight) + log_slope
+        return density.reshape(coordinates.shape[:-1])
 
     def placed(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return coordinates (..., count, free) of straight ones, and log density (..., count)."""
+        """Return coordinates (count, free) of straight ones, and their log density (count,)."""
         coordinates, log_slope = to_curved(self.maps, straight)
         return coordinates, self._straight_density(straight) - log_slope
 
@@ -215,13 +220,9 @@ class StudentMixture:
         return straight
 
     def _straight_density(self, straight: FloatArray) -> FloatArray:
-        """Log density (..., count) of straight coordinates (..., count, free)."""
-        flat = straight.reshape(-1, straight.shape[-1])
-        density = np.empty(len(flat))
-        for start in range(0, len(flat), 1 << 15):  # the components take memory
-            rows = slice(start, start + (1 << 15))
-            density[rows] = np.logaddexp.reduce(self.log_parts(self.squares(flat[rows])))
-        return density.reshape(straight.shape[:-1])
+        """Log density (count,) of straight coordinates (count, free)."""
+        density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(straight)))
+        return density
 
     @cached_property
     def _modes(self) -> list[int]:
