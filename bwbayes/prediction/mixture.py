@@ -41,16 +41,16 @@ def ranked_values(means: Floating, sds: Floating, scores: Floating) -> Floating:
     Parameters
     ----------
     means
-        (draws, samples) mean given a draw, um.
+        (samples, draws) mean given a draw, um.
     sds
-        (draws, samples) or (draws, 1) standard deviation given a draw, um. If all are zero the
+        (samples, draws) or (1, draws) standard deviation given a draw, um. If all are zero the
         values are the means.
     scores
         (scores, draws) from :func:`stratified_scores`.
     """
     if not sds.any():
-        return np.sort(means.T, axis=1)
-    values = (means.T[:, np.newaxis] + sds.T[:, np.newaxis] * scores).reshape(means.shape[1], -1)
+        return np.sort(means, axis=1)
+    values = (means[:, np.newaxis] + sds[:, np.newaxis] * scores).reshape(len(means), -1)
     values.sort(axis=1)
     return values
 
@@ -97,11 +97,11 @@ def crps(ranked: Floating, values: Floating) -> Floating:
 def log_density(z: Floating, sds: Floating) -> Floating:
     """Return the log density (samples,), nats, per um: log (1/S) Σ φ(z) / sd over the S draws.
 
-    ``z`` (draws, samples) is (value - mean) / sd, and ``sds``, all above zero, as in
+    ``z`` (samples, draws) is (value - mean) / sd, and ``sds``, all above zero, as in
     :func:`ranked_values`. nan where a value is missing.
     """
     by_draw = -0.5 * z**2 - np.log(sds)
-    largest = np.max(by_draw, axis=0)
-    mean = np.mean(np.exp(by_draw - largest), axis=0)
+    largest = np.max(by_draw, axis=1)
+    mean = np.mean(np.exp(by_draw - largest[:, np.newaxis]), axis=1)
     density: Floating = largest + np.log(mean) - 0.5 * math.log(2 * math.pi)
     return density

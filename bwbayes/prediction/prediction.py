@@ -248,15 +248,23 @@ def _summarized(
         expected, unknown = simulated + remembered, 1 - explained
     mean = np.mean(expected, axis=0)
     summarized: dict[str, Floating] = {"mean": mean}
-    # About their mean, so that a single precision is one of the band's width.
     scores = scores.astype(np.float32)
-    away, apart = ((path - mean).astype(np.float32) for path in (expected, simulated))
+
+    def about_mean(paths: FloatArray) -> Floating:
+        """Return what draws are off their mean: single precision is then one of the band's width.
+
+        A sample's are side by side, (samples, draws), to be sorted.
+        """
+        return (paths - mean).T.astype(np.float32, order="C")
+
+    away = about_mean(expected)
+    apart = away if expected is simulated else about_mean(simulated)
     offset, slow, white = variances
     variance = np.zeros(1)
     for kind, added in zip(KINDS, (offset, slow * unknown, white), strict=True):
         means = apart if kind == "parameter" else away
         variance = variance + added
-        sds = np.sqrt(variance).astype(np.float32)
+        sds = np.sqrt(variance).astype(np.float32).T
         ranked = mixture.ranked_values(means, sds, scores)
         for level in LEVELS:
             tail = (100 - level) / 200
@@ -264,7 +272,7 @@ def _summarized(
             summarized[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
         if kind == "sensor" and record.displacement is not None:
             reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
-            z = (reading - means) / sds
+            z = (reading[:, np.newaxis] - means) / sds
             summarized["pit"] = mixture.probability(ranked, reading)
             summarized["crps"] = mixture.crps(ranked, reading)
             summarized["log_score"] = mixture.log_density(z, sds)

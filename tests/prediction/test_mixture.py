@@ -27,12 +27,12 @@ def random() -> np.random.Generator:
 
 
 def _kinds(number: int = 400, samples: int = 7) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Means (draws, samples) and sds (draws, 1) of every kind that posteriors come in."""
+    """Means (samples, draws) and sds (1, draws) of every kind that posteriors come in."""
     generator = np.random.default_rng(3)
     normal = generator.normal(size=(number, 1))
     means = 10 * np.sin(np.arange(samples)) + 0.3 * generator.normal(size=(number, samples))
     far = 8.0 * (generator.random((number, 1)) < 0.4)
-    return {
+    kinds = {
         "usual": (means, np.exp(0.2 * normal)),
         "parameters alone": (means + normal, np.full_like(normal, 0.01)),
         "no sds": (means, np.zeros_like(normal)),
@@ -45,6 +45,7 @@ def _kinds(number: int = 400, samples: int = 7) -> dict[str, tuple[FloatArray, F
         "sds along the record": (means, np.exp(0.2 * normal) * np.arange(1, samples + 1)),
         "many draws": (np.repeat(means, 13, axis=0), np.repeat(np.exp(0.2 * normal), 13, axis=0)),
     }
+    return {kind: (means.T, sds.T) for kind, (means, sds) in kinds.items()}
 
 
 KINDS = _kinds()
@@ -52,7 +53,7 @@ KINDS = _kinds()
 
 def values(kind: str) -> Floating:
     means, sds = KINDS[kind]
-    return ranked_values(means, sds, stratified_scores(len(means), random()))
+    return ranked_values(means, sds, stratified_scores(means.shape[1], random()))
 
 
 def worst_error(means: FloatArray, sds: FloatArray, ranked: Floating) -> float:
@@ -63,8 +64,9 @@ def worst_error(means: FloatArray, sds: FloatArray, ranked: Floating) -> float:
     errors = []
     for p in LEVELS:
         x = quantile(ranked, p)
-        z = [(x + side - means) / np.maximum(sds, 1e-12) for side in (-1e-9, 1e-9)]
-        low, high = (ndtr(one).mean(axis=0) for one in z)
+        sides = (x[:, np.newaxis] + side for side in (-1e-9, 1e-9))
+        z = [(side - means) / np.maximum(sds, 1e-12) for side in sides]
+        low, high = (ndtr(one).mean(axis=1) for one in z)
         off = np.maximum(low - p, 0) + np.maximum(p - high, 0)
         errors.append(off / np.sqrt(p * (1 - p) / ranked.shape[1]))
     return float(np.max(errors))
@@ -78,8 +80,8 @@ def test_quantiles_have_their_probabilities(kind: str) -> None:
 
 def test_scores_that_go_with_the_draws_would_be_noticed() -> None:
     """The twin: without the permutation high draws get high scores."""
-    means, sds = np.sort(KINDS["many draws"][0], axis=0), np.full((1, 1), 0.5)
-    scores = stratified_scores(len(means), random())
+    means, sds = np.sort(KINDS["many draws"][0], axis=1), np.full((1, 1), 0.5)
+    scores = stratified_scores(means.shape[1], random())
     assert worst_error(means, sds, ranked_values(means, sds, scores)) < ALARM
     ordered = ranked_values(means, sds, np.sort(scores, axis=1))
     assert worst_error(means, sds, ordered) > 2 * ALARM
@@ -96,8 +98,8 @@ def test_crps_is_the_double_sum_over_values(kind: str) -> None:
 
 def test_the_log_density_is_that_of_all_components() -> None:
     """Also where none of them is anything that a float can hold; nothing without a reading."""
-    means = np.random.default_rng(1).normal(size=(300, 6))
-    sds = np.random.default_rng(2).uniform(0.1, 2.0, (300, 1))
-    y = np.array([0.0, 1.0, -3.0, 40.0, 1e4, np.nan])
-    expected = logsumexp(norm.logpdf(y, means, sds), axis=0) - np.log(300)
+    means = np.random.default_rng(1).normal(size=(6, 300))
+    sds = np.random.default_rng(2).uniform(0.1, 2.0, (1, 300))
+    y = np.array([0.0, 1.0, -3.0, 40.0, 1e4, np.nan])[:, np.newaxis]
+    expected = logsumexp(norm.logpdf(y, means, sds), axis=1) - np.log(300)
     np.testing.assert_allclose(log_density((y - means) / sds, sds), expected, rtol=1e-12)
