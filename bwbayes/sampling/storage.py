@@ -6,7 +6,7 @@ chain that a disk has damaged, what comes before the damage is used. This module
 
     start.npz                        starts of the ensembles, the point fit, the pilot's proposal,
                                      and what was run, as JSON
-    PHASE-proposal.npz               weights, centers, factors and bend of a phase's proposal
+    PHASE-proposal.npz               weights, centers, factors and maps of a phase's proposal
     PHASE-0000.npz, PHASE-0001.npz   a block each: coordinates (steps, ensembles, walkers, free),
                                      log_density, accepted, moves, random_state
     set-aside.npz                    how many blocks of the sampling were set aside, and the
