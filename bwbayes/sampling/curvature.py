@@ -299,8 +299,9 @@ type Map = TotalMap | SkewMap | BendMap
 def straightening(draws: FloatArray) -> list[Map]:
     """Return the maps, one after the other, that make draws (count, free) straight.
 
-    A tail may be longer because of a bend, and is taken for one then: the maps are those after
-    which the draws are the most probable ones of a normal distribution, with skews or without.
+    A tail may be longer because of a bend, and is taken for one then: there are skews only if the
+    draws are more probable with them, by a hundredth of a nat each, as those of a normal
+    distribution.
     """
     found: list[tuple[float, list[Map]]] = []
     for skewed in (False, True):
@@ -312,7 +313,8 @@ def straightening(draws: FloatArray) -> list[Map]:
             log_slope = log_slope + slope
         _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(straight, rowvar=False)))
         found.append((float(np.mean(log_slope) - 0.5 * log_volume), maps))
-    return max(found, key=lambda probable: probable[0])[1]
+    (plain, bends), (probable, with_skews) = found
+    return with_skews if probable > plain + 0.01 else bends
 
 
 def to_straight(maps: Sequence[Map], bent: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,7 @@ from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Declaration, lognormal
 from bwbayes.sampling import proposals
-from bwbayes.sampling.curvature import LONGEST, BendMap, SkewMap, TotalMap
+from bwbayes.sampling.curvature import LONGEST, BendMap, SkewMap, TotalMap, straightening
 from bwbayes.sampling.proposals import StudentMixture
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
@@ -172,6 +172,7 @@ def test_what_is_normal_is_neither_bent_nor_widened_nor_skewed() -> None:
     generator = np.random.default_rng(5)
     straight = generator.standard_normal((4000, 6)) @ generator.standard_normal((6, 6))
     assert BendMap.fitted(straight) is None
+    assert [] == straightening(straight)
     # Five errors of a power, which has one of 0.02.
     np.testing.assert_allclose(SkewMap.fitted(straight).powers, 1.0, atol=0.1)
 
