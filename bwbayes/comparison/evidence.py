@@ -104,7 +104,7 @@ def evidence(
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))
-    places, proposed = proposal.placed(proposal.draw(random, 10_000))
+    places, proposed = proposal.evaluate(proposal.draw(random, 10_000))
     at_places = posterior.log_density(places) - proposed
     bridged = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.

@@ -6,10 +6,10 @@ Tails are longer on one side, and an offset is the less known the larger the dis
 ellipsoids cover that, least of all where there are few draws. Three maps take it out, one after the
 other. Of two sds a record may tell hardly more than what they are together: the ridge is then two
 legs at a right angle, which a :class:`TotalMap` puts in line. A :class:`SkewMap` makes both tails
-of each coordinate alike. A :class:`BendMap` takes of each coordinate what those before it leave
-open, longest first, and lets it bend quadratically with them, and widen. Each tells how much it
-stretches, so that a distribution of the straight coordinates is one of the bent ones, density and
-all.
+of each coordinate alike. A :class:`QuadraticMap` takes of each coordinate what those before it
+leave open, longest first, and lets it bend quadratically with them, and widen. Each tells how
+much it stretches, so that a distribution of the straight coordinates is one of the bent ones,
+density and all.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown 
 
 
 @dataclass(frozen=True)
-class BendMap:
+class QuadraticMap:
     """The map from straight coordinates z to bent ones x.
 
-    With c = clip(z) to five sds, over coordinates in an order of their own,
+    With c = clip(z) to five sds, and next of the coordinates always the one of which those before
+    it leave open most,
 
         yⱼ = zⱼ exp(Σ_{i < j} sᵢⱼ cᵢ) + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
 
@@ -58,7 +59,7 @@ class BendMap:
     scales: FloatArray | None = None
 
     @classmethod
-    def fitted(cls, draws: FloatArray) -> BendMap | None:
+    def fitted(cls, draws: FloatArray) -> QuadraticMap | None:
         """Fit to draws (count, free), or 20,000 of them; None if not bent and of one width.
 
         A coordinate bends if that explains a tenth of its variance, by least squares and with as
@@ -73,8 +74,7 @@ class BendMap:
         draws = subsample(draws, 20_000)
         count, free = draws.shape
         center = np.mean(draws, axis=0)
-        # Next is always the one of which those before it leave open most. A decomposition of the
-        # draws keeps digits that one of their covariance would lose.
+        # A decomposition of the draws keeps digits that one of their covariance would lose.
         triangle, order = scipy.linalg.qr(draws - center, mode="r", pivoting=True)
         factor = np.empty((free, free))
         factor[order] = triangle[:free].T / np.sqrt(count)
@@ -93,7 +93,7 @@ class BendMap:
             if np.var(straight) < 0.9 * np.var(z[:, j]):
                 z[:, j], bends[:terms, j] = straight, coefficients
             near = np.clip(z[:, : min(j, LONGEST)], -FARTHEST, FARTHEST)
-            scale = scales[: near.shape[1], j] = _widening(near, z[:, j])
+            scale = scales[: near.shape[1], j] = _fit_log_scales(near, z[:, j])
             z[:, j] *= np.exp(-near @ scale)
         if not bends.any() and not scales.any():
             return None
@@ -293,28 +293,26 @@ class TotalMap:
         return slopes
 
 
-type Map = TotalMap | SkewMap | BendMap
+type Map = TotalMap | SkewMap | QuadraticMap
 
 
-def straightening(draws: FloatArray) -> list[Map]:
+def fit_maps(draws: FloatArray) -> list[Map]:
     """Return the maps, one after the other, that make draws (count, free) straight.
 
     A tail may be longer because of a bend, and is taken for one then: there are skews only if the
     draws are more probable with them, by a hundredth of a nat each, as those of a normal
     distribution.
     """
-    found: list[tuple[float, list[Map]]] = []
-    for skewed in (False, True):
-        maps: list[Map] = [SkewMap.fitted(draws)] if skewed else []
+    candidates: list[tuple[float, list[Map]]] = []
+    without: list[Map] = []
+    for skews in (without, [*without, SkewMap.fitted(draws)]):
+        bend = QuadraticMap.fitted(to_straight(skews, draws)[0])
+        maps: list[Map] = [*skews, *([] if bend is None else [bend])]
         straight, log_slope = to_straight(maps, draws)
-        if (bend := BendMap.fitted(straight)) is not None:
-            maps.append(bend)
-            straight, slope = bend.to_straight(straight)
-            log_slope = log_slope + slope
         _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(straight, rowvar=False)))
-        found.append((float(np.mean(log_slope) - 0.5 * log_volume), maps))
-    (plain, bends), (probable, with_skews) = found
-    return with_skews if probable > plain + 0.01 else bends
+        candidates.append((float(np.mean(log_slope) - 0.5 * log_volume), maps))
+    (log_density, bends), (log_density_skewed, bends_and_skews) = candidates
+    return bends_and_skews if log_density_skewed > log_density + 0.01 else bends
 
 
 def to_straight(maps: Sequence[Map], bent: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -349,7 +347,7 @@ def _products(z: FloatArray, last: int) -> FloatArray:
     return products
 
 
-def _widening(near: FloatArray, values: FloatArray) -> FloatArray:
+def _fit_log_scales(near: FloatArray, values: FloatArray) -> FloatArray:
     """Return s (others,) of which values (count,) are as wide as exp(s·c) of c (count, others).
 
     By maximum likelihood of normal values; zeros unless a value is more probable by that than with
@@ -360,14 +358,14 @@ def _widening(near: FloatArray, values: FloatArray) -> FloatArray:
     # A value far out would tell more than all others.
     squares = np.minimum(np.abs(values) / np.std(values), FARTHEST) ** 2
 
-    def unlikely(logs: FloatArray) -> tuple[float, FloatArray]:
+    def loss(logs: FloatArray) -> tuple[float, FloatArray]:
         width = design @ logs
         with np.errstate(over="ignore"):
             left = squares * np.exp(-2 * width)
         # Drawn to zero by a hundredth of a draw each.
-        loss = np.mean(width + 0.5 * left) + 0.005 * logs @ logs
-        return float(loss), design.T @ (1 - left) / count + 0.01 * logs
+        value = np.mean(width + 0.5 * left) + 0.005 * logs @ logs
+        return float(value), design.T @ (1 - left) / count + 0.01 * logs
 
-    found = scipy.optimize.minimize(unlikely, np.zeros(1 + others), jac=True, method="L-BFGS-B")
-    gain = 0.5 + 0.5 * np.log(np.mean(squares)) - found.fun
-    return found.x[1:] if gain > 0.01 else np.zeros(others)
+    optimum = scipy.optimize.minimize(loss, np.zeros(1 + others), jac=True, method="L-BFGS-B")
+    gain = 0.5 + 0.5 * np.log(np.mean(squares)) - optimum.fun
+    return optimum.x[1:] if gain > 0.01 else np.zeros(others)

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.curvature import BendMap
+from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.proposals import StudentMixture
 
 
@@ -70,6 +70,6 @@ def _mixture(group: Any) -> StudentMixture:
     weights, bend = group["weights"][0], group["bend"][0]
     used = weights > 0
     center, factor, bends = np.split(bend, [1, 1 + bend.shape[1]])
-    maps = (BendMap(center[0], factor, bends),) if bend.any() else ()
+    maps = (QuadraticMap(center[0], factor, bends),) if bend.any() else ()
     centers, factors = (group[name][0][used] for name in ("centres", "factors"))
     return StudentMixture(weights[used], centers, factors, maps, freedom=6.0)

@@ -205,7 +205,7 @@ def _independent_steps(
     """Make steps of an independence proposal, whose straight places are known already."""
     walkers, free = path.here.shape
     here = path.density - move.proposal.log_density(path.here)
-    places, log_density = move.proposal.placed(np.concatenate(proposed))
+    places, log_density = move.proposal.evaluate(np.concatenate(proposed))
     offered = yield places
     shape = (len(chances), move.places, walkers)
     weight = (offered - log_density).reshape(shape)

@@ -18,11 +18,11 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.curvature import (
-    BendMap,
     Map,
+    QuadraticMap,
     SkewMap,
     TotalMap,
-    straightening,
+    fit_maps,
     subsample,
     to_curved,
     to_straight,
@@ -30,7 +30,7 @@ from bwbayes.sampling.curvature import (
 from bwbayes.shown import brief
 
 # By the name in a file, in the order in which they make coordinates straight.
-_MAPS: dict[str, type[Map]] = {"totals": TotalMap, "skew": SkewMap, "bend": BendMap}
+_MAPS: dict[str, type[Map]] = {"totals": TotalMap, "skew": SkewMap, "bend": QuadraticMap}
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class StudentMixture:
         if guess is not None and modes:
             likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
             first = draws[np.asarray(guess._modes)[likeliest] == 0]
-        further = straightening(first)
+        further = fit_maps(first)
         draws, slope = to_straight(further, draws)
         modes = [to_straight(further, mode)[0] for mode in modes]
         # First with so few of the draws that they cost little, then with all.
@@ -163,8 +163,8 @@ class StudentMixture:
             keys = {field.name: f"{name}_{field.name}" for field in fields(kind)}
             if stored := {key: arrays[stored] for key, stored in keys.items() if stored in arrays}:
                 maps.append(kind(**stored))
-        own = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
-        return cls(**own, maps=tuple(maps))
+        parts = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
+        return cls(**parts, maps=tuple(maps))
 
     @cached_property
     def _whitening(self) -> FloatArray:
@@ -203,7 +203,7 @@ class StudentMixture:
             density[rows] = self._straight_density(straight) + log_slope
         return density.reshape(coordinates.shape[:-1])
 
-    def placed(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def evaluate(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return coordinates (count, free) of straight ones, and their log density (count,)."""
         coordinates, log_slope = to_curved(self.maps, straight)
         return coordinates, self._straight_density(straight) - log_slope

@@ -108,7 +108,7 @@ def _tried(
     count: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Draw places (count, free) of a proposal; log density of the posterior over its (count,)."""
-    places, proposed = proposal.placed(proposal.draw(random, count))
+    places, proposed = proposal.evaluate(proposal.draw(random, count))
     ratio: FloatArray = posterior.log_density(places) - proposed
     return places, ratio
 

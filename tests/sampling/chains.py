@@ -10,7 +10,7 @@ import numpy as np
 
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import BendMap, SkewMap, TotalMap
+from bwbayes.sampling.curvature import QuadraticMap, SkewMap, TotalMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
@@ -59,7 +59,7 @@ def proposal(phase: Phase) -> StudentMixture:
     bends[0, 1], scales[0, 1] = generator.standard_normal(2)
     totals = TotalMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
     skew = SkewMap(centers[1], np.exp(centers[2]), np.full(FREE, 0.8))
-    bend = BendMap(centers[0], factors[0], bends, scales)
+    bend = QuadraticMap(centers[0], factors[0], bends, scales)
     return StudentMixture(weights, centers, factors, (totals, skew, bend))
 
 

@@ -56,7 +56,7 @@ def share_by_weights(posterior: Posterior, point: PointFit) -> tuple[float, floa
     around = StudentMixture.around(point.optima, *map_estimate.peaks(posterior, point))
     # Twice as wide as the modes: what is between them is reached too.
     proposal = replace(around, factors=2**0.5 * around.factors, freedom=3.0)
-    places, proposed = proposal.placed(proposal.draw(np.random.RandomState(1), 400_000))
+    places, proposed = proposal.evaluate(proposal.draw(np.random.RandomState(1), 400_000))
     weights = scipy.special.softmax(posterior.log_density(places) - proposed)
     inside = without_discrepancy(posterior, places)
     share = float(weights @ inside)

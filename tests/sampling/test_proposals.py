@@ -20,7 +20,7 @@ from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Declaration, lognormal
 from bwbayes.sampling import proposals
-from bwbayes.sampling.curvature import LONGEST, BendMap, SkewMap, TotalMap, straightening
+from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalMap, fit_maps
 from bwbayes.sampling.proposals import StudentMixture
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
@@ -46,7 +46,7 @@ def test_the_density_is_that_of_scipys_mixture() -> None:
 
 def test_draws_have_the_distribution() -> None:
     """Each coordinate, and one direction across, by Kolmogorov-Smirnov at one in 10,000."""
-    draws, _ = MIXTURE.placed(MIXTURE.draw(np.random.RandomState(3), 20_000))  # emcee's generator
+    draws, _ = MIXTURE.evaluate(MIXTURE.draw(np.random.RandomState(3), 20_000))  # emcee's generator
     for direction in np.array([[1.0, 0.0], [0.0, 1.0], [0.6, -0.8]]):
 
         def cdf(x: FloatArray, direction: FloatArray = direction) -> FloatArray:
@@ -91,7 +91,7 @@ def test_components_of_hardly_any_draws_give_no_nan(name: str) -> None:
     assert (4,) == mixture.weights.shape
     assert (mixture.weights > 0).all()
     assert np.isfinite(mixture.log_density(TINY[name])).all()
-    proposed, log_density = mixture.placed(mixture.draw(np.random.RandomState(14), 500))
+    proposed, log_density = mixture.evaluate(mixture.draw(np.random.RandomState(14), 500))
     assert np.isfinite(log_density).all()
     # Of units far apart rounding leaves less.
     np.testing.assert_allclose(mixture.log_density(proposed), log_density, atol=1e-3)
@@ -126,7 +126,7 @@ def any_skew(free: int, generator: np.random.Generator) -> SkewMap:
     return SkewMap(center, scale, generator.uniform(0.1, 1.9, free))
 
 
-def any_bend(free: int, generator: np.random.Generator) -> BendMap:
+def any_bend(free: int, generator: np.random.Generator) -> QuadraticMap:
     """Return a bend with coefficients wherever there may be any."""
     longest = min(free, LONGEST)
     bends = generator.normal(0, 0.3, (longest * (longest + 1) // 2, free))
@@ -136,13 +136,13 @@ def any_bend(free: int, generator: np.random.Generator) -> BendMap:
         place += k + 1
     scales = np.triu(generator.normal(0, 0.1, (longest, free)), 1)
     factor = np.linalg.qr(generator.standard_normal((free, free)))[0] * np.geomspace(1, 0.1, free)
-    return BendMap(generator.standard_normal(free), factor, bends, scales)
+    return QuadraticMap(generator.standard_normal(free), factor, bends, scales)
 
 
 @pytest.mark.parametrize("any_map", [any_totals, any_skew, any_bend])
 @given(free=st.integers(2, 15), seed=st.integers(0, 10**6))
 def test_straight_undoes_bent_and_tells_how_much_it_stretches(
-    any_map: Callable[[int, np.random.Generator], BendMap | SkewMap | TotalMap],
+    any_map: Callable[[int, np.random.Generator], QuadraticMap | SkewMap | TotalMap],
     free: int,
     seed: int,
 ) -> None:
@@ -171,8 +171,8 @@ def test_skewed_tails_are_scipys(power: float, seed: int) -> None:
 def test_what_is_normal_is_neither_bent_nor_widened_nor_skewed() -> None:
     generator = np.random.default_rng(5)
     straight = generator.standard_normal((4000, 6)) @ generator.standard_normal((6, 6))
-    assert BendMap.fitted(straight) is None
-    assert [] == straightening(straight)
+    assert QuadraticMap.fitted(straight) is None
+    assert [] == fit_maps(straight)
     # Five errors of a power, which has one of 0.02.
     np.testing.assert_allclose(SkewMap.fitted(straight).powers, 1.0, atol=0.1)
 
@@ -183,7 +183,7 @@ def test_a_width_is_found_that_another_coordinate_tells() -> None:
     x = np.column_stack([z[:, 0], z[:, 1] * np.exp(0.4 * np.clip(z[:, 0] / 3, -5, 5))])
     x[7, 1] = 50.0
     for draws in (x[8:], x):
-        bend = BendMap.fitted(draws)
+        bend = QuadraticMap.fitted(draws)
         assert bend is not None
         assert bend.scales is not None
         # The first axis may point either way; an outlier makes sds of others, not widths.
@@ -216,7 +216,7 @@ def taken(
     proposal: StudentMixture, draws: FloatArray, log_density: Callable[[FloatArray], FloatArray]
 ) -> float:
     """Return which part of an independence sampler's proposals is taken, of a known target."""
-    places, proposed = proposal.placed(proposal.draw(np.random.RandomState(8), len(draws)))
+    places, proposed = proposal.evaluate(proposal.draw(np.random.RandomState(8), len(draws)))
     old, new = log_density(draws) - proposal.log_density(draws), log_density(places) - proposed
     return float(np.mean(np.exp(np.minimum(new - old, 0.0))))
 
@@ -224,7 +224,7 @@ def taken(
 def unstraightened(draws: FloatArray, log_density: FloatArray | None = None) -> StudentMixture:
     """Fit without what bends, widens and skews."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proposals, "straightening", lambda _: [])
+        patch.setattr(proposals, "fit_maps", lambda _: [])
         return StudentMixture.fitted(draws, log_density)
 
 
@@ -232,7 +232,7 @@ def test_places_on_a_ridge_are_taken_several_times_as_often() -> None:
     draws, others = banana(4000), banana(4000, seed=7)
     bent, unbent = StudentMixture.fitted(draws), unstraightened(draws)
     # The tail of one side is the bend's.
-    assert [BendMap] == [type(map_) for map_ in bent.maps]
+    assert [QuadraticMap] == [type(map_) for map_ in bent.maps]
     assert taken(bent, others, log_banana) > 0.7
     assert taken(unbent, others, log_banana) < taken(bent, others, log_banana) / 3
 
@@ -247,7 +247,7 @@ def test_longer_tails_and_widths_are_proposed_as_often_as_they_are() -> None:
     for seed in range(12):
         draws = funnel(2000, seed)
         fits = [fit(draws, log_funnel(draws)) for fit in (StudentMixture.fitted, unstraightened)]
-        assert [SkewMap, BendMap] == [type(map_) for map_ in fits[0].maps]
+        assert [SkewMap, QuadraticMap] == [type(map_) for map_ in fits[0].maps]
         rates.append([taken(proposal, others, log_funnel) for proposal in fits])
         logs = [log_funnel(others) - proposal.log_density(others) for proposal in fits]
         rests.append([np.mean(np.sort(np.exp(weights))[-100:]) for weights in logs])
@@ -273,7 +273,7 @@ def test_the_density_is_that_of_the_draws(
     Over 20,000 draws its error is 0.01.
     """
     proposal = StudentMixture.fitted(drawn)
-    y, proposed = proposal.placed(proposal.draw(np.random.RandomState(10), 20_000))
+    y, proposed = proposal.evaluate(proposal.draw(np.random.RandomState(10), 20_000))
     ratio = np.exp(log_target(y) + missing - proposed)
     assert np.std(ratio) / np.sqrt(ratio.size) < 0.02
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.06)
@@ -330,7 +330,7 @@ def test_places_on_two_legs_are_taken_more_often_and_have_their_density() -> Non
     fitted = StudentMixture.fitted(draws, None, guess), StudentMixture.fitted(draws)
     x, rates, spreads = legs(4000, 2), [], []
     for proposal in fitted:
-        y, proposed = proposal.placed(proposal.draw(np.random.RandomState(3), 4000))
+        y, proposed = proposal.evaluate(proposal.draw(np.random.RandomState(3), 4000))
         old, new = log_legs(x) - proposal.log_density(x), log_legs(y) - proposed
         rates.append(float(np.mean(np.exp(np.minimum(new - old, 0.0)))))
         # Both are estimates of the constant that is missing to the target's density.

@@ -18,7 +18,7 @@ import pytest
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.curvature import BendMap
+from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.storage import ChainFile
 from tests.sampling.chains import (
     ATTRIBUTES,
@@ -235,7 +235,7 @@ def write_earlier(path: Path, chain: ChainFile) -> None:
                 bend = next(iter(mixture.maps), None)
                 twice[f"{group}/bend"] = (
                     np.vstack([bend.center, bend.factor, bend.bends])
-                    if isinstance(bend, BendMap)
+                    if isinstance(bend, QuadraticMap)
                     else np.zeros((1 + free, free))
                 )
             done = chain.history(phase)
@@ -258,7 +258,7 @@ def test_a_chain_of_an_earlier_version_is_read_and_goes_on_as_todays(
     chain = ChainFile.read(whole)
     for phase, mixture in chain.proposals.items():
         # Its proposals did not put sds in line, knew no skewed tails, and nothing that widens.
-        bends = [m for m in mixture.maps if isinstance(m, BendMap)] if mixture else []
+        bends = [m for m in mixture.maps if isinstance(m, QuadraticMap)] if mixture else []
         maps = tuple(replace(bend, scales=None) for bend in bends)
         chain.proposals[phase] = mixture and replace(mixture, maps=maps, freedom=6.0)
     write_earlier(tmp_path / "chain.h5", chain)

@@ -94,7 +94,7 @@ def _begin() -> None:
 def _load() -> None:
     """Load what draws, and what its work is made of."""
     if "bwbayes.report.figures.interactive" in sys.modules:
-        return  # before
+        return  # at the beginning
     from bwbayes.report import result  # noqa: F401, PLC0415
     from bwbayes.report.figures import prepare  # noqa: PLC0415
 
