@@ -241,11 +241,13 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         The largest x↓ − x↑ at one voltage as a part of the range: what data sheets call hysteresis.
     ``remanence_um``
         x↓(0) − x_m: what remains at zero volts after the highest voltage, against the middle; half
-        of the opening in a loop that is symmetric about zero. None as for the opening.
+        of the opening in a loop that is symmetric about zero.
     ``coercive_V``
         (u↑ − u↓) / 2, with u↑ and u↓ the voltages at which x↑ and x↓ pass the middle x_m: half of
         the loop's width there. In a loop that is symmetric about zero it is the voltage that takes
-        the displacement back to zero, as the coercive field does a polarization.
+        the displacement back to zero, as the coercive field does a polarization. Both are None
+        unless the loop is about zero volts, u↓ ≤ 0 ≤ u↑ in the mean of the models: the middle of
+        a unipolar drive is no state without a field.
     ``area_um_V``
         −∮ x du = ∮ u dx over one cycle, positive where the displacement lags: the energy lost in a
         cycle, in µJ, once multiplied with the actuator's force per volt, N/V.
@@ -259,12 +261,13 @@ def measures(traced: Traced) -> dict[str, FloatArray | None]:
         first_passage(voltage, sign * (x - middle[:, np.newaxis]), 0.0) for x in (rising, falling)
     )
     through_zero = bool(voltage[0] < 0 < voltage[-1])
+    about_zero = through_zero and bool(np.nanmean(down) <= 0 <= np.nanmean(up))
     return {
         "range_um": size,
         "opening_um": _at_zero(voltage, gap) if through_zero else None,
         "widest_percent": 100 * np.max(gap, axis=1) / np.abs(size),
-        "remanence_um": _at_zero(voltage, falling) - middle if through_zero else None,
-        "coercive_V": (up - down) / 2,
+        "remanence_um": _at_zero(voltage, falling) - middle if about_zero else None,
+        "coercive_V": (up - down) / 2 if about_zero else None,
         "area_um_V": np.asarray(scipy.integrate.simpson(gap, x=voltage, axis=1)),
     }
 

@@ -196,7 +196,9 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     ]
     if result.loops is not None:
         measured = tables.loops_table(result.loops)
-        loops: list[Block] = [measured, pictures["loops"], Glossary([*LOOP_TERMS.items()])]
+        titles = [row[0] for row in measured.rows]
+        terms = [pair for pair in LOOP_TERMS.items() if any(t.startswith(pair[0]) for t in titles)]
+        loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
         blocks.append(Section("Loops", loops, folded=False))
     if result.steps:
         steps: list[Block] = [tables.steps_table(result.steps), pictures["steps"]]

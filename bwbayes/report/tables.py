@@ -257,12 +257,14 @@ def _measured(
     records: Sequence[Mapping[str, object]],
     note: str,
 ) -> Table:
-    """Return mean ± SD and interval of each measure of every loop or step."""
+    """Return mean ± SD and interval of each measure that any loop or step has."""
     columns: list[str | TableColumn] = ["Quantity"]
     for title in estimates:
         columns += [TableColumn("Mean ± SD", title, on="page"), TableColumn("95% interval", title)]
     rows = []
     for measure, (words, unit) in measures.items():
+        if all(estimated[measure] is None for estimated in estimates.values()):
+            continue
         row = [words]
         for estimated in estimates.values():
             if (estimate := estimated[measure]) is None:

@@ -19,6 +19,7 @@ from bwbayes.prediction.loops import (
     measures,
     steady_loop,
 )
+from bwbayes.report.tables import loops_table
 from tests.model.operators.slow import by_plays
 from tests.model.operators.test_every_operator import posterior
 
@@ -51,14 +52,16 @@ def test_plays_are_measured_as_in_a_slow_loop(low: float, high: float) -> None:
     expected = {
         "range_um": rising[-1] - rising[0],
         "widest_percent": 100 * np.max(falling - rising) / (rising[-1] - rising[0]),
-        "coercive_V": (np.interp(middle, rising, u) - np.interp(middle, falling, u)) / 2,
     }
     cycle = np.concatenate([u, u[::-1]]), np.concatenate([rising, falling[::-1]])
     forward = cycle[0] * np.roll(cycle[1], -1) - np.roll(cycle[0], -1) * cycle[1]
     expected["area_um_V"] = np.sum(forward) / 2
     if low < 0:
         expected["opening_um"] = np.interp(0.0, u, falling - rising)
+    if low == -high:
         expected["remanence_um"] = np.interp(0.0, u, falling) - middle
+        passing = [np.interp(middle, branch, u) for branch in (rising, falling)]
+        expected["coercive_V"] = (passing[0] - passing[1]) / 2
     assert set(got) == set(expected)
     for name, value in expected.items():
         assert value == pytest.approx(got[name], rel=1e-4), name
@@ -83,6 +86,23 @@ def test_loops_are_those_of_the_whole_range_and_of_half_of_it() -> None:
     assert (low, high) == (loops.major.voltage[0], loops.major.voltage[-1])
     assert [low + quarter, high - quarter] == pytest.approx(loops.minor.voltage[[0, -1]])
     assert 2 * quarter == pytest.approx(loops.major.amplitude)
+
+
+@pytest.mark.parametrize(("shift", "about_zero"), [(-5.0, True), (60.0, False), (150.0, False)])
+def test_remanence_and_coercive_voltage_are_of_loops_about_zero_volts(
+    shift: float, about_zero: bool
+) -> None:
+    """Elsewhere they have no number, no row and no term; an opening is where the loop has zero."""
+    of, draws = problem("bouc-wen")
+    # Over 200 V, with a coercive voltage of some 10 V.
+    voltage = 100 * of.only.voltage / np.max(np.abs(of.only.voltage))
+    loops = measure_loops(of.altered(voltage=voltage + shift), draws)
+    for loop in (loops.major, loops.minor):
+        for name in ("remanence_um", "coercive_V"):
+            assert (loop.estimates[name] is not None) == about_zero
+    titles = [row[0] for row in loops_table(loops).rows]
+    assert ("Remanence" in titles, "Coercive voltage" in titles) == (about_zero, about_zero)
+    assert ("Opening at zero voltage" in titles) == (shift < 100)
 
 
 def test_initial_curve_starts_at_zero_volts_and_ends_where_the_voltage_does() -> None:
