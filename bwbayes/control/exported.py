@@ -2,7 +2,9 @@
 
 The C file needs no library but ``math.h`` and allocates nothing. It holds the very functions of
 :mod:`bwbayes.control.sampled`, forward and, where the model has one, inverse; both take a bounded
-time.
+time. Where a voltage is held between samples, forward returns the displacement just before its
+voltage acts and inverse the voltage for the next sample: forward of inverse is one sample late. A
+value that is not a number holds the last voltage and sets ``held`` of the state.
 """
 
 from __future__ import annotations

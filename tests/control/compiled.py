@@ -16,14 +16,15 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
 # One call for each sample, as in a controller.
 DRIVER = """
-void run_FUNCTION(double begin, const double *values, double *result, size_t count);
-void run_FUNCTION(double begin, const double *values, double *result, size_t count)
+void run_FUNCTION(double begin, const double *values, double *result, double *held, size_t count);
+void run_FUNCTION(double begin, const double *values, double *result, double *held, size_t count)
 {
     actuator_state state;
     size_t i;
     actuator_begin(&state, begin);
     for (i = 0; i < count; i++) {
         result[i] = actuator_FUNCTION(&state, values[i]);
+        held[i] = state.held;
     }
 }
 """
@@ -63,10 +64,16 @@ class Compiled:
 
     def run(self, function: str, begin: float, values: FloatArray) -> FloatArray:
         """Return what ``forward`` or ``inverse`` makes of values (samples,), one call each."""
+        return self.run_with_flags(function, begin, values)[0]
+
+    def run_with_flags(
+        self, function: str, begin: float, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the same, and whether a voltage was held (samples,)."""
         array = ndpointer(np.float64, flags="C")
         call = getattr(self._library, f"run_{function}")
-        call.argtypes = [ctypes.c_double, array, array, ctypes.c_size_t]
+        call.argtypes = [ctypes.c_double, array, array, array, ctypes.c_size_t]
         call.restype = None
-        result = np.empty(values.size)
-        call(begin, np.ascontiguousarray(values), result, values.size)
-        return result
+        result, held = np.empty((2, values.size))
+        call(begin, np.ascontiguousarray(values), result, held, values.size)
+        return result, held

@@ -64,6 +64,47 @@ def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
     assert 5.0 == pytest.approx(compiled.run("forward", 0.0, command)[-1], abs=1e-12)
 
 
+@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, gain"])
+@every_hold
+def test_a_value_that_cannot_be_used_holds_the_last_voltage(
+    name: str, hold: Hold, tmp_path: Path
+) -> None:
+    """Bit by bit as if the last voltage had come again, with a flag at just these samples."""
+    compiled = Compiled(of(name, hold), tmp_path, needs("cc"))
+    voltage = cases.drive(400)
+    rng = np.random.default_rng(5)
+    lost = rng.random(voltage.size) < 0.2
+    lost[[0, 200, 201, 202]] = True
+    last = np.maximum.accumulate(np.where(lost, -1, np.arange(voltage.size)))
+    before = np.where(last < 0, voltage[0], voltage[last])
+    for bad in (np.nan, np.inf, -np.inf, 1e308):
+        given = np.where(lost, bad, voltage)
+        displacement, held = compiled.run_with_flags("forward", voltage[0], given)
+        np.testing.assert_array_equal(held, lost)
+        np.testing.assert_array_equal(displacement, compiled.run("forward", voltage[0], before))
+    reference = compiled.run("forward", voltage[0], voltage)
+    given = np.where(lost, np.nan, reference)
+    command, held = compiled.run_with_flags("inverse", voltage[0], given)
+    np.testing.assert_array_equal(held, lost)
+    np.testing.assert_array_equal(command[lost], np.append(voltage[0], command)[:-1][lost])
+    # What follows is met as ever, unless a limit is in the way.
+    late = int(hold == "zero")
+    reached = compiled.run("forward", voltage[0], command)
+    free = ~lost & (command > cases.SPAN.low) & (command < cases.SPAN.high)
+    met = np.flatnonzero(free[: voltage.size - late])
+    assert met.size > 200
+    np.testing.assert_allclose(reached[met + late], reference[met], atol=1e-9)
+    begun = compiled.run_with_flags("forward", np.nan, voltage[:1] * 0)
+    np.testing.assert_array_equal(begun[0], compiled.run("forward", 0.0, voltage[:1] * 0))
+
+
+@every_hold
+def test_the_header_says_which_sample_the_inverse_is_of(hold: Hold) -> None:
+    code = of("bouc-wen with all", hold).c_code()
+    assert ("forward of\n * inverse is one sample late" in code) == (hold == "zero")
+    assert ("inverse returns the voltage of the same sample." in code) == (hold == "first")
+
+
 def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None:
     actuator = Actuator("none")
     theta = cases.theta(actuator)[0]

@@ -187,8 +187,9 @@ def design(
 def export(folder: Path, out: Path | None, **options: Any) -> int:
     """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
 
-    It is the posterior's mean. The C file needs math.h alone and does a sample a call. 0 um is
-    where the demagnetized actuator stands at zero volts.
+    It is the posterior's mean. The C file needs math.h alone and does a sample a call; its head
+    says which sample, and what a value does that is not a number. 0 um is where the demagnetized
+    actuator stands at zero volts.
 
     Example: bwbayes export results/ring_bender --rate 1000
     """

@@ -208,8 +208,10 @@ def export(
 ) -> Exported:
     """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
 
-    0 um is where the demagnetized actuator stands at zero volts. What is returned has the
-    ``linear`` part as a discrete ``scipy.signal`` system.
+    0 um is where the demagnetized actuator stands at zero volts. With ``hold="zoh"`` the inverse is
+    for the next sample: forward of inverse is one sample late. In C a value that is not a number
+    holds the last voltage, and the state says so. What is returned has the ``linear`` part as a
+    discrete ``scipy.signal`` system.
 
     Parameters
     ----------
