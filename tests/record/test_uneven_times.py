@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record
-from bwbayes.record.io.fields import VoltageIs
+from bwbayes.record.io.columns import Naming, select
+from bwbayes.record.io.fields import VoltageIs, record_fields
+from bwbayes.record.io.series import array_source
 
 
 def uneven(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Record:
@@ -115,6 +117,55 @@ def test_samples_are_uniform_whose_clock_ticks_too_slowly(
     # The times of both ends are uncertain by a tick.
     length = record.interval * (samples - 1)
     assert length == pytest.approx(interval * (samples - 1), abs=1.1 * tick)
+
+
+@given(
+    st.integers(100, 4000),
+    st.floats(0.01, 1e6),
+    st.integers(3, 9),
+    st.sampled_from("ge"),
+    st.sampled_from([0.0, -0.5, 0.2, 3.0]),
+    st.booleans(),
+)
+@example(20_000, 44_100.0, 5, "g", 0.0, False)
+@settings(max_examples=150, deadline=None)
+def test_times_of_a_fixed_number_of_digits_are_uniform(
+    samples: int, rate: float, digits: int, form: str, start: float, is_stated: bool
+) -> None:
+    """Any rate, length and start, as C prints them with %g and %e: no reading is moved, no remark.
+
+    Times are refused where the last digit is longer than 0.8 intervals, or read all the same. A
+    rate that the file states, or a round one, is met exactly.
+    """
+    rate = float(f"{rate:.3g}")
+    start *= samples / rate
+    time = start + np.arange(samples) / rate
+    printed = [f"{t:.{digits - (form == 'e')}{form}}" for t in time]
+    voltage = np.random.default_rng(samples).standard_normal(samples)
+    table = {"time_s": np.array(printed, dtype=np.float64), "voltage_V": voltage}
+    notes = {"sample_rate": f"{rate!r} Hz"} if is_stated else {}
+    source = array_source("file", table | {"displacement_um": voltage}, notes=notes)
+    is_fine = 10 ** (np.floor(np.log10(np.abs(time).max())) - digits + 1) <= 0.8 / rate
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error" if is_fine else "ignore", InputWarning)
+            record = Record(**record_fields(select(source, Naming())))
+    except InputError:
+        assert not is_fine
+        return
+    np.testing.assert_array_equal(record.voltage, voltage)
+    if is_fine:
+        assert record.interval == pytest.approx(1 / rate, abs=0.6 / rate / samples)
+    if is_fine and is_stated:
+        assert 1 / rate == record.interval
+
+
+def test_samples_are_missing_beside_times_of_a_fixed_number_of_digits() -> None:
+    index = np.delete(np.arange(5000), [10, 700, 701, 4990])
+    time = np.array([float(f"{t:.6g}") for t in index / 44_100])
+    record = uneven(time, np.sin(index / 100), np.cos(index / 100))
+    assert (5000, 4996) == (record.samples, record.readings)
+    np.testing.assert_array_equal(record.voltage[index], np.sin(index / 100))
 
 
 def test_a_slow_clock_is_named_and_samples_may_be_missing_beside_it() -> None:

@@ -214,8 +214,71 @@ def _uniform_interval(
             break
     tolerance = max(0.01 * interval, min(max(printed, rounding), 0.4 * interval))
     if (np.abs(elapsed - interval * positions) > tolerance).any():
-        return None
+        return _printed_interval(table, elapsed, positions)
     return _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
+
+
+def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
+    """Return the interval, s, of a uniform grid whose times have a fixed number of digits in print.
+
+    Unlike with a fixed number of decimals, a later time is rounded to a coarser unit. All times are
+    within half a unit of their last digit, or 1% of the interval, along a line. Where late units
+    are longer than 0.8 intervals, early ones have to be short, as coarse times alone would hide
+    missing samples.
+    """
+    column = table.columns["time"]
+    half = _half_units(np.asarray(column.values, dtype=np.float64))
+    if half is None:
+        return None
+    steps, interval = int(positions[-1]), float(elapsed[-1] / positions[-1])
+    half = np.maximum(column.scaled(half, "time"), 0.01 * interval)
+    is_even = steps == elapsed.size - 1
+    if half.max() > 0.4 * interval and not (
+        is_even and np.count_nonzero(half <= 0.1 * interval) >= 10
+    ):
+        return None
+    slopes = _slopes_between(elapsed - half, elapsed + half, positions)
+    if slopes is None:
+        return None
+    low, high = slopes
+    unsure = (high - low) / 2 * steps
+    return _exact_interval(table, (low + high) / 2, unsure, unsure / 2, steps, or_rate=True)
+
+
+def _half_units(values: FloatArray) -> FloatArray | None:
+    """Return half a unit of the last significant digit of each number, if they have at most 12."""
+    size = np.abs(values)
+    exponent = np.floor(np.log10(np.where(size > 0, size, 1.0)))
+    for digits in range(3, 13):
+        unit = 10.0 ** (exponent - digits + 1)
+        counts = size / unit
+        if np.all(np.abs(counts - np.rint(counts)) <= 1e-6 + 1e-15 * counts):
+            return np.where(size > 0, unit / 2, 0.0)
+    return None
+
+
+def _slopes_between(
+    lower: FloatArray, upper: FloatArray, positions: IntArray
+) -> tuple[float, float] | None:
+    """Return the least and the largest slope of the lines between bounds, if there are any.
+
+    From a slope at either end of what the first and the last bounds allow: as long as two bounds
+    exclude it, these two give the next.
+    """
+    slopes = []
+    for sign, end in (-1, lower[-1] - upper[0]), (1, upper[-1] - lower[0]):
+        slope = float(end / positions[-1])
+        while True:
+            low = int(np.argmax(lower - slope * positions))
+            high = int(np.argmin(upper - slope * positions))
+            run, rise = float(positions[high] - positions[low]), float(upper[high] - lower[low])
+            if rise - slope * run >= -1e-6 * abs(slope):
+                break
+            if sign * run <= 0:
+                return None
+            slope = rise / run
+        slopes.append(slope)
+    return slopes[0], slopes[1]
 
 
 def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
@@ -297,14 +360,29 @@ def _with_gaps(table: ColumnTable, steps: FloatArray) -> IntArray:
 
 
 def _exact_interval(
-    table: ColumnTable, measured: float, tolerance: float, rounding: float, steps: int
+    table: ColumnTable,
+    measured: float,
+    tolerance: float,
+    rounding: float,
+    steps: int,
+    *,
+    or_rate: bool = False,
 ) -> float:
-    """Return the interval that the file declares, if its times agree, or else the roundest one."""
+    """Return the interval that the file declares, if its times agree, or else the roundest one.
+
+    That of a round rate may count as round too.
+    """
     text = table.notes.get("interval_s")
     if text is None:
+        if rate := table.source.stated_rate():
+            if abs(1 / rate - measured) <= tolerance / steps:
+                return 1 / rate
         # The digits after these are the rounding of the times.
         unsure = max(2 * rounding / steps, 5e-13 * measured)
-        rounded = [float(f"{measured:.{digits}g}") for digits in range(1, 13)]
+        rounded = []
+        for digits in range(1, 13):
+            rounded += [float(f"{measured:.{digits}g}")]
+            rounded += [1 / float(f"{1 / measured:.{digits}g}")] * or_rate
         return next((value for value in rounded if abs(value - measured) <= unsure), rounded[-1])
     try:
         declared = float(text)

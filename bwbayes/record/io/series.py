@@ -90,7 +90,7 @@ class Source:
     interval: float | None = None
     start: float = 0.0
 
-    def stated_rate(self, default: float) -> float:
+    def stated_rate(self, default: float = 0.0) -> float:
         """Return the sampling rate, Hz, that is stated beside the series, or the default."""
         texts = {n.lower(): t for notes in self.notes.values() for n, t in notes.items()}
         for series in self.series:
