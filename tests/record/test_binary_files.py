@@ -151,7 +151,7 @@ def replaced(values: np.ndarray, sample: int, value: float) -> np.ndarray:
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "nan": ({"voltage_V": replaced(VOLTAGE, 23, np.nan)}, ":sample 23: voltage_V: no number"),
     "gap": ({"voltage_V": replaced(VOLTAGE, 17, np.nan)}, ":sample 18: time_s: gap of 0.002 s"),
-    "inf": ({"displacement_um": replaced(DISPLACEMENT, 0, -np.inf)}, ":sample 0: displacement_um"),
+    "inf": ({"voltage_V": replaced(VOLTAGE, 0, -np.inf)}, ":sample 0: voltage_V"),
     "lengths": ({"voltage_V": VOLTAGE[1:]}, ": voltage_V: 23 values where time has 24"),
     "complex": ({"voltage_V": VOLTAGE + 1j}, ": voltage_V: holds complex numbers"),
     "matrix": ({"voltage_V": VOLTAGE.reshape(6, 4)}, ": no column for the voltage; add it"),

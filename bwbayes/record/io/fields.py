@@ -121,14 +121,20 @@ def _check_lengths(table: ColumnTable) -> None:
 
 
 def _without_marks(table: ColumnTable) -> ColumnTable:
-    """Return the table without readings of a number that marks missing ones, as -9999 or 1e30.
+    """Return the table without readings of a number that marks missing ones, as inf, -9999 or 1e30.
 
-    Such a number is repeated, further from all others than they are apart, where the voltage is one
+    A finite one is repeated, further from all others than they are apart, where the voltage is one
     that others were read at.
     """
     column, voltage = table.columns["displacement"], table.columns["voltage"].values
     readings = np.array(column.values, dtype=np.float64)
     is_finite = np.isfinite(readings)
+    if (is_infinite := np.isinf(readings)).any():
+        count = int(np.count_nonzero(is_infinite))
+        remark = f"inf {count} time{'s' * (count > 1)}, no number, is taken as missing"
+        where = int(np.argmax(is_infinite))
+        warnings.warn(str(table.error(remark, "displacement", where)), InputWarning, stacklevel=4)
+        readings[is_infinite] = np.nan
     levels, counts = np.unique(readings[is_finite], return_counts=True)
     center = np.median(levels / 2) if levels.size else 0.0
     farthest = np.argsort(-np.abs(levels / 2 - center))

@@ -374,9 +374,9 @@ def _exact_interval(
     """
     text = table.notes.get("interval_s")
     if text is None:
-        if rate := table.source.stated_rate():
-            if abs(1 / rate - measured) <= tolerance / steps:
-                return 1 / rate
+        rate = table.source.stated_rate()
+        if rate and abs(1 / rate - measured) <= tolerance / steps:
+            return 1 / rate
         # The digits after these are the rounding of the times.
         unsure = max(2 * rounding / steps, 5e-13 * measured)
         rounded = []

@@ -20,7 +20,8 @@ from bwbayes.errors import InputError, NoNumbersError
 from bwbayes.record.io.units import QUANTITIES, power_of
 
 _NUMBER = re.compile(
-    r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)([eEdD][+-]?\d+)?"
+    r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+(,\d*)?|\d{1,3}(,\d{3})+(\.\d*)?)"
+    r"([eEdD][+-]?\d+)?"
     r"|[+-]?nan|[+-]?inf",
     re.IGNORECASE,
 )

@@ -42,7 +42,10 @@ from bwbayes.record.io.layout import (
 from bwbayes.record.io.series import RATES, Series, Source, in_seconds
 from bwbayes.record.record import Record
 
-_MARKS = "['\u2019\u00a0\u2009\u202f]"
+type Marks = tuple[str, str | None]
+"""The mark of decimals in numbers, and that of thousands, if there is one."""
+
+_OTHER_MARKS = "['\u2019\u00a0\u2009\u202f]"
 
 
 def read_text(path: Path) -> Source:
@@ -100,7 +103,7 @@ def read_text(path: Path) -> Source:
         first = min(set(range(layout.first + 1, len(lines) + 1)) - set(numbers))
         remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
-    frame, decimal = _parsed(path, body, layout)
+    frame, marks = _parsed(path, body, layout)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
         if column >= layout.fields:
@@ -109,7 +112,7 @@ def read_text(path: Path) -> Source:
         cell = str(frame[column].iloc[0])
         is_clock = bool(re.match(r".*\d:\d\d|[\d.]+ (sec|min|hr)$", cell))
         stated = "s" if is_clock else unit
-        load = partial(_numbers, path, frame[column], decimal, name, numbers, is_clock=is_clock)
+        load = partial(_numbers, path, frame[column], marks, name, numbers, is_clock=is_clock)
         series.append(
             Series(name, len(body), load, stated, load_readings=partial(load, words=True))
         )
@@ -155,10 +158,10 @@ def _decoded(path: Path) -> str:
     text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
     # What C writes where there is no number, and marks of thousands but points and commas.
     text = re.sub(r"-?1\.#(INF|IND|QNAN|SNAN)\d*", "nan", text)
-    if re.search(_MARKS, text) is None:
+    if re.search(_OTHER_MARKS, text) is None:
         return text
-    thousands = rf"(?<![\d.,])\d{{1,3}}({_MARKS}\d{{3}})+(?!\d)"
-    return re.sub(thousands, lambda number: re.sub(_MARKS, "", number[0]), text)
+    thousands = rf"(?<![\d.,])\d{{1,3}}({_OTHER_MARKS}\d{{3}})+(?!\d)"
+    return re.sub(thousands, lambda number: re.sub(_OTHER_MARKS, "", number[0]), text)
 
 
 def _samples(
@@ -210,40 +213,97 @@ def _samples(
     return samples
 
 
-def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, str]:
-    """Return the cells, as numbers where a whole column is, and the decimal mark."""
+def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, Marks]:
+    """Return the cells, as numbers where a whole column is, and the marks in them."""
     # Fortran writes 1.5D+00.
     text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
-    frames = []
-    for decimal in ".," if "," in text and (layout.separator != "," or '"' in text) else ".":
-        mark = "." if decimal == "," else ","
-        # In quotes they may be those that separate columns as well.
-        begin = '"-?' if mark == layout.separator else ""
-        has_thousands = re.search(rf"{begin}\d+\{mark}\d{{3}}\{decimal}\d", text)
-        try:
-            frame = pd.read_csv(
-                StringIO(text),
-                sep=r"\s+" if layout.separator == " " else layout.separator,
-                decimal=decimal,
-                thousands=mark if has_thousands else None,
-                header=None,
-                names=range(layout.fields),
-                usecols=range(layout.fields),
-                index_col=False,
-                skip_blank_lines=False,
-                skipinitialspace=True,
-                low_memory=False,
-            )
-        except (ValueError, OverflowError) as error:
-            raise InputError(f"{path}: {one_line(str(error))[:200]}; write it again") from None
-        frames.append((frame, decimal))
-    return max(frames, key=lambda read: read[0].select_dtypes("number").shape[1])
+
+    def read(decimal: str, thousands: str | None, kind: type | None = None) -> pd.DataFrame:
+        return pd.read_csv(
+            StringIO(text),
+            sep=r"\s+" if layout.separator == " " else layout.separator,
+            decimal=decimal,
+            thousands=thousands,
+            dtype=kind,
+            header=None,
+            names=range(layout.fields),
+            usecols=range(layout.fields),
+            index_col=False,
+            skip_blank_lines=False,
+            skipinitialspace=True,
+            low_memory=False,
+        )
+
+    try:
+        marks = _shown_marks(text, layout.separator) or _likely_marks(path, read(".", None, str))
+        frames = [(read(*pair), pair) for pair in marks]
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path}: {one_line(str(error))[:200]}; write it again") from None
+    return max(frames, key=lambda frame: frame[0].select_dtypes("number").shape[1])
+
+
+# Whole numbers with a mark between thousands, which may be decimals as well.
+_GROUPED = r"[+-]?[1-9]\d{{0,2}}(?:\{0}\d{{3}})+"
+
+
+def _shown_marks(text: str, separator: str) -> list[Marks]:
+    """Return the decimal mark of the numbers in a text, and that of thousands if there is one.
+
+    A number shows its decimals by a zero before them, by more or fewer digits than three, or by
+    marks of thousands. If some numbers show the one mark and some the other, either is returned; if
+    none shows any, and there are numbers that may have marks of thousands, nothing is.
+    """
+    shown, grouped = set[str](), []
+    for mark, other in (".,", ",."):
+        begin, end = rf'(?<![^\s"{separator}])', rf'(?![^\s"{separator}])'
+        if mark == separator:  # within quotes
+            begin, end = '(?<=")', '(?=")'
+        whole = f"{_GROUPED.format(mark)}{end}"
+        digits = rf"(?:\d+|\d{{1,3}}(?:\{other}\d{{3}})+)"
+        number = rf"[+-]?(?:{digits}\{mark}\d*|\{mark}\d+)(?:[eE][+-]?\d+)?{end}"
+        several = rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}}){{2,}}{end}"
+        if mark not in text or (mark == separator and '"' not in text):
+            continue
+        if re.search(f"{begin}(?!{whole}){number}", text):
+            shown.add(mark)
+        elif re.search(rf"{begin}{_GROUPED.format(mark)}(?:\{other}\d*)?{end}", text):
+            grouped.append(mark)
+            if re.search(f"{begin}{several}", text):
+                shown.add(other)
+    if len(shown) == 1:
+        return [(shown.pop(), grouped[0] if grouped else None)]
+    return [(mark, None) for mark in (".," if shown else "." * (not grouped))]
+
+
+def _likely_marks(path: Path, cells: pd.DataFrame) -> list[Marks]:
+    """Return the decimal mark and that of thousands of numbers that show none.
+
+    Decimals do not always have three digits: if a column has numbers below 1,000 without a mark,
+    and none above, the mark is that of thousands.
+
+    Warns
+    -----
+    InputWarning
+        If it is taken for that of thousands.
+    """
+    for mark, other in (".,", ",."):
+        for _, column in cells.items():
+            text = column.dropna().str.strip()
+            is_grouped = text.str.fullmatch(_GROUPED.format(mark))
+            is_small = text.str.fullmatch(r"[+-]?\d{1,3}")
+            if is_grouped.any() and is_small.any() and (is_grouped | is_small).all():
+                example = text[is_grouped].iloc[0]
+                remark = f"{path}: {example} is read as {example.replace(mark, '')}"
+                advice = "write numbers without marks between thousands if that is wrong"
+                warnings.warn(one_line(f"{remark}; {advice}"), InputWarning, stacklevel=5)
+                return [(other, mark)]
+    return [(".", None), (",", None)]
 
 
 def _numbers(
     path: Path,
     column: Any,
-    decimal: str,
+    marks: Marks,
     name: str,
     lines: Sequence[int],
     *,
@@ -255,7 +315,7 @@ def _numbers(
     Raises
     ------
     InputError
-        A cell is no number, or one with digits is none, or most are words; the text names its line.
+        A cell is no number, or only begins like one, or most are words; the text names its line.
 
     Warns
     -----
@@ -264,8 +324,9 @@ def _numbers(
     """
     if column.dtype.kind in "iuf":
         return np.asarray(column)
-    text = column.astype(str)
-    numbers = pd.to_numeric(text.str.replace(decimal, "."), errors="coerce")
+    text, (decimal, thousands) = column.astype(str), marks
+    whole = text.str.replace(thousands, "") if thousands else text
+    numbers = pd.to_numeric(whole.str.replace(decimal, "."), errors="coerce")
     wrong = np.flatnonzero(numbers.isna() & column.notna() & (text.str.lower() != "nan"))
     if not wrong.size:
         return np.asarray(numbers, dtype=np.float64)
@@ -291,12 +352,10 @@ def _numbers(
     cell = str(column.iloc[wrong[0]])
     shown = repr(cell if len(cell) <= 30 else f"{cell[:30]}...")
     where = f"{path}:{lines[wrong[0]]}: {name}: {shown}"
-    if (
-        words
-        and 2 * wrong.size < column.size
-        and not text.iloc[wrong].str.contains(r"[\d\0]").any()
-    ):
-        # As loggers write where there is nothing to read: OVERLOAD, ---, Error.
+    # A number with something behind it, as 1.5V, is mistyped; what begins otherwise is a word.
+    is_number = text.iloc[wrong].str.contains(r"^[^\w#<>*]*\d|\0")
+    if words and 2 * wrong.size < column.size and not is_number.any():
+        # As loggers and spreadsheets write where there is nothing to read: OVERLOAD, #DIV/0!, ---.
         cells = f"{wrong.size} cell{'s' * (wrong.size > 1)} without a number"
         warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
         return np.asarray(numbers, dtype=np.float64)
