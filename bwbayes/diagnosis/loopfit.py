@@ -51,6 +51,8 @@ class LoopFit:
         The same of the trend, that loops do not imitate.
     explained : float
         Part of the displacement's variance that the voltage explains, at most 1.
+    missed : float
+        Part of the displacement's variance that is neither explained nor white noise.
     without_loops : float
         Probability (F test, for white noise) that a curve and a lag leave so much more than loops
         do if there are none.
@@ -67,6 +69,7 @@ class LoopFit:
     trend: float
     trend_share: float
     explained: float
+    missed: float
     without_loops: float
 
 
@@ -138,8 +141,47 @@ def fit_loop(record: Record) -> LoopFit:
         float(coefficients[-2]),
         _distinct(among[:-1, :-1]),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
+        max(float(np.var(residual) - _white(residual)), 0.0) / max(np.var(centered), 1e-300),
         float(scipy.stats.f.sf(ratio, added, degrees)),
     )
+
+
+def find_delay(record: Record, limit: float) -> tuple[float, float]:
+    """Return the delay, s, behind which loops of the voltage miss least, and what they miss, um².
+
+    Within ``limit`` s of either sign, behind no lag. Where the displacement falls with the voltage
+    all of it is missed: half a period of a sine is no delay but another sign.
+    """
+    assert record.displacement is not None
+    rows = _rows(record.voltage, np.flatnonzero(record.has_reading))
+    rows = rows[record.has_reading[rows]]
+    time, begin = record.time, record.start
+    rows = rows[(time[rows] >= begin + limit) & (time[rows] <= begin + record.duration - limit)]
+    centered = record.displacement[rows] - record.displacement[rows].mean()
+    trend = np.linspace(-0.5, 0.5, rows.size)
+
+    def missed(delay: float) -> float:
+        voltage = np.interp(time[rows] - delay, time, record.voltage)
+        if (voltage - voltage.mean()) @ centered <= 0:
+            return float(np.mean(centered**2))
+        (loops,) = _bases(voltage[np.newaxis], np.ones(rows.size, dtype=np.bool_))
+        basis = np.column_stack([loops, trend])
+        products = _products(basis, centered[:, np.newaxis])[:, 0]
+        fitted = (basis * (_inverse(_products(basis, basis)) @ products)).sum(axis=1)
+        return float(np.mean((centered - fitted) ** 2))
+
+    sizes = np.geomspace(min(record.interval, limit / 2), limit, 9)
+    tried = np.concatenate([-sizes[::-1], [0.0], sizes])
+    nearest = int(np.argmin([missed(delay) for delay in tried]))
+    between = tried[max(nearest - 1, 0)], tried[min(nearest + 1, tried.size - 1)]
+    optimum = scipy.optimize.minimize_scalar(missed, bounds=between, method="bounded")
+    return float(optimum.x), float(optimum.fun)
+
+
+def _white(residual: FloatArray) -> float:
+    """Return the variance of the white noise in a residual, by the median of its differences."""
+    # The median of a χ² variable of one degree of freedom is 0.4549.
+    return float(np.median(np.diff(residual) ** 2)) / (2 * 0.4549)
 
 
 def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:

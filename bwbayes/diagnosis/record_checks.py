@@ -13,13 +13,16 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.loopfit import LoopFit, fit_loop
+from bwbayes.diagnosis.loopfit import LoopFit, find_delay, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     Stuck,
     clipped,
+    copies,
     held,
     lasting_jumps,
+    moves_between,
     repeated,
+    resolution,
     scatter,
     spikes,
 )
@@ -33,10 +36,11 @@ LONG_DECAY = 0.13
 def inspect(record: Record) -> tuple[Finding, ...]:
     """Return what is wrong with a record, in the order in which to deal with it.
 
-    Findings are "unlikely units", "no relation", "reversed sign", "swapped columns",
-    "few readings", "coarse sampling", "one amplitude", "held readings", "repeated samples",
-    "clipping", "jump", "spikes", "switch-on transient", "drift" and "no hysteresis". A planned
-    voltage is looked at for its own sake alone.
+    Findings are "unlikely units", "no relation", "late voltage", "late displacement",
+    "reversed sign", "swapped columns", "few readings", "coarse sampling", "one amplitude",
+    "held readings", "repeated samples", "clipping", "coarse resolution", "jump", "spikes",
+    "switch-on transient", "drift" and "no hysteresis". A planned voltage is looked at for its own
+    sake alone.
 
     Examples
     --------
@@ -72,11 +76,13 @@ def inspect(record: Record) -> tuple[Finding, ...]:
         # Of so little only the most obvious can be said.
         obvious = [finding for finding in unlike if finding.kind == "no relation"]
         return (*findings, *obvious, *sudden)
-    unlike += stuck
+    unlike += [*stuck, *_coarse(record)]
     findings += [*unlike, *sudden]
     if not unlike:
+        transient = [*_transient(record, loop)]
+        late = _late(record, loop, 1.5) if transient else None
         findings += [
-            *_transient(record, loop),
+            *(transient if late is None else [late]),
             *_drift(record, loop),
             *_no_hysteresis(record, loop),
         ]
@@ -204,14 +210,21 @@ def _exclude(record: Record, rows: IntArray, stuck: Stuck) -> str:
 
 
 def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a displacement that does not follow the voltage, or the wrong way."""
-    if loop.explained < 0.3:
-        text = f"the voltage explains {max(loop.explained, 0):.0%} of the displacement's variance"
+    """Find a displacement that does not follow the voltage, or the wrong way, or ahead of it."""
+    voltage, displacement = record.voltage[record.has_reading], _readings(record)
+    leads = _leads(voltage, displacement)
+    late = None if leads is False and loop.missed < 0.02 else _late(record, loop, 5.0)
+    if late is not None:
+        yield late
+        return
+    # Loops of another sign or sense imitate most of what moves by itself along with the drive.
+    limit = 0.03 if leads or loop.gain < 0 else 0.3
+    if loop.explained < 0.3 or loop.missed > limit:
+        share = min(max(1 - loop.explained, loop.missed), 1)
+        text = f"{share:.0%} of the displacement's variance does not follow the voltage"
         yield _whole(record, "no relation", text, "check the columns, the wiring and the amplifier")
         return
-    leads = _leads(record)
     # A single step leaves the fitted gain open; then the two do not agree.
-    voltage, displacement = record.voltage[record.has_reading], _readings(record)
     together = float((voltage - voltage.mean()) @ (displacement - displacement.mean()))
     if loop.gain < 0 and together < 0:
         text = f"the displacement falls by {-loop.gain:.3g} um where the voltage rises by 1 V"
@@ -222,6 +235,31 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
         text = "the displacement turns before the voltage does"
         fix = "swap the names of the columns voltage and displacement in the file"
         yield _whole(record, "swapped columns", text, fix)
+
+
+def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
+    """Find a column that is late by up to a quarter of the drive's period.
+
+    A delay leaves so many times less variance than a lag and a decay do; columns that are swapped
+    lead behind any.
+    """
+    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
+    quarter = 0.5 * record.interval * float(np.median(np.diff(turns))) if turns.size > 2 else 0.0
+    if not record.interval < quarter < 0.2 * record.duration:
+        return None
+    delay, missed = find_delay(record, 1.1 * quarter)
+    if np.var(loop.residual) < gain * missed or not 0.5 * record.interval < abs(delay):
+        return None
+    time = record.time[record.has_reading] - delay
+    known = (time >= record.time[0]) & (time <= record.time[-1])
+    voltage = np.interp(time[known], record.time, record.voltage)
+    if _leads(voltage, _readings(record)[known]):
+        return None
+    name = "displacement" if delay > 0 else "voltage"
+    text = f"the {name} is late by {1e3 * abs(delay):.3g} ms"
+    samples = max(round(abs(delay) / record.interval), 1)
+    fix = f"move the {name}'s column up by {samples} rows in the file"
+    return _whole(record, f"late {name}", text, fix)
 
 
 def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
@@ -239,13 +277,11 @@ def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
         yield _whole(record, "no hysteresis", text, fix)
 
 
-def _leads(record: Record) -> bool | None:
+def _leads(voltage: FloatArray, displacement: FloatArray) -> bool | None:
     """Tell whether the displacement leads the voltage, by the sense in which the loops run.
 
     None if the record has no loops, or they are too thin or too uneven to tell.
     """
-    rows = np.flatnonzero(record.has_reading)
-    voltage, displacement = record.voltage[rows], _readings(record)
     turns = turning_points(voltage, 0.2 * float(np.ptp(voltage)))
     if turns.size < 3:
         return None
@@ -268,7 +304,10 @@ def _stuck(record: Record) -> Iterator[Finding]:
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     voltage = record.voltage[rows]
     repeats, jump = repeated(voltage, displacement), "repeat the one before{} and then jump{}"
-    if repeats is not None:
+    if (times := copies(voltage, displacement)) > 1:
+        text = f"every sample is written {times} times"
+        yield _whole(record, "repeated samples", text, f"decimate = {times} under [record]")
+    elif repeats is not None:
         seen = f"samples {jump.format(', voltage and displacement,', '')}"
         yield _where(record, rows, "repeated samples", seen, repeats)
     elif (holds := held(voltage, displacement)) is not None:
@@ -289,6 +328,23 @@ def _stuck(record: Record) -> Iterator[Finding]:
         text = f"{', and '.join(texts)}, while the voltage moves, first at {first} s"
         fix = f"missing = [{', '.join(limits)}] under [record]"
         yield Finding("clipping", text, fix, min(starts), max(stops))
+
+
+def _coarse(record: Record) -> Iterator[Finding]:
+    """Find a column recorded in steps that are too coarse, and no staircase.
+
+    Rounding to steps has an sd of 1/√12 of one: here more than a percent of the range, which is
+    what a Bouc-Wen model misses of an actuator.
+    """
+    voltage, displacement = record.voltage[record.has_reading], _readings(record)
+    fix = "record it with a finer resolution: a smaller range of the instrument, or more bits"
+    for name, unit, values in (("voltage", "V", voltage), ("displacement", "um", displacement)):
+        step = resolution(values)
+        staircase = name == "voltage" and not moves_between(voltage, displacement)
+        if step > 0.01 * np.sqrt(12) and not staircase:
+            size = step * float(np.ptp(values))
+            text = f"the {name} is recorded in steps of {size:.3g} {unit}, {step:.0%} of its range"
+            yield _whole(record, "coarse resolution", text, fix)
 
 
 def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -> Finding:

@@ -225,6 +225,44 @@ def repeated(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
     return _enough(first, last, stuck)
 
 
+def copies(voltage: FloatArray, displacement: FloatArray) -> int:
+    """Return how many times in a row every sample (samples,) is written, both columns alike.
+
+    Then all that changes does so at every so manieth sample, but for one change in twenty.
+    """
+    changes = np.flatnonzero((np.diff(voltage) != 0) | (np.diff(displacement) != 0))
+    if changes.size < 20:
+        return 1
+    times = int(np.bincount(np.diff(changes)).argmax())
+    in_step = int(np.bincount(changes % times).max())
+    return times if in_step >= 0.95 * changes.size else 1
+
+
+def resolution(values: FloatArray) -> float:
+    """Return the smallest distance of two levels of values (samples,), as a part of their range.
+
+    Numbers that agree to nine digits of the range are one level.
+    """
+    levels = np.unique(np.round((values - values.min()) / (np.ptp(values) or 1.0), 9))
+    return float(np.diff(levels).min()) if levels.size > 1 else 0.0
+
+
+def moves_between(voltage: FloatArray, displacement: FloatArray) -> bool:
+    """Tell whether a displacement (samples,) moves on while the voltage stays at its levels.
+
+    Then it moves as fast before each jump as it does on the whole. Along a staircase it has settled
+    by then: behind a lag of half a hold a hold's second half has 0.54 of that speed.
+    """
+    jumps = np.flatnonzero(np.diff(voltage)) + 1
+    if jumps.size < 5:
+        return False
+    middles = (jumps[:-1] + jumps[1:]) // 2
+    last, direction = jumps[1:-1] - 1, np.sign(np.diff(voltage)[jumps[1:-1] - 1])
+    motion, samples = direction @ np.diff(displacement[middles]), np.diff(middles).sum()
+    before = direction @ (displacement[last] - displacement[middles[:-1]])
+    return bool(before * samples > 0.65 * motion * (last - middles[:-1]).sum() > 0)
+
+
 def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> Stuck | None:
     """Return the runs that are stuck if these are ten samples in all, enough to say so."""
     runs_stuck = Stuck(first[stuck], last[stuck])

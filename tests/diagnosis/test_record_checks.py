@@ -108,6 +108,67 @@ def test_what_is_wrong_is_named(kind: str, records: range, most: int) -> None:
     assert len(missed(kind, records)) <= most
 
 
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.4])
+def test_a_staircase_is_no_coarse_voltage(lag: float) -> None:
+    """However few its levels are, and with a lag of up to two fifths of a hold; nor are steps."""
+    rng = np.random.default_rng(int(10 * lag))
+    for levels, samples in product((2, 5, 12), (20, 200)):
+        heights = [*range(levels), *range(levels - 1, -1, -1)] * 4, rng.integers(levels, size=60)
+        for height in heights:
+            fine = np.repeat(10.0 * np.array(height), samples)
+            keep = np.exp(-1 / max(lag * samples, 1e-9))
+            moved = scipy.signal.lfilter([1 - keep], [1, -keep], hysteresis(drawn(rng), fine))
+            readings = moved + 0.002 * np.ptp(moved) * rng.standard_normal(moved.size)
+            assert [] == findings("coarse resolution", fine, readings)
+
+
+@pytest.mark.parametrize("levels", [2, 5, 20, 60])
+def test_a_staircase_whose_readings_are_noise_free_repeats_no_sample(levels: int) -> None:
+    """They go on after each jump, as long as a lag has not settled."""
+    fine = np.repeat(100.0 * np.sin(np.arange(40)), levels * 10)
+    readings = scipy.signal.lfilter([0.05], [1, -0.95], 0.6 * fine)
+    assert [] == findings("repeated samples", fine, readings)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.sampled_from(["decay", "triangle", "unipolar"]),
+    rate=st.sampled_from([150.0, 800.0]),
+    part=st.floats(0.07, 0.25),
+    column=st.sampled_from(["voltage", "displacement"]),
+    unit=st.sampled_from([0.05, 1.0, 8.0]),
+)
+def test_a_late_column_is_named_with_its_delay(
+    seed: int, shape: str, rate: float, part: float, column: str, unit: float
+) -> None:
+    """To a fifth, or 3% of a period; a displacement that is less late may be behind a lag."""
+    rng, time = np.random.default_rng(seed), np.arange(round(10 * rate)) / rate
+    frequency = float(rng.uniform(0.6, 1.4))
+    swing = np.exp(-0.1 * time)
+    triangle = 2 * np.abs(2 * ((frequency * time) % 1) - 1) - 1
+    voltage = {
+        "decay": 100 * swing * np.sin(2 * np.pi * frequency * time),
+        "triangle": 100 * swing * triangle,
+        "unipolar": 60 + 50 * swing * np.sin(2 * np.pi * frequency * time),
+    }[shape]
+    clean = hysteresis(drawn(rng), voltage) + float(rng.normal(0, 30))
+    readings = clean + 0.001 * np.ptp(clean) * rng.standard_normal(clean.size)
+    part = part if column == "voltage" else 0.2 + part / 5
+    count = round(part * rate / frequency)
+    early, late = slice(count, None), slice(None, -count)
+    rows = (late, early) if column == "voltage" else (early, late)
+    (finding,) = [
+        finding
+        for finding in inspect(Record(unit * voltage[rows[0]], readings[rows[1]], 1 / rate))
+        if finding.kind not in ("one amplitude", "unlikely units")
+    ]
+    assert finding.kind == f"late {column}"
+    named = float(finding.text.split()[-2]) / 1e3 * frequency
+    assert abs(named - part) < max(0.2 * part, 0.03)
+    assert finding.fix.startswith(f"move the {column}'s column up by ")
+
+
 def without_memory(seed: int, loop: float = 0.0) -> Record:
     """Return a curve behind a lag, with white noise, and a play that opens it by so much of it."""
     random, samples = np.random.default_rng(seed), np.arange(4000)

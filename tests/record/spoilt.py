@@ -12,6 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
+from bwbayes.model.reversals import turning_points
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
@@ -189,6 +190,46 @@ def _unrelated(record: Record, g: Generator) -> Record:
     return replace(record, voltage=quiet)
 
 
+def _written_often(record: Record, g: Generator) -> Record:
+    times = int(g.integers(2, 6))
+    voltage, values = np.repeat(record.voltage, times), np.repeat(_readings(record), times)
+    return Record(voltage, values, record.interval / times)
+
+
+def _rounded(values: FloatArray, levels: int, g: Generator) -> FloatArray:
+    step = float(np.ptp(values)) / levels
+    phase = float(g.uniform(0, 1))
+    rounded: FloatArray = step * (np.round(values / step + phase) - phase)
+    return rounded
+
+
+def _coarse_voltage(record: Record, g: Generator) -> Record:
+    return replace(record, voltage=_rounded(record.voltage, int(g.integers(3, 6)), g))
+
+
+def _coarse_displacement(record: Record, g: Generator) -> Record:
+    return _displaced(record, _rounded(_readings(record), int(g.integers(1, 20)), g))
+
+
+def _late(record: Record, g: Generator, least: float, column: str) -> Record:
+    """Delay a column by ``least`` to a quarter of the drive's period."""
+    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
+    count = max(round(2 * float(g.uniform(least, 0.25)) * float(np.median(np.diff(turns)))), 1)
+    late, other = slice(None, -count), slice(count, None)
+    if column == "voltage":
+        return Record(record.voltage[late], _readings(record)[other], record.interval)
+    return Record(record.voltage[other], _readings(record)[late], record.interval)
+
+
+def _by_itself(record: Record, g: Generator) -> Record:
+    """Replace the displacement by a sine that the voltage does not have."""
+    power = np.abs(np.fft.rfft(record.voltage - record.voltage.mean()))
+    main = float(np.fft.rfftfreq(record.samples, record.interval)[np.argmax(power)])
+    frequency = main * float(g.choice([0.6, 1.4, 2.3]))
+    phase = 2 * np.pi * frequency * record.time + float(g.uniform(0, 6))
+    return _displaced(record, 10 * np.sin(phase) + 0.05 * g.standard_normal(record.samples))
+
+
 SPOILT: Mapping[str, Callable[[Record, Generator], Record]] = {
     "switch-on transient": _transient,
     "reversed sign": lambda record, _: _displaced(record, -_readings(record)),
@@ -207,4 +248,10 @@ SPOILT: Mapping[str, Callable[[Record, Generator], Record]] = {
     "few readings": lambda record, _: record.decimate(record.samples // 60),
     "one amplitude": _one_amplitude,
     "no relation": _unrelated,
+    "no relation: a sine": _by_itself,
+    "repeated samples: all of them": _written_often,
+    "coarse resolution: voltage": _coarse_voltage,
+    "coarse resolution: displacement": _coarse_displacement,
+    "late voltage": lambda record, g: _late(record, g, 0.06, "voltage"),
+    "late displacement": lambda record, g: _late(record, g, 0.2, "displacement"),
 }

@@ -51,7 +51,7 @@ class ConfigProposal:
     @property
     def pointless(self) -> Finding | None:
         """What makes a fit pointless, if anything."""
-        kinds = ("no relation", "reversed sign", "swapped columns")
+        kinds = ("no relation", "reversed sign", "swapped columns", "late voltage")
         return next((finding for finding in self.findings if finding.kind in kinds), None)
 
 
