@@ -28,9 +28,8 @@ MOST_DRAWS = 2**19
 Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
-# Names of the moves, in the order in which a block counts them; chains of earlier versions have
-# the last one.
-MOVES = ("differential evolution", "snooker", "mixture", "nearby")
+# Names of the moves, in the order in which a block counts them.
+MOVES = ("differential evolution", "snooker", "mixture")
 
 
 @dataclass(frozen=True)

@@ -96,12 +96,11 @@ class ChainFile(Chain):
         InputWarning
             It is damaged further on; the blocks before that are read.
         """
-        earlier = path.with_suffix(".h5")
-        if not path.exists() and not earlier.exists():
+        if not path.exists():
             raise InputError(f"{path}: the chain does not exist; run again")
         chain: ChainFile | None = None
         try:
-            load = partial(_load, path) if path.exists() else _earlier_files(earlier).get
+            load = partial(_load, path)
             chain = cls._begun(path, load("start"))
             chain._read_blocks(load)
         except Exception as error:  # a damaged file fails in whatever way its reader stumbles
@@ -141,8 +140,6 @@ class ChainFile(Chain):
         chain = cls.read(path)
         if check is not None:
             check(chain.attributes())
-        if not path.exists():
-            _create_folder(path, _earlier_files(path.with_suffix(".h5")))
         for phase in PHASES:
             n_blocks = len(chain.history(phase))
             for file in path.glob(f"{phase}-[0-9]*"):
@@ -234,16 +231,6 @@ def _load(folder: Path, name: str) -> Arrays | None:
         return None
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return dict(arrays)
-
-
-def _earlier_files(path: Path) -> dict[str, Arrays]:
-    """Return the files that a chain of an earlier version would be today."""
-    from bwbayes.sampling.earlier import read_earlier  # noqa: PLC0415  # h5py is slow to load
-
-    files: dict[str, Arrays] = {**read_earlier(path)}
-    start = dict(files["start"])
-    text = {"format": FORMAT, "block": start.pop("block"), "attributes": start.pop("attributes")}
-    return files | {"start": {"text": json.dumps(text)} | start}
 
 
 def _write(folder: Path, name: str, arrays: Arrays) -> None:

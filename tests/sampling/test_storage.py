@@ -6,19 +6,15 @@ import errno
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.map_estimate import PointFit
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.curvature import QuadraticMap
 from bwbayes.sampling.storage import ChainFile
 from tests.sampling.chains import (
     ATTRIBUTES,
@@ -209,64 +205,3 @@ def test_a_reader_meets_whole_blocks_alone_while_another_writes(tmp_path: Path) 
     writer.join()
     assert ChainFile.read(chain.path).blocks("sampling") == 40
     assert len(set(counts)) > 2
-
-
-def write_earlier(path: Path, chain: ChainFile) -> None:
-    """Write a chain as earlier versions did: one HDF5 file, small datasets twice."""
-    free = chain.starts[0].coordinates.shape[1]
-    with h5py.File(path, "w") as file:
-        file.attrs.update({"format": 2, **chain.attributes()})
-        twice: dict[str, Any] = {
-            f"point/{field.name}": getattr(chain.point, field.name) for field in fields(PointFit)
-        }
-        for name in ("coordinates", "log_density", "random_state"):
-            twice[f"start/{name}"] = np.stack([getattr(start, name) for start in chain.starts])
-        counts = [len(chain.history(phase)) for phase in PHASES]
-        frozen = [chain.proposals[phase] is not None for phase in PHASES]
-        twice["committed"] = np.array([*counts, *frozen, chain.set_aside, chain.set_aside])
-        for phase in PHASES:
-            mixture = chain.proposals[phase]
-            if mixture is not None:
-                unused = [(0, 2)]
-                group = f"proposal/{phase}"
-                twice[f"{group}/weights"] = np.pad(mixture.weights, unused)
-                twice[f"{group}/centres"] = np.pad(mixture.centers, [*unused, (0, 0)])
-                twice[f"{group}/factors"] = np.pad(mixture.factors, [*unused, (0, 0), (0, 0)])
-                bend = next(iter(mixture.maps), None)
-                twice[f"{group}/bend"] = (
-                    np.vstack([bend.center, bend.factor, bend.bends])
-                    if isinstance(bend, QuadraticMap)
-                    else np.zeros((1 + free, free))
-                )
-            done = chain.history(phase)
-            for name in ("coordinates", "log_density"):
-                steps = [np.stack([getattr(b, name) for b in row], axis=1) for row in done]
-                file.create_dataset(
-                    f"{phase}/{name}", data=np.concatenate(steps), chunks=steps[0].shape
-                )
-            for name in ("accepted", "moves"):
-                file[f"{phase}/{name}"] = [[getattr(b, name) for b in row] for row in done]
-            file[f"{phase}/random_state"] = [[b.end.random_state for b in row] for row in done]
-        for name, values in twice.items():
-            file[name] = np.stack([values, values])
-
-
-def test_a_chain_of_an_earlier_version_is_read_and_goes_on_as_todays(
-    whole: Path, tmp_path: Path
-) -> None:
-    """A damaged one is refused in one line."""
-    chain = ChainFile.read(whole)
-    for phase, mixture in chain.proposals.items():
-        # Its proposals did not put sds in line, knew no skewed tails, and nothing that widens.
-        bends = [m for m in mixture.maps if isinstance(m, QuadraticMap)] if mixture else []
-        maps = tuple(replace(bend, scales=None) for bend in bends)
-        chain.proposals[phase] = mixture and replace(mixture, maps=maps, freedom=6.0)
-    write_earlier(tmp_path / "chain.h5", chain)
-    assert_same(arrays(chain), arrays(ChainFile.read(tmp_path / "chain")))
-    assert not (tmp_path / "chain").exists()
-    assert_same(arrays(chain), arrays(ChainFile.resume(tmp_path / "chain")))
-    files_of(tmp_path / "chain")
-    shutil.rmtree(tmp_path / "chain")
-    (tmp_path / "chain.h5").write_bytes(b"no chain")
-    with pytest.raises(InputError, match=r"chain: the chain cannot be read .*; run again$"):
-        ChainFile.read(tmp_path / "chain")

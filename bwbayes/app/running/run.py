@@ -136,7 +136,7 @@ def _open_chain(
     folder: RunFolder, problem: Problem, console: Console, requested: Engine | None = None
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
-    if not folder.chain.exists() and not folder.chain.with_suffix(".h5").exists():
+    if not folder.chain.exists():
         with ProgressLine(console, "computing the MAP estimate ..."):
             problem, point, why = find_map(problem)
         posterior, config = problem.posterior, problem.config
