@@ -43,9 +43,9 @@ class WrongCorrelation(DiscrepancyNoise):
         """Return that of more readings."""
         return super().transition(theta, self.apart * np.asarray(readings))
 
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+    def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
         """Return that of more readings."""
-        return super().fresh(theta, self.apart * readings)
+        return super().process_covariance(theta, self.apart * readings)
 
 
 def nothing(draws: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.gains import Gains
 from bwbayes.control.sampled import SampledModel
-from bwbayes.inference.state_space import Noise
+from bwbayes.inference.state_space import Noise, root
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 
@@ -64,16 +64,13 @@ class LoopNoise(NamedTuple):
     ) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield discrepancy and sensor noise, (draws,) each, um, sample by sample without end."""
         model, theta = self.model.at(interval), self.parameters
-        states = slice(0, model.states)
-        kept, fresh = (f(theta)[:, states, states] for f in (model.transition, model.fresh))
-        values, vectors = np.linalg.eigh(fresh)
-        scale = vectors * np.sqrt(np.maximum(values, 0.0))[:, np.newaxis]
-        slow, white = model.marginal_sd(theta)
-        state = slow[:, np.newaxis] * generator.standard_normal((len(theta), model.states))
+        kept, shocks = model.transition(theta), root(model.process_covariance(theta))
+        scores = generator.standard_normal((len(theta), model.states))
+        state = np.einsum("dj,dji->di", scores, root(model.stationary(theta)))
         while True:
-            yield state[:, :1].sum(axis=1), white * generator.standard_normal(len(theta))
-            shock = generator.standard_normal(state.shape)
-            state = np.einsum("dij,dj->di", kept, state) + np.einsum("dij,dj->di", scale, shock)
+            yield state @ model.observe, theta[:, 0] * generator.standard_normal(len(theta))
+            scores = generator.standard_normal(state.shape)
+            state = np.einsum("dij,dj->di", kept, state) + np.einsum("dj,dji->di", scores, shocks)
 
 
 class LoopPlan(NamedTuple):

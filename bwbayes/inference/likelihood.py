@@ -140,7 +140,7 @@ class Likelihood:
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
         """
         if self.engine == "numpy":
-            products = self._with_numpy(theta, np.empty((0, self.readings.rows.size)))
+            products = self.products_of_series(theta, np.empty((0, self.readings.rows.size)))
         else:
             # Here, because numba may not be installed, and takes half a second to load.
             from bwbayes.inference import compiled  # noqa: PLC0415
@@ -161,7 +161,7 @@ class Likelihood:
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
         at θ, if it is given.
         """
-        products, log_determinant = self._with_numpy(theta, shapes, displacement)
+        products, log_determinant = self.products_of_series(theta, shapes, displacement)
         start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
         series = [0, *range(end, products.shape[1])]
         across = products[:, 1:end][:, :, series]
@@ -247,7 +247,7 @@ class Likelihood:
 
         return onwards
 
-    def _with_numpy(
+    def products_of_series(
         self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Return Σ zᵢ zⱼ (models, series, series) of whitened residual, responses and shapes.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -67,24 +66,23 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 class WhiteNoise(Noise):
     """Sensor noise alone, independent normal errors of sd s. Right only if the model is."""
 
-    states: ClassVar[int] = 0
-
     @property
     def declarations(self) -> tuple[Declaration, ...]:
         """The sensor's sd."""
         return (SENSOR_SD,)
 
+    @property
+    def observe(self) -> FloatArray:
+        """No state."""
+        return np.zeros(0)
+
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return the covariance of no state."""
+        return np.zeros((len(theta), 0, 0))
+
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Nothing is left."""
-        return np.zeros((len(theta), *np.shape(readings), 2, 2))
-
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:  # noqa: ARG002
-        """Nothing is gained."""
-        return np.zeros((len(theta), 2, 2))
-
-    def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """No discrepancy; sd of the sensor."""
-        return np.zeros(len(theta)), theta[:, 0]
+        """Return the transition of no state."""
+        return np.zeros((len(theta), *np.shape(readings), 0, 0))
 
     def whiten(
         self,
@@ -106,7 +104,7 @@ class DiscrepancyNoise(Noise):
     """A rough discrepancy, an Ornstein-Uhlenbeck process, which forgets exponentially.
 
     It claims the least of what a model misses: that two readings have less in common the farther
-    they are apart, exp(−t/τ). It has one state.
+    they are apart, exp(−t/τ).
 
     Notes
     -----
@@ -114,27 +112,33 @@ class DiscrepancyNoise(Noise):
     823-841 (1930), doi:10.1103/PhysRev.36.823.
     """
 
-    states: ClassVar[int] = 1
-
     @property
     def declarations(self) -> tuple[Declaration, ...]:
         """Sds of sensor and discrepancy, and the discrepancy's correlation time."""
         return (SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
 
+    @property
+    def observe(self) -> FloatArray:
+        """The only state."""
+        return np.ones(1)
+
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return σ²."""
+        return theta[:, 1, np.newaxis, np.newaxis] ** 2
+
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return exp(−t/τ), alone."""
-        return _alone(np.exp(-np.multiply.outer(self.interval / theta[:, 2], readings)))
+        """Return exp(−t/τ)."""
+        decay = np.exp(-np.multiply.outer(self.interval / theta[:, 2], readings))
+        return decay[..., np.newaxis, np.newaxis]
 
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return σ² (1 − exp(−2t/τ)), alone."""
-        return _alone(-(theta[:, 1] ** 2) * np.expm1(-2 * readings * self.interval / theta[:, 2]))
+    def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return σ² (1 − exp(−2t/τ))."""
+        gained = -(theta[:, 1] ** 2) * np.expm1(-2 * readings * self.interval / theta[:, 2])
+        return gained[:, np.newaxis, np.newaxis]
 
-
-def _alone(values: FloatArray) -> FloatArray:
-    """Return matrices (..., 2, 2) of the first state alone."""
-    matrices = np.zeros((*values.shape, 2, 2))
-    matrices[..., 0, 0] = values
-    return matrices
+    def correlation_time(self, theta: FloatArray) -> FloatArray:
+        """Return τ (models,), s."""
+        return theta[:, 2]
 
 
 # Below it is an Ornstein-Uhlenbeck process to rounding, and nothing can be divided by its square.
@@ -165,8 +169,6 @@ class SmoothNoise(Noise):
     series, The Astronomical Journal 154, 220 (2017), doi:10.3847/1538-3881/aa9332.
     """
 
-    states: ClassVar[int] = 2
-
     @property
     def declarations(self) -> tuple[Declaration, ...]:
         """Sds of sensor and discrepancy, the discrepancy's correlation time and quality."""
@@ -183,12 +185,25 @@ class SmoothNoise(Noise):
         sized[:, 1] = np.sqrt(np.maximum(missed() - theta[:, 0] ** 2, 0.0))
         return sized
 
+    @property
+    def observe(self) -> FloatArray:
+        """The first state."""
+        return np.array([1.0, 0.0])
+
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return σ² times the unit matrix."""
+        return theta[:, 1, np.newaxis, np.newaxis] ** 2 * np.eye(2)
+
+    def correlation_time(self, theta: FloatArray) -> FloatArray:
+        """Return τ (models,), s."""
+        return theta[:, 2]
+
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
         """Return F over the time of so many readings."""
         return _oscillation(theta, readings * self.interval)
 
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return Q, over a short time as the integral of what the noise becomes.
+    def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return σ² (1 − F Fᵀ); over short times from the integral of driven motion.
 
         White noise drives the second state.
         """
@@ -197,15 +212,15 @@ class SmoothNoise(Noise):
         fast = (1 + np.sqrt(np.maximum(1 - 4 * quality**2, 0))) / (2 * time * quality**2)
         fast = np.maximum(fast, 1 / (time * quality))
         kept, passed = self.transition(theta, readings), readings * self.interval
-        fresh = np.eye(2) - kept @ np.swapaxes(kept, 1, 2)
+        gained = np.eye(2) - kept @ np.swapaxes(kept, 1, 2)
         short = fast * passed < 1
         if short.any():
             pushed = _oscillation(theta[short], passed * (1 + NODES) / 2)[..., 1]
             total = np.einsum("mti,mtj,t->mij", pushed, pushed, WEIGHTS)
             scale = passed / (time * quality**2)[short]
-            fresh[short] = scale[:, np.newaxis, np.newaxis] * total
-        fresh *= (process**2)[:, np.newaxis, np.newaxis]
-        return fresh
+            gained[short] = scale[:, np.newaxis, np.newaxis] * total
+        gained *= (process**2)[:, np.newaxis, np.newaxis]
+        return gained
 
 
 def _oscillation(theta: FloatArray, time: float | FloatArray) -> FloatArray:
@@ -244,6 +259,8 @@ NOISES: Mapping[str, Callable[..., Noise]] = {
 def noise_model(kind: str, interval: float) -> Noise:
     """Return the noise of that name (or import path) for readings ``interval`` seconds apart.
 
+    ``kind`` may be a sum, such as ``"discrepancy + smooth"``.
+
     Raises
     ------
     InputError
@@ -254,4 +271,6 @@ def noise_model(kind: str, interval: float) -> Noise:
     >>> [declared.name for declared in noise_model("discrepancy", 1e-3).declarations]
     ['sensor_sd', 'discrepancy_sd', 'discrepancy_time']
     """
-    return made("noise", kind, NOISES, {"interval": interval}, Noise)
+    options = {"interval": interval}
+    first, *others = (made("noise", k.strip(), NOISES, options, Noise) for k in kind.split("+"))
+    return sum(others, start=first)

@@ -95,10 +95,12 @@ def surprise(
     """Return how far each reading of a record is from what all others predict, in sds, (readings,).
 
     At the coordinates ``position`` (free,). ``readings`` may have some that the posterior has not;
-    these predict no other. With the mean and covariance (m, P) of the discrepancy's state from the
-    readings before, and from those after, both joined over its own covariance σ²:
+    these predict no other. With the mean and covariance (m, P) of the discrepancy's states from the
+    readings before, and from those after, both joined over their stationary covariance P₀:
 
-        Q⁻¹ = P₁⁻¹ + P₂⁻¹ − σ⁻²,   x̂ = Q (P₁⁻¹ m₁ + P₂⁻¹ m₂),   (r − x̂) / √(Q + s²).
+        Q⁻¹ = P₁⁻¹ + P₂⁻¹ − P₀⁻¹,   x̂ = Q (P₁⁻¹ m₁ + P₂⁻¹ m₂),   (r − h x̂) / √(h Q hᵀ + s²).
+
+    Backwards in time the states go on by P₀ Fᵀ P₀⁻¹.
     """
     theta = posterior.prior.theta(posterior.prior.constrain(position[np.newaxis])[0])
     dataset, readings = posterior.only, readings or posterior.only.readings
@@ -106,26 +108,26 @@ def surprise(
     residual = readings.values - simulated
     noise = dataset.noise.at(dataset.actuator.interval * readings.stride)
     parameters = dataset.table.noise(theta)
-    process, sensor = (float(sd[0]) ** 2 for sd in noise.marginal_sd(parameters))
-    if process <= 0:
+    (stationary,), sensor = noise.stationary(parameters), float(parameters[0, 0]) ** 2
+    observe = noise.observe
+    if not observe @ stationary @ observe > 0:
         return np.asarray(residual / np.sqrt(sensor))
     fitted = np.isin(readings.rows, dataset.readings.rows)
-    steps = {
-        missing: noise.transition(parameters, 1 + missing)[0]
-        for missing in set(readings.skipped.tolist())
-    }
-    backward = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    m_1, p_1 = _predicted(residual, readings.skipped, fitted, steps, process, sensor)
-    after = _predicted(residual[::-1], backward, fitted[::-1], steps, process, sensor)
-    # Backwards in time the second state has the other sign.
-    turned = np.array([1.0, -1.0])
-    m_2, p_2 = after[0][::-1] * turned, after[1][::-1] * np.outer(turned, turned)
+    forward, backward = {}, {}
+    for missing in set(readings.skipped.tolist()):
+        forward[missing] = noise.transition(parameters, 1 + missing)[0]
+        backward[missing] = np.linalg.solve(stationary, forward[missing] @ stationary).T
+    turned = np.concatenate([[0.0], readings.skipped[:0:-1]])
+    known = stationary, observe, sensor
+    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *known)
+    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *known)
+    m_2, p_2 = after[0][::-1], after[1][::-1]
     one, other = np.linalg.inv(p_1), np.linalg.inv(p_2)
-    joined = np.linalg.inv(one + other - np.eye(2) / process)
+    joined = np.linalg.inv(one + other - np.linalg.inv(stationary))
     pull = np.einsum("tij,tj->ti", one, m_1) + np.einsum("tij,tj->ti", other, m_2)
-    expected = np.einsum("tj,tj->t", joined[:, 0], pull)
-    distance: FloatArray = (residual - expected) / np.sqrt(joined[:, 0, 0] + sensor)
-    return distance
+    seen = joined @ observe
+    distance: FloatArray = residual - np.sum(seen * pull, axis=1)
+    return distance / np.sqrt(seen @ observe + sensor)
 
 
 def _predicted(
@@ -133,25 +135,28 @@ def _predicted(
     skipped: FloatArray,
     fitted: BoolArray,
     steps: Mapping[float, FloatArray],
-    process: float,
+    stationary: FloatArray,
+    observe: FloatArray,
     sensor: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict the discrepancy's state at each reading from known ones before.
+    """Predict the discrepancy's states at each reading from known ones before.
 
-    ``steps`` are F (2, 2) by the readings that are missing. Returns means (readings, 2) and
-    covariances (readings, 2, 2).
+    ``steps`` are F (states, states) by the readings that are missing. Returns means (readings,
+    states) and covariances (readings, states, states).
     """
-    means, gains = np.empty((residual.size, 2)), np.empty((residual.size, 2, 2))
-    mean, gained = np.zeros(2), np.zeros((2, 2))
+    means = np.empty((residual.size, observe.size))
+    covariances = np.empty((residual.size, *stationary.shape))
+    # What is known already is taken from the covariance, which stays stationary otherwise.
+    mean, known = np.zeros(observe.size), np.zeros_like(stationary)
     series = zip(residual.tolist(), skipped.tolist(), fitted.tolist(), strict=True)
-    for t, (reading, missing, is_known) in enumerate(series):
+    for t, (reading, missing, is_fitted) in enumerate(series):
         if t:
             kept = steps[missing]
-            mean, gained = kept @ mean, kept @ gained @ kept.T
-        means[t], gains[t] = mean, gained
-        if is_known:
-            told = np.array([process - gained[0, 0], -gained[1, 0]])
-            gain = told / (told[0] + sensor)
-            mean = mean + gain * (reading - mean[0])
-            gained = gained + np.outer(gain, told)
-    return means, process * np.eye(2) - gains
+            mean, known = kept @ mean, kept @ known @ kept.T
+        means[t], covariances[t] = mean, stationary - known
+        if is_fitted:
+            shared = covariances[t] @ observe
+            gain = shared / (shared @ observe + sensor)
+            mean = mean + gain * (reading - observe @ mean)
+            known = known + np.outer(gain, shared)
+    return means, covariances

@@ -4,12 +4,13 @@ The residual of a Bouc-Wen fit to a measured record is correlated over many samp
 what the model does not know about the actuator. Calling it white makes the parameters look several
 times better known than they are. So the residual is the sum of two parts,
 
-    r(t) = x(t) + e(t),   x the discrepancy (sd σ, correlation time τ),   e white (s).
+    r(t) = h · x(t) + e(t),   x the states of the discrepancy,   e white (sd s).
 
-x is the first of two states whose stationary covariance is σ² times the unit matrix. Over a time
-they go on by a matrix F and gain the covariance Q = σ² (1 − F Fᵀ). A Kalman filter turns residuals
-into independent innovations, whatever readings are missing; their log density is that of the
-residuals, exact in O(readings).
+A noise states three things: the stationary covariance P of its states, by which matrix F they go
+on over a time, and the row h that reads the discrepancy from them. The process covariance that
+they gain over that time follows, Q = P − F P Fᵀ. A Kalman filter turns residuals into independent
+innovations, whatever readings are missing; their log density is that of the residuals, exact in
+O(readings). Two noises add up: ``first + second`` has the states of both.
 
 R. E. Kalman, A new approach to linear filtering and prediction problems, Journal of Basic
 Engineering 82, 35-45 (1960), doi:10.1115/1.3662552.
@@ -17,30 +18,31 @@ Engineering 82, 35-45 (1960), doi:10.1115/1.3662552.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
-# Of the two states, (models, series) each, and three elements of their covariance, (models,).
-_Mean = tuple[FloatArray, FloatArray]
-_Covariance = tuple[FloatArray, FloatArray, FloatArray]
+# Readings that a settled filter takes at once.
+BLOCK = 64
 
 
 class Filtered(NamedTuple):
     """Innovations of series, and what is known of the discrepancy after the last reading.
 
     ``white`` (models, series, readings) are the innovations over their sds, ``log_determinant``
-    (models,) that of the covariance of the readings; ``mean`` (models, series, 2), um, and
-    ``covariance`` (models, 2, 2), um², are those of the states.
+    (models,) that of the covariance of the readings; ``mean`` (models, series, states) and
+    ``covariance`` (models, states, states) are those of the states.
     """
 
     white: FloatArray
@@ -53,8 +55,7 @@ class Filtered(NamedTuple):
 class Noise(ABC):
     """A Gaussian model of the residual between a reading and the forward model.
 
-    Methods take θ (models, parameters), the first two of which are the sds of sensor and
-    discrepancy, the third the correlation time τ.
+    Methods take θ (models, parameters), whose first column is the sd s of the sensor, um.
 
     Parameters
     ----------
@@ -64,32 +65,72 @@ class Noise(ABC):
 
     interval: float = 1.0
 
-    # How many of the two states there are; the others are zero.
-    states: ClassVar[int]
-
     @property
     @abstractmethod
     def declarations(self) -> tuple[Declaration, ...]:
         """Its parameters, in the order of θ's columns."""
 
+    @property
+    @abstractmethod
+    def observe(self) -> FloatArray:
+        """The row h (states,) that reads the discrepancy, um, from the states."""
+
+    @abstractmethod
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return P, the covariance of the states at any time, (models, states, states)."""
+
     @abstractmethod
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return F = [[a, b], [−b, d]], what is left of the states after so many readings.
+        """Return F, by which the states go on over so many intervals between readings.
 
-        (models, 2, 2) after one number of readings, (models, numbers, 2, 2) after some (numbers,).
+        (models, states, states) over one number of them, (models, numbers, states, states) over
+        some (numbers,).
         """
 
-    @abstractmethod
-    def fresh(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return Q (models, 2, 2), um², without taking differences of nearly equal numbers."""
+    def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return Q = P − F P Fᵀ, the covariance that the states gain, (models, states, states).
+
+        Where F is nearly one this is a difference of nearly equal numbers: a noise that is sampled
+        far faster than it changes should have a formula of its own.
+
+        Raises
+        ------
+        InputError
+            Q is no covariance: P is not stationary under F.
+        """
+        stationary, kept = self.stationary(theta), self.transition(theta, readings)
+        gained = stationary - kept @ stationary @ np.swapaxes(kept, 1, 2)
+        gained = (gained + np.swapaxes(gained, 1, 2)) / 2
+        # Each state in its own unit.
+        scale = np.sqrt(np.maximum(np.diagonal(stationary, axis1=1, axis2=2), 1e-300))
+        relative = gained / (scale[:, :, np.newaxis] * scale[:, np.newaxis, :])
+        if self.states and np.min(np.linalg.eigvalsh(relative)) < -1e-9:
+            raise InputError(
+                f"noise: {type(self).__name__}.stationary(theta) is not stationary under its "
+                "transition(theta): P - F P F' has a negative eigenvalue; return the P that "
+                "solves P = F P F' + Q"
+            )
+        return gained
+
+    @property
+    def states(self) -> int:
+        """How many states the discrepancy has; none if the noise is white."""
+        return self.observe.size
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Stationary sd of the discrepancy and sd of the sensor, each (models,), um."""
-        return theta[:, 1], theta[:, 0]
+        variance = self.observe @ self.stationary(theta) @ self.observe
+        return np.sqrt(variance), theta[:, 0]
 
     def correlation_time(self, theta: FloatArray) -> FloatArray:
-        """Correlation time τ of the discrepancy (models,), s; zero without one."""
-        return theta[:, 2]
+        """Correlation time ∫₀^∞ ρ(t) dt of the discrepancy (models,), s; zero without one.
+
+        By default the sum over the readings, Δ (h (1 − F)⁻¹ P hᵀ / (h P hᵀ) − ½).
+        """
+        stationary, observe = self.stationary(theta), self.observe
+        total = np.linalg.solve(np.eye(self.states) - self.transition(theta), stationary)
+        variance = np.maximum(observe @ stationary @ observe, np.finfo(float).tiny)
+        return self.interval * np.maximum(observe @ total @ observe / variance - 0.5, 0.0)
 
     def for_new_readings(
         self,
@@ -106,6 +147,11 @@ class Noise(ABC):
     def at(self, interval: float) -> Self:
         """Return the same noise for readings ``interval`` seconds apart."""
         return replace(self, interval=interval)
+
+    def __add__(self, other: Noise) -> Noise:
+        """Return the noise with both discrepancies, and one sensor."""
+        terms = [t for n in (self, other) for t in (n.terms if isinstance(n, SumNoise) else (n,))]
+        return SumNoise(self.interval, tuple(term.at(self.interval) for term in terms))
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um."""
@@ -130,65 +176,64 @@ class Noise(ABC):
     def filter(
         self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
     ) -> Filtered:
-        """Whiten series, and say what is known of the states then; arguments as of `whiten`.
+        """Whiten series, and return what is known of the states then; arguments as of `whiten`.
 
-        Once the covariance of all models stays as it is, only the means go on.
+        Once the covariance of all models stays as it is, readings are taken in blocks.
         """
-        sd, sensor_sd = self.marginal_sd(theta)
-        sensor, always, two = sensor_sd**2, sd**2, self.states > 1
+        observe, sensor, readings = self.observe, theta[:, 0] ** 2, series.shape[2]
         white, log_determinant = np.empty_like(series), np.zeros(len(series))
-        mean: _Mean = np.zeros(series.shape[:2]), np.zeros(series.shape[:2])
-        covariance: _Covariance = always, np.zeros_like(always), always
-        predicted = covariance
-        between = self.step(theta)
-        gaps = [] if skipped is None else np.flatnonzero(skipped[1:]).tolist()
-        starts = [0, *(gap + 1 for gap in gaps)]
-        for first, last in zip(starts, [*starts[1:], series.shape[2]], strict=True):
-            step = between
-            if first and skipped is not None:
-                step = self.step(theta, 1.0 + float(skipped[first]))
-            for t in range(first, last):
-                before = predicted
-                expected, predicted = _predicted(step, mean, covariance, two=two)
-                p, p_12, p_22 = predicted
-                variance = p + sensor
-                gain, rest = p / variance, sensor / variance
-                gain_2 = p_12 / variance if two else p_12
-                if t > first and t % 8 == 0 and _stays(before, predicted):
-                    ahead = slice(t, last)
-                    gains = gain, gain_2
-                    mean = _settled(step, gains, mean, series[..., ahead], white[..., ahead], two)
-                    white[..., ahead] /= np.sqrt(variance)[:, np.newaxis, np.newaxis]
-                    log_determinant += (last - t) * np.log(variance)
-                    break
-                innovation = series[..., t] - expected[0]
+        mean = np.zeros((*series.shape[:2], self.states))
+        predicted = self.stationary(theta)
+        between = self.transition(theta), self.process_covariance(theta)
+        gaps = [] if skipped is None else (1 + np.flatnonzero(skipped[1:])).tolist()
+        for first, last in itertools.pairwise([0, *gaps, readings]):
+            stays, t = False, first
+            while t < last:
+                shared = predicted @ observe
+                variance = shared @ observe + sensor
+                if stays and t < last - 1:
+                    # But for the last, after which the step may be another one.
+                    ahead = slice(t, last - 1)
+                    gain = shared / variance[:, np.newaxis]
+                    mean, innovations = _filter_settled(
+                        between[0], gain, observe, mean, series[..., ahead]
+                    )
+                    white[..., ahead] = innovations / np.sqrt(variance)[:, np.newaxis, np.newaxis]
+                    log_determinant += (last - 1 - t) * np.log(variance)
+                    t = last - 1
+                innovation = series[..., t] - mean @ observe
                 white[..., t] = innovation / np.sqrt(variance)[:, np.newaxis]
                 log_determinant += np.log(variance)
-                mean = expected[0] + gain[:, np.newaxis] * innovation, expected[1]
-                covariance = p * rest, p_12, p_22
-                if two:
-                    mean = mean[0], expected[1] + gain_2[:, np.newaxis] * innovation
-                    covariance = p * rest, p_12 * rest, p_22 - gain_2 * p_12
-                step = between
-        c, c_12, c_22 = covariance
-        matrices = np.stack([c, c_12, c_12, c_22], axis=1).reshape(-1, 2, 2)
-        return Filtered(white, log_determinant, np.stack(mean, axis=2), matrices)
-
-    def step(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
-        """Return a, b, d of F, and Q's first row and its last element, (6, models)."""
-        parts = self.transition(theta, readings), self.fresh(theta, readings)
-        return np.concatenate([part[:, [0, 0, 1], [0, 1, 1]] for part in parts], axis=1).T
+                t += 1
+                kept, gained = between
+                if t == readings:
+                    # Nothing is left to be predicted.
+                    kept, gained = np.eye(self.states)[np.newaxis], np.zeros_like(gained)
+                elif t == last and skipped is not None:
+                    over = 1.0 + float(skipped[t])
+                    kept = self.transition(theta, over)
+                    gained = self.process_covariance(theta, over)
+                forced = (shared / variance[:, np.newaxis])[:, np.newaxis] @ kept.swapaxes(1, 2)
+                mean = mean @ kept.swapaxes(1, 2) + innovation[..., np.newaxis] * forced
+                # Joseph's form, which has no negative eigenvalue however it is rounded.
+                forced = forced.swapaxes(1, 2)
+                onwards = kept - forced * observe
+                forced = forced * np.sqrt(sensor)[:, np.newaxis, np.newaxis]
+                before, predicted = predicted, onwards @ predicted @ onwards.swapaxes(1, 2)
+                predicted += forced * forced.swapaxes(1, 2) + gained
+                stays = (t - first) % 8 == 0 and _stays(before, predicted)
+        return Filtered(white, log_determinant, mean, predicted)
 
     def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
         """One-sided amplitude spectral density (frequencies,), um/√Hz, at one θ (1, parameters).
 
-        √(2 Δ (h Q h* + s²)), h the first row of (z − F)⁻¹ with z = exp(2π i f Δ).
+        √(2 Δ (g Q g* + s²)), g = h (z − F)⁻¹ with z = exp(2π i f Δ).
         """
-        (kept,), (fresh,), sensor = self.transition(theta), self.fresh(theta), theta[0, 0]
+        (kept,), (gained,) = self.transition(theta), self.process_covariance(theta)
         z = np.exp(2j * np.pi * frequency * self.interval)[:, np.newaxis, np.newaxis]
-        row = np.linalg.inv(z * np.eye(2) - kept)[:, 0]
-        power = np.einsum("fi,ij,fj->f", row, fresh, row.conj()).real
-        density: FloatArray = np.sqrt(2 * self.interval * (power + sensor**2))
+        row = self.observe @ np.linalg.inv(z * np.eye(self.states) - kept)
+        power = np.einsum("fi,ij,fj->f", row, gained, row.conj()).real
+        density: FloatArray = np.sqrt(2 * self.interval * (power + theta[0, 0] ** 2))
         return density
 
     def draw(
@@ -202,79 +247,151 @@ class Noise(ABC):
         self, theta: FloatArray, samples: int, generator: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Draw the same at each θ (models, parameters), (models, samples), as one by one."""
-        kept, fresh = self.transition(theta), self.fresh(theta)
-        states, sds = slice(0, self.states), self.marginal_sd(theta)[0]
+        kept = self.transition(theta)
         scores = generator.standard_normal((len(theta), self.states + 1, samples))
-        values, vectors = np.linalg.eigh(fresh[:, states, states])
-        shocks = np.zeros((len(theta), 2, samples))
-        scales = np.sqrt(np.maximum(values, 0))[:, np.newaxis]
-        shocks[:, states] = (vectors * scales) @ scores[:, states]
-        shocks[:, states, 0] = sds[:, np.newaxis] * scores[:, states, 0]
-        discrepancy = np.empty((len(theta), samples))
-        for model, f in enumerate(kept):
-            bottom = (1.0, -np.trace(f), np.linalg.det(f))
-            first = scipy.signal.lfilter((1.0, -f[1, 1]), bottom, shocks[model, 0])
-            second = scipy.signal.lfilter((0.0, f[0, 1]), bottom, shocks[model, 1])
-            discrepancy[model] = first + second
-        return discrepancy, theta[:, :1] * scores[:, -1]
+        states = np.swapaxes(scores[:, :-1], 1, 2) @ root(self.process_covariance(theta))
+        states[:, 0] = (scores[:, np.newaxis, :-1, 0] @ root(self.stationary(theta)))[:, 0]
+        if self.states == 1:
+            for model, (a,) in enumerate(kept[:, 0]):
+                states[model, :, 0] = scipy.signal.lfilter((1.0,), (1.0, -a), states[model, :, 0])
+        else:
+            for t in range(1, samples):
+                states[:, t] += (kept @ states[:, t - 1, :, np.newaxis])[..., 0]
+        return states @ self.observe, theta[:, :1] * scores[:, -1]
 
 
-def _predicted(
-    step: FloatArray, mean: _Mean, covariance: _Covariance, *, two: bool
-) -> tuple[_Mean, _Covariance]:
-    """Return mean and covariance after a step; of one state alone, the other is not touched."""
-    a, b, d, q, q_12, q_22 = step
-    p, p_12, p_22 = covariance
-    x, x_2 = mean
-    if not two:
-        return (a[:, np.newaxis] * x, x_2), (a * a * p + q, p_12, p_22)
-    top, bottom = a * p + b * p_12, a * p_12 + b * p_22
-    low, end = d * p_12 - b * p, d * p_22 - b * p_12
-    after = a * top + b * bottom + q, d * bottom - b * top + q_12, d * end - b * low + q_22
-    a, b, d = step[:3, :, np.newaxis]
-    return (a * x + b * x_2, d * x_2 - b * x), after
+@dataclass(frozen=True)
+class SumNoise(Noise):
+    """Several discrepancies beside one sensor: the states of all, one after the other.
 
-
-def _stays(before: _Covariance, after: _Covariance) -> bool:
-    """Tell whether covariances are the same, each for the size of its parts, to rounding."""
-    scales = after[0], np.sqrt(after[0] * after[2]), after[2]
-    triples = zip(before, after, scales, strict=True)
-    return all(bool(np.all(np.abs(new - old) <= 2e-15 * size)) for old, new, size in triples)
-
-
-def _settled(
-    step: FloatArray,
-    gains: tuple[FloatArray, FloatArray],
-    mean: _Mean,
-    series: FloatArray,
-    innovations: FloatArray,
-    two: bool,
-) -> _Mean:
-    """Follow series (models, series, readings) with gains that stay.
-
-    Writes the innovations, um, and returns the states' mean after them.
+    θ has the sensor's sd, then what each of the ``terms`` has besides. Where an earlier term has a
+    parameter of the same name, the number of the term is added to it, as in ``discrepancy_sd_2``.
     """
-    after = np.empty_like(mean[0]), np.zeros_like(mean[1])
-    for model, values in enumerate(series):
-        a, b, d = step[:3, model]
-        g, g_2 = gains[0][model], gains[1][model]
-        x, x_2 = mean[0][model], mean[1][model]
-        top: tuple[float, ...] = (1.0, -a)
-        bottom: tuple[float, ...] = (1.0, a * g - a)
-        # From the state that is predicted, as a filter in transposed form keeps it.
-        first, second = a * x + b * x_2, d * x_2 - b * x
-        delays = -first[:, np.newaxis]
-        if two:
-            determinant = a * d + b * b
-            top = 1.0, -a - d, determinant
-            bottom = 1.0, a * g + b * g_2 - a - d, determinant * (1 - g)
-            delays = np.stack([-first, d * first - b * second], axis=1)
-        innovation, _ = scipy.signal.lfilter(top, bottom, values, zi=delays)
-        innovations[model] = innovation
-        after[0][model] = values[:, -1] - (1 - g) * innovation[:, -1]
-        if two:
-            seen = values[:, :-1] - (1 - g) * innovation[:, :-1]
-            pull = g_2 * innovation - b * np.concatenate([x[:, np.newaxis], seen], axis=1)
-            other, _ = scipy.signal.lfilter((1.0,), (1.0, -d), pull, zi=d * x_2[:, np.newaxis])
-            after[1][model] = other[:, -1]
-    return after
+
+    terms: tuple[Noise, ...] = ()
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """Those of the first term, then all but the sensor's of the others."""
+        declared = list(self.terms[0].declarations)
+        for number, term in enumerate(self.terms[1:], start=2):
+            taken = {declaration.name for declaration in declared}
+            for declaration in term.declarations[1:]:
+                renamed = replace(
+                    declaration,
+                    name=f"{declaration.name}_{number}",
+                    label=f"{declaration.label}_{{{number}}}",
+                    description=f"{declaration.description}, term {number}",
+                    aliases=(),
+                )
+                declared.append(renamed if declaration.name in taken else declaration)
+        return tuple(declared)
+
+    @property
+    def observe(self) -> FloatArray:
+        """The rows of all terms, one after the other."""
+        return np.concatenate([term.observe for term in self.terms])
+
+    def stationary(self, theta: FloatArray) -> FloatArray:
+        """Return the covariances of all terms along the diagonal."""
+        return _along_diagonal([term.stationary(own) for term, own in self._split(theta)])
+
+    def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
+        """Return the transitions of all terms along the diagonal."""
+        return _along_diagonal([term.transition(own, readings) for term, own in self._split(theta)])
+
+    def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
+        """Return the process covariances of all terms along the diagonal."""
+        return _along_diagonal(
+            [term.process_covariance(own, readings) for term, own in self._split(theta)]
+        )
+
+    def correlation_time(self, theta: FloatArray) -> FloatArray:
+        """Return the mean of those of all terms, by their variances (models,), s."""
+        times, variances = np.zeros(len(theta)), np.zeros(len(theta))
+        for term, own in self._split(theta):
+            variance = term.marginal_sd(own)[0] ** 2
+            times += variance * term.correlation_time(own)
+            variances += variance
+        return times / np.maximum(variances, np.finfo(float).tiny)
+
+    def at(self, interval: float) -> Self:
+        """Return the same noise for readings ``interval`` seconds apart."""
+        terms = tuple(term.at(interval) for term in self.terms)
+        return replace(self, interval=interval, terms=terms)
+
+    def _split(self, theta: FloatArray) -> Iterator[tuple[Noise, FloatArray]]:
+        """Yield each term with its own parameters."""
+        first = 1
+        for term in self.terms:
+            last = first + len(term.declarations) - 1
+            yield term, np.concatenate([theta[:, :1], theta[:, first:last]], axis=1)
+            first = last
+
+
+def _along_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
+    """Return matrices (..., states, states) with blocks (..., own, own) along their diagonal."""
+    size = sum(block.shape[-1] for block in blocks)
+    matrices = np.zeros((*blocks[0].shape[:-2], size, size))
+    first = 0
+    for block in blocks:
+        last = first + block.shape[-1]
+        matrices[..., first:last, first:last] = block
+        first = last
+    return matrices
+
+
+def root(covariance: FloatArray) -> FloatArray:
+    """Return R with Rᵀ R = covariance, each (models, states, states)."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: FloatArray = np.sqrt(np.maximum(values, 0))[..., np.newaxis] * np.swapaxes(vectors, 1, 2)
+    return root
+
+
+def _stays(before: FloatArray, after: FloatArray) -> bool:
+    """Tell whether covariances (models, states, states) are the same to rounding."""
+    sd = np.sqrt(np.maximum(np.diagonal(after, axis1=1, axis2=2), 0))
+    scale = sd[:, :, np.newaxis] * sd[:, np.newaxis]
+    return bool(np.all(np.abs(after - before) <= 2e-15 * scale))
+
+
+def _filter_settled(
+    kept: FloatArray, gain: FloatArray, observe: FloatArray, mean: FloatArray, series: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Filter series (models, series, readings) whose gain K stays, a block of readings at once.
+
+    The state m that is expected of a reading y goes on by A = F (1 − K h),
+
+        m ← A m + F K y,   so that over a block   m ← Aᴮ m + Σⱼ A^(B−1−j) F K yⱼ,
+
+    and the innovation of its reading i is yᵢ − h Aⁱ m − Σ_(j<i) h A^(i−1−j) F K yⱼ. Returns the
+    state expected after all readings, (models, series, states), and the innovations, um.
+    """
+    models, n_series, readings = series.shape
+    size = min(BLOCK, readings)
+    n_blocks = readings // size
+    forced = (kept @ gain[..., np.newaxis])[..., 0]
+    onwards = kept - forced[..., np.newaxis] * observe
+    # A^j F K and h A^j, (models, size, states).
+    responses, rows = np.empty((2, models, size, observe.size))
+    responses[:, 0], rows[:, 0] = forced, observe
+    for j in range(1, size):
+        responses[:, j] = (onwards @ responses[:, j - 1, :, np.newaxis])[..., 0]
+        rows[:, j] = (rows[:, j - 1, np.newaxis] @ onwards)[:, 0]
+    lags = np.subtract.outer(np.arange(size), np.arange(size)) - 1
+    weights = np.where(lags >= 0, (responses @ observe)[:, np.maximum(lags, 0)], 0.0)
+    blocks = series[..., : n_blocks * size].reshape(models, n_series * n_blocks, size)
+    pushed = (blocks @ responses[:, ::-1]).reshape(models, n_series, n_blocks, observe.size)
+    over_block = np.swapaxes(np.linalg.matrix_power(onwards, size), 1, 2)
+    expected = np.empty_like(pushed)
+    for block in range(n_blocks):
+        expected[:, :, block] = mean
+        mean = mean @ over_block + pushed[:, :, block]
+    expected = expected.reshape(models, n_series * n_blocks, observe.size)
+    innovations = blocks - expected @ np.swapaxes(rows, 1, 2) - blocks @ np.swapaxes(weights, 1, 2)
+    innovations = innovations.reshape(models, n_series, n_blocks * size)
+    if n_blocks * size < readings:
+        rest = series[..., n_blocks * size :]
+        mean, last = _filter_settled(kept, gain, observe, mean, rest)
+        innovations = np.concatenate([innovations, last], axis=2)
+    return mean, innovations

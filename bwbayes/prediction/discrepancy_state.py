@@ -1,10 +1,11 @@
 """The discrepancy that readings leave behind, carried on to what comes after them.
 
 Where readings end, a part of the model discrepancy is known: by the filter of the noise its state
-(:meth:`~bwbayes.inference.noise.Noise.transition`) has the mean m and the covariance P, given a
-draw. A process of sd σ goes on from there: a time t later it is normal with
+(:meth:`~bwbayes.inference.state_space.Noise.transition`) has the mean m and the covariance P, given
+a draw. A process whose stationary covariance is P₀ goes on from there: a time t later it is normal
+with
 
-    mean F(t) m,   covariance σ² − F(t) (σ² − P) F(t)ᵀ.
+    mean F(t) m,   covariance P₀ − F(t) (P₀ − P) F(t)ᵀ.
 
 So a forecast is narrower than any other prediction at first, and after a few correlation times as
 wide as ever.
@@ -25,9 +26,10 @@ from bwbayes.inference.state_space import Noise
 class DiscrepancyState:
     """What readings leave of the discrepancy, for each draw.
 
-    ``last`` is the sample of the last reading; ``mean`` (draws, 2), um, that of the state there,
-    and ``gained`` (draws, 2, 2), um², by how much its covariance is less than σ²; ``noise`` is that
-    for the interval between samples, and ``parameters`` (draws, parameters) are its own.
+    ``last`` is the sample of the last reading; ``mean`` (draws, states) that of the states there,
+    and ``gained`` (draws, states, states) by how much their covariance is less than the stationary
+    one; ``noise`` is that for the interval between samples, and ``parameters`` (draws, parameters)
+    are its own.
     """
 
     last: int
@@ -39,11 +41,11 @@ class DiscrepancyState:
     def after(self, first: int, samples: int) -> tuple[FloatArray, FloatArray]:
         """Return what is known of samples from one on, each (draws, samples).
 
-        The discrepancy's mean, um, and the part of its variance σ² that is known; before the last
+        The discrepancy's mean, um, and the part of its variance that is known; before the last
         reading those there.
         """
         later = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
-        row = self.noise.transition(self.parameters, later)[:, :, 0]
+        row = self.noise.observe @ self.noise.transition(self.parameters, later)
         known = np.einsum("dtj,djk,dtk->dt", row, self.gained, row)
         always = self.noise.marginal_sd(self.parameters)[0][:, np.newaxis] ** 2
         share = np.divide(known, always, out=np.zeros_like(known), where=always > 0)
@@ -61,7 +63,6 @@ def filter_discrepancy(
     parameters = likelihood.table.noise(theta)
     residual = (readings.values - simulated)[:, np.newaxis]
     filtered = noise.filter(parameters, residual, readings.skipped)
-    always = noise.marginal_sd(parameters)[0][:, np.newaxis, np.newaxis] ** 2 * np.eye(2)
-    mean, gained = filtered.mean[:, 0], always - filtered.covariance
+    mean, gained = filtered.mean[:, 0], noise.stationary(parameters) - filtered.covariance
     last = int(readings.rows[-1])
     return DiscrepancyState(last, mean, gained, likelihood.noise, parameters)

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["products", "rehearse", "whiten"]
 
+# States of the noise that the lanes hold; more are filtered by :mod:`whitening` alone.
+LANE_STATES = 2
+
 
 def rehearse(posterior: Posterior) -> None:
     """Simulate and whiten one model, which compiles what :func:`products` does not need.
@@ -46,6 +49,8 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
+    if noise.states > LANE_STATES:
+        return likelihood.products_of_series(theta, np.empty((0, likelihood.readings.rows.size)))
     voltage = likelihood.voltage[: likelihood.readings.samples]
     offset = int(likelihood.offset_sd > 0)
     free = likelihood.unknowns - offset
@@ -70,7 +75,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     pairs = np.empty((len(theta), size, size))
     i, j = np.tril_indices(size)
     pairs[:, i, j] = pairs[:, j, i] = sums[: i.size].T
-    typical = likelihood.readings.rows.size * np.log(filtering["fresh_11"] + filtering["sensor"])
+    typical = likelihood.readings.rows.size * np.log(filtering["q_11"] + filtering["sensor"])
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
@@ -82,10 +87,13 @@ def whiten(
     Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um;
     and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
     """
-    filtering, second, steps = _filtering(noise, theta, gaps[0])
-    models, over_gaps = lanes.in_lanes(lanes.by_rows(filtering)), _over_gaps(steps)
+    steps = [_step(noise, theta, 1.0 + number) for number in gaps[0].tolist()]
+    transitions, gained = (np.stack(matrices) for matrices in zip(*steps, strict=True))
     # Each layout of an array would be compiled by itself.
-    return whitening.whitened(models, second, gaps[1], over_gaps, np.ascontiguousarray(series))
+    return whitening.whitened(
+        transitions, gained, noise.stationary(theta), noise.observe, theta[:, 0] ** 2, gaps[1],
+        np.ascontiguousarray(series),
+    )  # fmt: skip
 
 
 def _filtering(
@@ -95,13 +103,58 @@ def _filtering(
 
     Then whether there is a second state, what is None being left out when it is compiled, and the
     steps over all gaps but the first, which misses none, side by side (models, gaps times rows).
+
+    The lanes see the first of two states alone, which have a stationary covariance of one size:
+    other states x are turned into T x.
     """
-    names = lanes.PARAMETERS[lanes.KEPT // lanes.LANES :]
-    named = dict(zip(names, noise.step(theta), strict=False))
-    named["process"], named["sensor"] = (sd**2 for sd in noise.marginal_sd(theta))
-    steps = [noise.step(theta, number) for number in missing[1:].tolist()]
+    stationary, observe, states = noise.stationary(theta), noise.observe, noise.states
+    variance = observe @ stationary @ observe
+    plain = np.array_equal(observe, np.eye(states)[:1].ravel()) and np.array_equal(
+        stationary, variance[:, np.newaxis, np.newaxis] * np.eye(states)
+    )
+    turned = None if plain else _observed_first(stationary, observe)
+
+    def rows(readings: float) -> FloatArray:
+        """Return the rows of a step over so many readings, (STEP, models)."""
+        values = np.zeros((lanes.STEP, len(theta)))
+        if states:
+            kept, gained = _step(noise, theta, readings)
+            if turned is not None:
+                kept = turned @ kept @ np.linalg.inv(turned)
+                gained = turned @ gained @ np.swapaxes(turned, 1, 2)
+            wide = np.zeros((2, len(theta), 2, 2))
+            wide[0, :, :states, :states], wide[1, :, :states, :states] = kept, gained
+            values[:4] = wide[0].reshape(-1, 4).T
+            values[4:] = wide[1, :, [0, 0, 1], [0, 1, 1]]
+        return values
+
+    named = dict(zip(lanes.PARAMETERS[lanes.F // lanes.LANES :], rows(1.0), strict=False))
+    named["stationary"], named["sensor"] = variance, theta[:, 0] ** 2
+    steps = [rows(number) for number in missing[1:].tolist()]
     over = np.concatenate([np.empty((0, len(theta))), *steps]).T
-    return named, True if noise.states > 1 else None, over
+    return named, True if states > 1 else None, over
+
+
+def _observed_first(stationary: FloatArray, observe: FloatArray) -> FloatArray:
+    """Return T (models, states, states) for one or two states.
+
+    Its first row is h, and T P Tᵀ = h P hᵀ times the unit matrix.
+    """
+    turned = np.empty_like(stationary)
+    turned[:, 0] = observe
+    if observe.size > 1:
+        shared = stationary @ observe
+        shared /= np.maximum(np.linalg.norm(shared, axis=1), np.finfo(float).tiny)[:, np.newaxis]
+        other = np.stack([-shared[:, 1], shared[:, 0]], axis=1)
+        size = np.einsum("mi,mij,mj->m", other, stationary, other)
+        ratio = (observe @ stationary @ observe) / np.maximum(size, np.finfo(float).tiny)
+        turned[:, 1] = np.sqrt(ratio)[:, np.newaxis] * other
+    return turned
+
+
+def _step(noise: Noise, theta: FloatArray, readings: float) -> tuple[FloatArray, FloatArray]:
+    """Return F and Q over so many readings, (models, states, states)."""
+    return noise.transition(theta, readings), noise.process_covariance(theta, readings)
 
 
 def _over_gaps(steps: FloatArray) -> FloatArray:

@@ -21,8 +21,8 @@ from bwbayes.arrays import FloatArray, IntArray
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    CHANGE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FRESH, GAIN, GAIN_2,
-    GAP, INNOVATION, INVERSE, KEPT, KEPT_12, KEPT_22, LANES, LATEST, LOG, PRODUCTS, RATIO, RESPONSE,
+    CHANGE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, ESTIMATE, ESTIMATE_2, F, F_12, F_21, F_22,
+    GAIN, GAIN_2, GAP, INNOVATION, INVERSE, LANES, LATEST, LOG, PRODUCTS, Q, RATIO, RESPONSE,
     SENSOR, SQUARES, VALUE, inner,
 )
 # fmt: on
@@ -55,14 +55,16 @@ def follow(
             estimate = state[ESTIMATE + i]
             innovation = y - displacement[row + i] - estimate
             if second is None:
-                state[ESTIMATE + i] = state[KEPT + i] * estimate + state[GAIN + i] * innovation
+                state[ESTIMATE + i] = state[F + i] * estimate + state[GAIN + i] * innovation
             else:
-                other, across = state[ESTIMATE_2 + i], state[KEPT_12 + i]
+                other = state[ESTIMATE_2 + i]
                 state[ESTIMATE + i] = (
-                    state[KEPT + i] * estimate + across * other + state[GAIN + i] * innovation
+                    state[F + i] * estimate + state[F_12 + i] * other + state[GAIN + i] * innovation
                 )
                 state[ESTIMATE_2 + i] = (
-                    state[KEPT_22 + i] * other - across * estimate + state[GAIN_2 + i] * innovation
+                    state[F_22 + i] * other
+                    + state[F_21 + i] * estimate
+                    + state[GAIN_2 + i] * innovation
                 )
             state[SQUARES + i] += innovation * innovation
             state[LATEST + i] = innovation
@@ -121,12 +123,13 @@ def _fold(
 @inner(error_model="numpy")
 def _parts(state: FloatArray, second: bool | None, i: int, rho: float) -> tuple[float, float]:
     """Return c and c₂, the estimates of a response that keeps ρ of itself, over the response."""
-    gain, first = float(state[GAIN + i]), rho - state[KEPT + i]
+    gain, first = float(state[GAIN + i]), rho - state[F + i]
     if second is None:
         return gain / (first + gain), 0.0
-    across, left, pull = state[KEPT_12 + i], rho - state[KEPT_22 + i], state[GAIN_2 + i]
-    total = (first + gain) * left + across * (across + pull)
-    return (gain * left + across * pull) / total, (first * pull - across * gain) / total
+    gain_2, last = state[GAIN_2 + i], rho - state[F_22 + i]
+    f_12, f_21 = state[F_12 + i], state[F_21 + i]
+    total = (first + gain) * last + f_12 * (gain_2 - f_21)
+    return (gain * last + f_12 * gain_2) / total, (first * gain_2 + f_21 * gain) / total
 
 
 @inner(error_model="numpy")
@@ -216,7 +219,7 @@ def innovate(
                 estimate[i] = over[i] * before
                 if second is not None:
                     estimate[i] += over[LANES + i] * other[i]
-                    other[i] = over[2 * LANES + i] * other[i] - over[LANES + i] * before
+                    other[i] = over[3 * LANES + i] * other[i] + over[2 * LANES + i] * before
         if gaps[t] < 0:
             for i in range(LANES):
                 values[row + i] = 0.0
@@ -227,9 +230,8 @@ def innovate(
                 values[row + i] = innovation
                 estimate[i] = step[i] * before + gains[row + i] * innovation
                 if second is not None:
-                    across = step[LANES + i]
-                    estimate[i] += across * other[i]
-                    other[i] = step[2 * LANES + i] * other[i] - across * before
+                    estimate[i] += step[LANES + i] * other[i]
+                    other[i] = step[3 * LANES + i] * other[i] + step[2 * LANES + i] * before
                     other[i] += gains_2[row + i] * innovation
 
 
@@ -241,20 +243,20 @@ def _advance(state: FloatArray, second: bool | None) -> None:
         variance = p + sensor
         inverse = 1.0 / variance
         state[INVERSE + i] = inverse
-        state[RATIO + i] *= variance / (state[FRESH + i] + sensor)
+        state[RATIO + i] *= variance / (state[Q + i] + sensor)
         if second is None:
-            state[GAIN + i] = state[KEPT + i] * (p * inverse)
+            state[GAIN + i] = state[F + i] * (p * inverse)
             state[COVARIANCE + i] = p * (sensor * inverse)
         else:
             across, rest = state[COVARIANCE_12 + i], sensor * inverse
             g, g_2 = p * inverse, across * inverse
-            state[GAIN + i] = state[KEPT + i] * g + state[KEPT_12 + i] * g_2
-            state[GAIN_2 + i] = state[KEPT_22 + i] * g_2 - state[KEPT_12 + i] * g
+            state[GAIN + i] = state[F + i] * g + state[F_12 + i] * g_2
+            state[GAIN_2 + i] = state[F_22 + i] * g_2 + state[F_21 + i] * g
             state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * rest, across * rest
             state[COVARIANCE_22 + i] -= across * g_2
         # What it was, to be held against.
         state[CHANGE + i] = p
-    _predict(state, second, KEPT)
+    _predict(state, second, F)
     for i in range(LANES):
         state[CHANGE + i] = abs(state[COVARIANCE + i] - state[CHANGE + i])
 
@@ -264,17 +266,18 @@ def _predict(state: FloatArray, second: bool | None, step: int) -> None:
     """Take the covariance on by a step, whose rows begin there."""
     for i in range(LANES):
         a, p = state[step + i], state[COVARIANCE + i]
-        fresh = state[step + 3 * LANES + i]
+        gained = state[step + 4 * LANES + i]
         if second is None:
-            state[COVARIANCE + i] = a * a * p + fresh
+            state[COVARIANCE + i] = a * a * p + gained
         else:
-            b, d = state[step + LANES + i], state[step + 2 * LANES + i]
+            b, c = state[step + LANES + i], state[step + 2 * LANES + i]
+            d = state[step + 3 * LANES + i]
             p_12, p_22 = state[COVARIANCE_12 + i], state[COVARIANCE_22 + i]
             top, bottom = a * p + b * p_12, a * p_12 + b * p_22
-            low, end = d * p_12 - b * p, d * p_22 - b * p_12
-            state[COVARIANCE + i] = a * top + b * bottom + fresh
-            state[COVARIANCE_12 + i] = d * bottom - b * top + state[step + 4 * LANES + i]
-            state[COVARIANCE_22 + i] = d * end - b * low + state[step + 5 * LANES + i]
+            low, end = d * p_12 + c * p, d * p_22 + c * p_12
+            state[COVARIANCE + i] = a * top + b * bottom + gained
+            state[COVARIANCE_12 + i] = d * bottom + c * top + state[step + 5 * LANES + i]
+            state[COVARIANCE_22 + i] = d * end + c * low + state[step + 6 * LANES + i]
 
 
 @inner()
@@ -293,5 +296,5 @@ def gather(state: FloatArray, readings: int) -> None:
     for i in range(LANES):
         state[PRODUCTS + i] += state[SQUARES + i] * state[INVERSE + i]
         state[SQUARES + i] = 0.0
-        typical = state[FRESH + i] + state[SENSOR + i]
+        typical = state[Q + i] + state[SENSOR + i]
         state[LOG + i] -= readings * math.log(state[INVERSE + i] * typical)

@@ -23,9 +23,9 @@ from bwbayes.inference.compiled import filter as noise
 # isort: off
 # fmt: off
 from bwbayes.inference.compiled.lanes import (
-    A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, ESTIMATE_2, FREE, KEPT, LANES, LOG,
-    LOG_DETERMINANT, PAIRS, PARAMETERS, PROCESS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, SERIES,
-    STATE, SUMS, VALUE, inner,
+    A1, A2, CHANGE, COVARIANCE, COVARIANCE_22, ESTIMATE, ESTIMATE_2, F, FREE, LANES, LOG,
+    LOG_DETERMINANT, PAIRS, PARAMETERS, PRODUCTS, RATIO, RESPONSE, RESPONSE_2, SERIES, STATE,
+    STATIONARY, SUMS, VALUE, inner,
 )
 # fmt: on
 # isort: on
@@ -53,7 +53,7 @@ def _one_by_one(
     # Whole rows, which a compiler can tell to lie without gaps.
     gain, gain_2, inverse = work[0], work[1], work[2]
     noise.gain(state, second, gaps, steps, gain, gain_2, inverse)
-    step = state[KEPT : KEPT + 3 * LANES]
+    step = state[F : F + 4 * LANES]
     keeping, nothing = np.empty(LANES), np.zeros(LANES)
     for k in range(1 + offset + free + lags.shape[0]):
         at, values = k * LANES, work[3 + k]
@@ -145,7 +145,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
         state[i] = 0.0
     for i in range(LANES):
         state[RATIO + i], state[CHANGE + i] = 1.0, np.inf
-        state[COVARIANCE + i] = state[COVARIANCE_22 + i] = state[PROCESS + i]
+        state[COVARIANCE + i] = state[COVARIANCE_22 + i] = state[STATIONARY + i]
         if offset > 0:
             state[VALUE + LANES + i] = state[RESPONSE + LANES + i] = 1.0
         for k in range(free):
@@ -205,7 +205,7 @@ def sums(
         none is, else its number.
     models, steps
         (groups, lanes times parameters), in the order of ``PARAMETERS``, and (groups, gaps, lanes
-        times rows) of the filter's step over each gap, as from ``KEPT`` on.
+        times rows) of the filter's step over each gap, as from ``F`` on.
     second
         None unless the noise has two states.
     kind, groups, plan

@@ -29,22 +29,22 @@ LANES = 32
 # Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
 PARAMETERS = (
     "level", "b0", "b1", "b2", "a1", "a2",
-    "kept_11", "kept_12", "kept_22", "fresh_11", "fresh_12", "fresh_22", "process", "sensor",
+    "f_11", "f_12", "f_21", "f_22", "q_11", "q_12", "q_22", "stationary", "sensor",
     "free_11", "free_12", "free_21", "free_22",
     "quadratic", "cubic", "equilibrium", "crept", "growth",
     *(f"strength_{number}" for number in range(1, MOST_TIMES + 1)),
 )  # fmt: skip
 (
     LEVEL, B0, B1, B2, A1, A2,
-    KEPT, KEPT_12, KEPT_22, FRESH, FRESH_12, FRESH_22, PROCESS, SENSOR,
+    F, F_12, F_21, F_22, Q, Q_12, Q_22, STATIONARY, SENSOR,
     FREE, FREE_12, FREE_21, FREE_22,
     QUADRATIC, CUBIC, EQUILIBRIUM, CREPT, GROWTH,
     STRENGTH,
 ) = (LANES * row for row in range(len(PARAMETERS) - MOST_TIMES + 1))  # fmt: skip
 
-# The filter's step over a gap, as from `KEPT` on; states of the dynamics; covariance and gains of
+# The filter's step over a gap, as from `F` on; states of the dynamics; covariance and gains of
 # the filter, and the sums of a piece.
-STEP = 6
+STEP = 7
 MEMORY = STEP + 14 + MOST_TIMES
 (
     GAP, X1, X2, DRIVE, COVARIANCE, COVARIANCE_12, COVARIANCE_22, GAIN, GAIN_2, INVERSE, RATIO, LOG,
