@@ -106,7 +106,7 @@ def oscillation(scene: Scene) -> Iterator[Explanation]:
     text = f"oscillation of {size:.2g} um at {line.frequency:.4g} Hz{line.source}"
     cost = float(np.log(rows.size / 2))
     fix = "look for the source: mains, ground loops, vibration"
-    yield scene.explained("oscillation", text, fix, fit, cost)
+    yield scene.explained("oscillation", text, fix, fit, cost, noise=True)
 
 
 def moving_gain(scene: Scene) -> Iterator[Explanation]:

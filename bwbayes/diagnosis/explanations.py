@@ -17,7 +17,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
 
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
-# good fit refuses at once; the others are for fits of which something is known to be wrong.
+# good fit refuses at once; the others explain what the discrepancy takes up.
 ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     effects.transient,
     effects.drift,
@@ -50,14 +50,15 @@ TIED = float(np.log(20))
 
 
 def explain(
-    scene: Scene, watch: Callable[[float], None] = lambda _: None, *, thorough: bool
+    scene: Scene, watch: Callable[[float], None] = lambda _: None
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
-    Unless ``thorough``, only the first of them, and all if any of these is worth more than
-    :data:`LIMIT`, so that all compete where a cause is named. Where the discrepancy is smooth, they
-    are fitted beside a rough one first, then those beside the smooth one that gained anything; each
-    counts as the better fit. ``watch`` is called with the share that is done.
+    Only the first of them where the discrepancy takes up too little for any other to be worth more
+    than :data:`LIMIT`, unless one of these is, so that all compete where a cause is named. Where
+    the discrepancy is smooth, they are fitted beside a rough one first, then those beside the
+    smooth one that gained anything; each counts as the better fit. ``watch`` is called with the
+    share that is done.
     """
     best: dict[str, Explanation] = {}
     rough = scene.with_rough_noise()
@@ -65,7 +66,7 @@ def explain(
     for number, kind in enumerate(kinds):
         if (
             number == len(ADDITIONS)
-            and not thorough
+            and scene.unexplained <= LIMIT
             and all(e.nats <= LIMIT for e in best.values())
         ):
             break
@@ -87,6 +88,15 @@ def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
     ]
     keeping = [explanation for explanation in leading if not explanation.removes]
     return tuple(keeping or leading)
+
+
+def better_models(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
+    """Return the likely causes that would change what is predicted of the next drive.
+
+    Not noise of another kind, as heavy tails: the bands have its size already, and where that
+    matters to their coverage, they fail.
+    """
+    return likely_causes([explanation for explanation in ranked if not explanation.noise])
 
 
 def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:

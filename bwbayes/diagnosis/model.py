@@ -74,7 +74,8 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         posterior = scene.rebuilt(changes)
         if posterior is None or type(posterior.only.actuator.hysteresis) is present:
             continue
-        places = map_estimate.valleys(posterior, scene.generator)
+        # One start finds the best place for nearly all records, in half of the time of five.
+        places = map_estimate.valleys(posterior, scene.generator, 1)
         fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
         yield scene.explained(f"operator {name}", text, _lines(changes), fit, changes=changes)
@@ -83,7 +84,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
 def smooth(scene: Scene) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
     if isinstance(scene.posterior.only.noise, DiscrepancyNoise) and scene.before is None:
-        yield from _changed(scene, "a smooth discrepancy", {"noise": "smooth"})
+        yield from _changed(scene, "a smooth discrepancy", {"noise": "smooth"}, noise=True)
 
 
 def _changed(
@@ -93,8 +94,12 @@ def _changed(
     kind: str = "",
     parameters: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     starts: Sequence[Mapping[str, float]] = ({},),
+    **facts: Any,
 ) -> Iterator[Explanation]:
-    """Fit the changed model from the mode; its new parameters start at their priors' medians."""
+    """Fit the changed model from the mode; its new parameters start at their priors' medians.
+
+    ``facts`` are other fields of the explanation.
+    """
     posterior = scene.rebuilt(changes, parameters)
     if posterior is None:
         return
@@ -108,7 +113,8 @@ def _changed(
     fix = _lines(changes)
     if parameters:
         fix += f", with what is known of {', '.join(parameters)} in [parameters]"
-    yield scene.explained(kind or text, text, fix, fit, changes=changes, parameters=parameters)
+    facts |= {"changes": changes, "parameters": parameters}
+    yield scene.explained(kind or text, text, fix, fit, **facts)
 
 
 def _lines(changes: Mapping[str, object]) -> str:
@@ -127,7 +133,7 @@ def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     rmse = scene.without[0], scene.fit.rmse
     fix = "set outliers = true in [model]"
     nats = tail_nats(white) - scene.lead
-    yield Explanation("heavy tails", text, fix, nats=nats, rmse=rmse, foreign=True)
+    yield Explanation("heavy tails", text, fix, nats=nats, rmse=rmse, foreign=True, noise=True)
 
 
 def tail_nats(white: FloatArray) -> float:
@@ -170,4 +176,5 @@ def growing_noise(scene: Scene) -> Iterator[Explanation]:
         text += "'s speed" if kind == "speed" else "'s distance from its center"
         rmse = scene.without[0], scene.fit.rmse
         fix = "train on a record driven as the plans are: the bands' width is the mean one"
-        yield Explanation(f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse)
+        nats = float(nats - scene.lead)
+        yield Explanation(f"noise by {kind}", text, fix, nats=nats, rmse=rmse, noise=True)

@@ -37,14 +37,16 @@ class Explanation(Finding):
     ``rmse`` is the root mean square of the residual, um, without it and with it; ``held_out`` is
     that of the readings that were held out, nan without any. ``shift`` is by how many sds of both
     fits the actuator's parameter moves that moves most. What is ``foreign`` the actuator has not
-    done, so that a fit without it has followed it. ``changes`` are the values of keys of [model]
-    that make it a part of the model, and ``parameters`` what [parameters] says of new ones.
+    done, so that a fit without it has followed it. What is ``noise`` leaves the displacement as it
+    is. ``changes`` are the values of keys of [model] that make it a part of the model, and
+    ``parameters`` what [parameters] says of new ones.
     """
 
     rmse: tuple[float, float] = (np.nan, np.nan)
     held_out: tuple[float, float] = (np.nan, np.nan)
     shift: float = 0.0
     foreign: bool = False
+    noise: bool = False
     changes: Mapping[str, object] = field(default_factory=dict)
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -212,6 +214,25 @@ class Scene:
     def innovations(self) -> FloatArray:
         """Innovations of the fit (readings,), in sds."""
         return innovations(self.posterior, self.fit.free).white
+
+    @cached_property
+    def unexplained(self) -> float:
+        """Nats of log likelihood that the sensor's noise alone would gain, if the model were right.
+
+        What the discrepancy takes up, no other model can gain more; inf without a discrepancy, as
+        the sensor's noise takes it up then.
+        """
+        record = self.posterior.only
+        if not record.noise.states:
+            return np.inf
+        parameters = record.table.noise(self.posterior.prior.theta(self.fit.free[np.newaxis]))
+        residual = record.readings.values - self.fit.displacement
+        white, log_determinant = self.posterior.likelihood.whiten(
+            parameters, residual[np.newaxis, np.newaxis]
+        )
+        sensor = float(record.noise.marginal_sd(parameters)[1][0])
+        now = -0.5 * (float(np.sum(white**2)) + float(log_determinant[0]))
+        return -residual.size * (np.log(sensor) + 0.5) - now
 
     @property
     def lead(self) -> float:

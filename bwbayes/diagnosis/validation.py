@@ -11,7 +11,9 @@ A verdict that fails names the likely cause: on readings that were fitted the ex
 best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
 residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
 the best explanation is something that the actuator has not done, as a transient, a drift or
-outliers: parameters that have followed it are others.
+outliers: parameters that have followed it are others. Nor has it where a better model is known:
+held-out readings have the drive of those that were fitted, and a discrepancy takes up there what
+the model misses; along another drive its size is another one.
 
 What everything carries along that builds on a run is its :class:`Standing`: it goes first on every
 page, into every file of numbers, and decides the exit status of every command.
@@ -28,7 +30,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
 from bwbayes.diagnosis.departures import Standardized
-from bwbayes.diagnosis.explanations import followed_causes, likely_causes
+from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.errors import ExitStatus
@@ -254,11 +256,15 @@ def assess(
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"
         for text, chance in standard.chances()
     ]
-    followed = joined(followed_causes(explanations))
+    better, followed = (joined(find(explanations)) for find in (better_models, followed_causes))
     if followed is not None:
         doubts.append(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
         )
+    elif better is not None:
+        parts = all(each.changes for each in better_models(explanations))
+        way = "; --improve adds it" if parts else ", which no key of [model] adds"
+        doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){way}")
     least = 5.0  # worth fewer independent readings a record cannot show that bands hold
     if standard.effective_size < least:
         doubts.append(
@@ -266,5 +272,7 @@ def assess(
             f"bands; use a record {least / standard.effective_size:.2g} times as long"
         )
     return (
-        replace(verdict, holds=None, reasons=tuple(doubts), cause=followed) if doubts else verdict
+        replace(verdict, holds=None, reasons=tuple(doubts), cause=followed or better)
+        if doubts
+        else verdict
     )

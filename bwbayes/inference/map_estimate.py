@@ -77,15 +77,19 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     return PointFit(best.position, best.covariance, best.log_density, optima, spread)
 
 
-def valleys(posterior: Posterior, generator: np.random.Generator) -> FloatArray:
+def valleys(
+    posterior: Posterior, generator: np.random.Generator, starts: int = STARTS
+) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
+
+    From so many starts: a few find the best of them, if not all.
 
     Raises
     ------
     InputError
         As :func:`fit`.
     """
-    return np.stack(_places(posterior, generator)[0])
+    return np.stack(_places(posterior, generator, starts)[0])
 
 
 def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -105,7 +109,7 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
 
 
 def _places(
-    posterior: Posterior, generator: np.random.Generator
+    posterior: Posterior, generator: np.random.Generator, starts: int = STARTS
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Return places (free,) to climb from; of prior draws, the noise and the covariance."""
     prior = posterior.prior
@@ -117,8 +121,8 @@ def _places(
     optima = []
     for steps in (False, True):
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
-        starts = draws[np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")[:STARTS]]
-        optima += _valleys(least_squares, least_squares.optima(starts))
+        order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
+        optima += _valleys(least_squares, least_squares.optima(draws[order[:starts]]))
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
     # A place that least squares allows may still have no density: the noise is another one there.

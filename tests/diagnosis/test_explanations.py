@@ -129,7 +129,7 @@ def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     kind: str, tmp_path: Path
 ) -> None:
     """Runs that improve a model find them among all in the default suite too."""
-    found = explain(scene(kind, 1, tmp_path, 5.0), thorough=kind != "good")
+    found = explain(scene(kind, 1, tmp_path, 5.0))
     causes = {cause.kind for cause in likely_causes(found)}
     assert causes & CAUSES[kind] if kind != "good" else not causes
 
@@ -142,7 +142,7 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     monkeypatch.setattr(explanations, "CHANGES", (effects.slew_limit,))
     slow = scene("slew limit", 1, tmp_path, 5.0)
     assert all(found.nats < 0 for found in effects.slew_limit(slow))
-    found = explain(slow, thorough=True)
+    found = explain(slow)
     assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
 

@@ -112,7 +112,7 @@ def study(kind: str, seed: int, folder: Path) -> Outcome:
     problem = problem_of(config, folder)
     source = np.random.default_rng((6, seed))
     point = pointfit.fit(problem.posterior, source)
-    found = likely_causes(explained(problem, "record", point.optima, thorough=kind != "good"))
+    found = likely_causes(explained(problem, "record", point.optima))
     if found:
         config = followed(config, problem, found[0], kind, seed, folder)
     judged = judge(problem_of(config, folder), source, again=False)

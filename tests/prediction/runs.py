@@ -134,10 +134,9 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     background = Background.of(posterior, draws)
     verdicts = validate_predictions(problem, bands, background, {})
     if again:
-        failed = verdicts["training"].holds is False
         places = posterior.prior.unconstrain(best[np.newaxis])
         places = np.concatenate([places, point.optima])
-        found = explained(problem, "record", places, thorough=failed)
+        found = explained(problem, "record", places)
         verdicts = validate_predictions(problem, bands, background, {"record": found})
     return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
 

@@ -15,7 +15,7 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, find_map, lines
-from bwbayes.diagnosis import conflict, identifiability, innovations
+from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
 from bwbayes.report.tables import priors_table
@@ -39,9 +39,8 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
-    for name, alone, theta in posterior.each(free):
-        odd = bool(innovations.departures(innovations.innovations(alone, theta[0])))
-        remarks += lines(explained(problem, name, point.optima, thorough=odd))
+    for name in problem.records:
+        remarks += lines(explained(problem, name, point.optima))
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)

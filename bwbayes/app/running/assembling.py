@@ -78,11 +78,12 @@ def assemble(
     starts = {name: record.start for name, record in records.items()}
     compared = agreement.agreements(posterior, chain.point, starts)
     background = Background.of(posterior, flat)
-    unexplained = validate_predictions(problem, bands, background, {})
     result = replace(
         result,
         scores={
-            band.name: score(band, background.extent) for band in bands if band.name in unexplained
+            band.name: score(band, background.extent)
+            for band in bands
+            if band.scored(band.measured).any()
         },
         innovations=series,
         loops=measure_loops(posterior, subset),
@@ -90,7 +91,6 @@ def assemble(
     )
     artist.draw(result)
     departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
-    failed = any(verdict.holds is False for verdict in unexplained.values())
     places = [*posterior.prior.unconstrain(best), *chain.point.optima]
     modes = distinct(places, chain.point.covariance)
     explanations = {
@@ -99,7 +99,6 @@ def assemble(
             name,
             modes,
             partial(watch, f"explanations of {name}" if several else "explanations"),
-            thorough=failed or bool(departures[name]),
         )
         for name in records
     }

@@ -40,13 +40,11 @@ def explained(
     name: str,
     places: FloatArray,
     watch: Callable[[float], None] = lambda _: None,
-    *,
-    thorough: bool,
 ) -> tuple[Explanation, ...]:
     """Explain a training record's readings better than its fit does, the best explanation first.
 
     ``places`` are the posterior's modes (modes, free), coordinates; ``watch`` is called with the
-    share that is done; ``thorough`` where something is known to be wrong.
+    share that is done.
     """
     posterior, record = problem.posterior, problem.records[name]
     scene = Scene.of(
@@ -58,7 +56,7 @@ def explained(
         # Of several records no other model is built: it would be one of all of them.
         problem.reconfigured if len(problem.records) == 1 else None,
     )
-    return explain(scene, watch, thorough=thorough)
+    return explain(scene, watch)
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
@@ -151,7 +149,7 @@ def improve_model(
         (name,) = problem.records
         with ProgressLine(console, "searching for missing parts of the model ..."):
             point = _fit_point(problem)
-            found = explained(problem, name, point.optima, thorough=True)
+            found = explained(problem, name, point.optima)
         parts = likely_causes([cause for cause in found if cause.changes])
         if followed_causes(found) or not parts:
             break
