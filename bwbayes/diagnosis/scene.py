@@ -232,7 +232,7 @@ class Scene:
         )
         sensor = float(record.noise.marginal_sd(parameters)[1][0])
         now = -0.5 * (float(np.sum(white**2)) + float(log_determinant[0]))
-        return -residual.size * (np.log(sensor) + 0.5) - now
+        return float(-residual.size * (np.log(sensor) + 0.5) - now)
 
     @property
     def lead(self) -> float:

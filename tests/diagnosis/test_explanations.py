@@ -19,6 +19,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import write_record
 from tests.diagnosis.plants import CAUSES, plant
 from tests.prediction.runs import problem_of
+from tests.stand import Stand
 
 
 def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0) -> Scene:
@@ -132,6 +133,25 @@ def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     found = explain(scene(kind, 1, tmp_path, 5.0))
     causes = {cause.kind for cause in likely_causes(found)}
     assert causes & CAUSES[kind] if kind != "good" else not causes
+
+
+def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> None:
+    """Where that is next to nothing, no other model is fitted: a good record takes no time."""
+    good = Stand(discrepancy=0.0, sensor=0.1)
+    record = good.measure(100 * np.sin(0.02 * np.pi * np.arange(800.0)), np.random.default_rng(1))
+    write_record(record, tmp_path / "record.h5")
+    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    rng = np.random.default_rng(0)
+    optima = pointfit.fit(problem.posterior, rng).optima
+    small = Scene.of(problem.posterior, optima, rng, reconfigure=problem.reconfigured)
+    assert small.unexplained < LIMIT
+    fitted: list[float] = []
+    explain(small, fitted.append)
+    assert len(fitted) == len(explanations.ADDITIONS)
+    (tmp_path / "other").mkdir()
+    large = scene("cubic", 0, tmp_path / "other", 5.0)
+    gained = max(found.nats for found in model.nonlinearity(large))
+    assert LIMIT < gained < large.unexplained
 
 
 def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(

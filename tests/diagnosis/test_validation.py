@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import WORDS, cause
+from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.prediction.bands import Bands, LeadIn
 from bwbayes.record.io.grid import clock
@@ -240,6 +242,35 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
         verdict = judged(bands_of(record, training=training), background)
         assert verdict.holds is holds
         assert holds or "on the training readings" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("explanation", "said"),
+    [
+        (
+            Explanation("backlash", "backlash of 1 um", "tighten the mount", nats=517.4),
+            "a better model is known (backlash, 517 nats), which no key of [model] adds",
+        ),
+        (
+            Explanation("creep", "creep", "set creep = true", nats=20.0, changes={"creep": True}),
+            "a better model is known (creep, 20 nats); --improve adds it",
+        ),
+        (Explanation("backlash", "backlash", "tighten it", nats=LIMIT - 0.1), None),
+        (Explanation("noise by speed", "noise", "do", nats=500.0, noise=True), None),
+    ],
+)
+def test_no_fit_passes_while_a_better_model_is_known(
+    explanation: Explanation, said: str | None
+) -> None:
+    """However well its bands cover. Twins: one that chance may find, and noise of another kind."""
+    record = made(np.random.default_rng(1), length=30)
+    noisy = Explanation("noise by voltage", "noise", "do", nats=900.0, noise=True)
+    background = Background(record.memory, 0.0, FITTED)
+    verdict = assess(bands_of(record, training=True), background, explanations=[noisy, explanation])
+    assert verdict is not None
+    assert verdict.holds is (True if said is None else None)
+    assert verdict.reasons == (() if said is None else (said,))
+    assert said is None or (verdict.cause is not None and verdict.cause.fix == explanation.fix)
 
 
 def test_no_fix_is_a_command_line_which_python_has_not() -> None:
