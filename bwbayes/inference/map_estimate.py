@@ -3,7 +3,7 @@
 Least squares from several prior draws finds the optima of the physical parameters, of residuals and
 of their steps; from the best ones the posterior's own modes follow by Newton steps, with all noise
 parameters. The curvature there is the Gaussian approximation: it starts the sampler and is never
-the answer itself.
+the answer itself. The modes of a long record are looked for in a thinned one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
+from bwbayes.inference.thinning import thinned
 from bwbayes.shown import brief
 
 if TYPE_CHECKING:
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
+
+# Samples of a record in which modes are looked for, and prior draws that tell whether a longer one
+# can be thinned to so many.
+SAMPLES, PROBES = 20_000, 8
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,14 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     InputError
         No prior draw has a finite posterior density.
     """
-    places, noise, spread = _places(posterior, generator)
+    # Drawn aside: what a short record is fitted from does not depend on them.
+    probes = posterior.prior.theta(posterior.prior.draw(generator.spawn(1)[0], PROBES))
+    short = thinned(posterior, probes, SAMPLES)
+    if short is posterior:
+        places, noise, spread = _places(posterior, generator)
+    else:
+        point = fit(short, generator)
+        places, noise, spread = [*point.optima], np.empty((0, 0)), point.prior_covariance
     modes: list[_Mode] = []
 
     def climb(position: FloatArray) -> None:

@@ -1,0 +1,110 @@
+"""Thinned records: every k-th sample of a long record, for searches that take many simulations.
+
+The voltage keeps its reversals and is taken to go straight in between, so that the hysteresis
+remembers what it remembers of the whole record. The error that is left is that of the drive's
+curvature between two samples. Where it is small beside a model's error, the modes of the thinned
+posterior are near those of the whole one, which a climb along all readings then reaches in a few
+steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.model.reversals import monotone_stretches
+
+# How much a displacement may change, root mean square, in parts of its range: a tenth of the error
+# of a Bouc-Wen model.
+ERROR = 1e-3
+
+
+def thinned(posterior: Posterior, theta: FloatArray, samples: int) -> Posterior:
+    """Thin each record of a posterior to so many samples, or as few as its displacement allows.
+
+    That of most models at θ (models, parameters) changes by no more than :data:`ERROR`. A posterior
+    of short records is returned as it is.
+    """
+    for dataset in posterior.datasets:
+        models = posterior.table.of(theta, dataset.name)
+        stride = dataset.readings.samples // samples
+        if stride > 1:
+            whole = displacement(posterior, dataset, models)
+            limit = ERROR * np.ptp(whole, axis=1)
+        while stride > 1:
+            short, kept = thin(dataset, stride), np.sum(dataset.readings.rows % stride == 0)
+            change = displacement(posterior, short, models) - whole[:, ::stride]
+            error = np.sqrt(np.mean(change**2, axis=1))
+            # There may be fewer readings than samples, and none of them at those that are kept.
+            enough = 2 * kept >= min(dataset.readings.rows.size, samples)
+            if enough and np.median(error - limit) <= 0:
+                others = (short if other is dataset else other for other in posterior.datasets)
+                posterior = replace(posterior, datasets=tuple(others))
+                break
+            stride //= 2
+    return posterior
+
+
+def thin(dataset: Dataset, stride: int) -> Dataset:
+    """Return every ``stride``-th sample of a record, with the extremes of its reversals.
+
+    The voltage goes straight from one to the next, whatever it did between the record's samples.
+    """
+    if stride == 1:
+        return dataset
+    actuator = replace(
+        dataset.actuator.within(dataset.voltage),
+        hold="first",
+        interval=stride * dataset.actuator.interval,
+    )
+    return replace(
+        dataset,
+        voltage=_with_reversals(dataset.voltage, stride),
+        displacement=dataset.displacement[::stride],
+        training=thinned_windows(dataset.training, stride),
+        actuator=actuator,
+        noise=dataset.noise.at(actuator.interval),
+    )
+
+
+def readings_at(short: Posterior, whole: Posterior, theta: FloatArray) -> FloatArray:
+    """Return readings (samples,), um, that leave a thinned record the residuals of the whole one.
+
+    Those of one model θ (1, parameters): to the readings is added what thinning changes of the
+    displacement, so that no other model gains from mending that.
+    """
+    stride = stride_of(short, whole)
+    before = displacement(whole, whole.only, theta)[0, ::stride]
+    after = displacement(short, short.only, theta)[0]
+    readings: FloatArray = whole.only.displacement[::stride] + after - before
+    return readings
+
+
+def stride_of(short: Posterior, whole: Posterior) -> int:
+    """Return the samples of a whole record for each of a thinned one."""
+    return round(short.only.actuator.interval / whole.only.actuator.interval)
+
+
+def thinned_windows(windows: Iterable[slice], stride: int) -> tuple[slice, ...]:
+    """Return where windows of a record (slices of its samples) are in a thinned one."""
+    return tuple(slice(-(-w.start // stride), -(-w.stop // stride)) for w in windows)
+
+
+def _with_reversals(voltage: FloatArray, stride: int) -> FloatArray:
+    """Take every ``stride``-th voltage; where these turn, the extreme of all voltages nearby."""
+    result = voltage[::stride].copy()
+    for branch in list(monotone_stretches(result))[:-1] if stride > 1 else ():
+        middle = stride * branch.last
+        nearby = voltage[max(middle - stride + 1, 0) : middle + stride]
+        result[branch.last] = nearby.max() if branch.direction > 0 else nearby.min()
+    return result
+
+
+def displacement(posterior: Posterior, dataset: Dataset, theta: FloatArray) -> FloatArray:
+    """Displacement (models, samples), um, from rest at θ (models, parameters) of a record."""
+    likelihood = dataset.likelihood(posterior.engine)
+    return likelihood.simulate(likelihood.table.actuator(theta), dataset.voltage)
