@@ -157,7 +157,7 @@ def backlash(scene: Scene) -> Iterator[Explanation]:
 
 def delay(scene: Scene) -> Iterator[Explanation]:
     """Try u(t − δ); δ is a fiftieth of the time between reversals, give or take."""
-    scale = max(scene.turn_time / 50, scene.interval)
+    scale = max(scene.turn_time / 50, scene.interval / scene.stride)
 
     def shifted(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
         clock = scene.interval * np.arange(voltage.size)

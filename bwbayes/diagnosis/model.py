@@ -57,7 +57,7 @@ def dynamics(scene: Scene) -> Iterator[Explanation]:
 
 def hold(scene: Scene) -> Iterator[Explanation]:
     """Try the other thing that the voltage may do between samples."""
-    other = "first" if scene.posterior.only.actuator.hold == "zero" else "zero"
+    other = "first" if scene.whole.only.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
     if other == "first":
         text = "voltage that changes steadily between samples"

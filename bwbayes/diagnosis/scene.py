@@ -18,6 +18,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.thinning import readings_at, stride_of, thin, thinned, thinned_windows
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.record.io.grid import clock
 
@@ -85,6 +86,8 @@ class Scene:
     ----------
     fit
         The fit without any extension.
+    whole
+        The posterior of the whole record, of which that of the fit may be thinned.
     places
         Coordinates (places, free) to climb from, those of the fit first.
     generator
@@ -100,6 +103,7 @@ class Scene:
     """
 
     fit: LocalFit
+    whole: Posterior
     places: FloatArray
     generator: np.random.Generator
     held_out: tuple[slice, ...] = ()
@@ -122,13 +126,17 @@ class Scene:
         Something at the start of the record may have drawn the fit to an optimum that the rest of
         it does not have: a fit of the rest says where else to start from.
         """
+        theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
+        whole, posterior = posterior, thinned(posterior, theta, READINGS)
+        if posterior is not whole:
+            posterior = posterior.altered(displacement=readings_at(posterior, whole, theta))
         rows = posterior.only.readings.rows
         if rows.size > READINGS:
-            # Every so many of them: the voltage stays whole.
+            # Every so many of them: the voltage stays as it is.
             retained = rows[:: -(-rows.size // READINGS)]
-            thinned = posterior.only.displacement.copy()
-            thinned[np.setdiff1d(rows, retained)] = np.nan
-            posterior, rows = posterior.altered(displacement=thinned), retained
+            readings = posterior.only.displacement.copy()
+            readings[np.setdiff1d(rows, retained)] = np.nan
+            posterior, rows = posterior.altered(displacement=readings), retained
         first = int(rows[rows.size // 5])
         windows = posterior.only.training
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
@@ -142,7 +150,8 @@ class Scene:
         best = max((climb(posterior, p) for p in places), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
-        return cls(best, starts, generator, tuple(held_out), begin, reconfigure)
+        held_out = thinned_windows(held_out, stride_of(posterior, whole))
+        return cls(best, whole, starts, generator, held_out, begin, reconfigure)
 
     def with_rough_noise(self) -> Scene | None:
         """Return the same with a rough discrepancy, if it has a smooth one; else none.
@@ -170,6 +179,11 @@ class Scene:
     def posterior(self) -> Posterior:
         """The posterior that was fitted."""
         return self.fit.posterior
+
+    @property
+    def stride(self) -> int:
+        """Samples of the whole record for each that is looked at."""
+        return stride_of(self.posterior, self.whole)
 
     @property
     def interval(self) -> float:
@@ -258,8 +272,14 @@ class Scene:
         """Return the posterior of another model and the same readings, if it can be built."""
         if self.reconfigure is None:
             return None
-        posterior = self.reconfigure(changes, parameters)
-        return posterior.altered(displacement=self.posterior.only.displacement)
+        rebuilt, readings = self.reconfigure(changes, parameters), self.posterior.only.displacement
+        posterior = replace(rebuilt, datasets=(thin(rebuilt.only, self.stride),))
+        if self.stride > 1 and rebuilt.only.actuator.hold != self.whole.only.actuator.hold:
+            # Of a thinned record the hold is in the readings.
+            theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
+            held = readings_at(posterior, rebuilt, theta)
+            readings = np.where(np.isfinite(readings), held, np.nan)
+        return posterior.altered(displacement=readings)
 
     def extended(
         self,

@@ -192,3 +192,32 @@ def test_a_fit_has_not_followed_what_a_missing_part_explains_as_well() -> None:
     assert 1 == len(followed_causes([creep, foreign(LIMIT + 18, removes=False)]))
     assert 1 == len(followed_causes([foreign(1.0, shift=4.0)]))
     assert () == followed_causes([foreign(1.0)])
+
+
+@pytest.mark.parametrize("kind", ["good", "delay", "hold"])
+def test_a_thinned_record_has_the_evidence_of_as_many_readings(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best explanation is the same whether the path between them is left out or not.
+
+    None gains by it. What does not move the drive's reversals loses nothing either.
+    """
+    nats = {}
+    monkeypatch.setattr("bwbayes.diagnosis.scene.READINGS", 500)
+    for stride in (4, 1):
+        if stride == 1:
+            monkeypatch.setattr("bwbayes.diagnosis.scene.thinned", lambda whole, *_: whole)
+        seen = scene(kind, 2, tmp_path)
+        assert stride == seen.stride
+        assert 500 == seen.posterior.only.readings.rows.size
+        families = effects.delay, effects.moving_gain, model.creep, model.hold
+        found = [explanation for family in families for explanation in family(seen)]
+        nats[stride] = {explanation.kind: explanation.nats for explanation in found}
+    whole, thin = nats[1], nats[4]
+    best = max(whole, key=whole.__getitem__)
+    assert best == max(thin, key=thin.__getitem__)
+    assert thin[best] == pytest.approx(whole[best], rel=0.02, abs=1.0)
+    for name, gained in thin.items():
+        assert gained < max(whole[name], 0.0) + 0.5
+    for name in ("moving gain", "creep"):
+        assert thin[name] == pytest.approx(whole[name], abs=0.1)
