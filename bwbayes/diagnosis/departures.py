@@ -60,7 +60,9 @@ class Standardized:
 
         rows = bands.scored(bands.measured)
         own, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
-        sensor = np.maximum(sensor, np.finfo(float).tiny)
+        # No band is narrower than a floating-point number's resolution.
+        largest = float(np.max(np.abs([bands.measured[rows], bands.mean[rows]])))
+        sensor = np.maximum(sensor, max(np.spacing(largest), 1e-150))
         z = (bands.measured - bands.mean)[rows] / sensor
         total = float(np.mean(sensor**2))
         p = min(float(np.mean(own**2)) / total, 1.0)
@@ -82,6 +84,8 @@ class Standardized:
 
         mean = p + q * once + (1 - p - q) * single
         shared = (p - common) + q * (1 - once) + (1 - p - q) * (1 - single)
+        # A common error may be all that the bands allow for, or the reading the only one.
+        shared = max(shared, float(np.finfo(float).eps))
         varying = of_squares(min((p - common) / shared, 1.0), min(q * (1 - once) / shared, 1.0))
         return cls(
             bands,

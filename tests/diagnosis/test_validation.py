@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import WORDS, cause
+from bwbayes.diagnosis.departures import Standardized
 from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.validation import Background, Verdict, assess
-from bwbayes.prediction.bands import Bands, LeadIn
+from bwbayes.prediction.bands import KINDS, Bands, LeadIn
 from bwbayes.record.io.grid import clock
-from tests.prediction.records import Made, bands_of, made
+from tests.prediction.records import Made, bands_of, made, normal_bands
 
 FITTED = (-100.0, 100.0)
 
@@ -58,6 +59,39 @@ def test_bands_of_good_records_hold(records: int, most: int) -> None:
     told = [good(generator, number).holds for number in range(records)]
     assert told.count(False) <= most
     assert told.count(None) < 0.1 * records
+
+
+@given(
+    readings=st.integers(1, 5),
+    sizes=st.tuples(*[st.sampled_from((0.0, 1e-200, 1e-9, 1.0, 1e9)) for _ in range(4)]),
+    share=st.floats(0, 1),
+    memory=st.sampled_from((0.0, 1e-9, 1.0, 1e9)),
+    noise_log_sd=st.sampled_from((0.0, 0.1, 1.0)),
+    error=st.sampled_from((0.0, 1e-12, 1.0)),
+)
+def test_bands_of_any_shares_are_judged(
+    readings: int,
+    sizes: tuple[float, float, float, float],
+    share: float,
+    memory: float,
+    noise_log_sd: float,
+    error: float,
+) -> None:
+    """Common error, parameters, discrepancy and sensor noise may each be nothing or all."""
+    variances = np.cumsum(np.square(sizes))[1:]
+    kinds = {kind: np.full(5, np.sqrt(total)) for kind, total in zip(KINDS, variances, strict=True)}
+    bands = normal_bands(np.arange(5.0), np.zeros(5), np.zeros(5), kinds, None)
+    measured = np.where(np.arange(5) < readings, error * (-1.0) ** np.arange(5), np.nan)
+    # A quantile may round to either side of the sd of all.
+    for common_sd in (sizes[0], share * kinds["parameter"][0], kinds["sensor"][0]):
+        found = replace(bands, measured=measured, common_sd=float(common_sd))
+        standard = Standardized.of(found, memory, noise_log_sd)
+        for size in (standard.mean_size, standard.square_size, standard.varying_size):
+            assert 1 - 1e-9 <= size <= readings * (1 + 1e-9)
+        assert np.isfinite(standard.z).all()
+        assert np.isfinite(standard.varying).all()
+        assert all(0 <= chance <= 1 for _, chance in standard.chances())
+        assert all(standard.reasons(FITTED, 1.0))
 
 
 def unsure_alarms(known: float, believed: float) -> int:
