@@ -28,18 +28,18 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import mark, with_error
 
-# The columns of the models' table.
+# The columns of the models' table. What decides stands in that of the differences.
 COLUMNS = (
     TableColumn("Model", text="{name}"),
     TableColumn("Validation", text=Markup("{status}")),
     TableColumn("Free", text="{free}"),
-    TableColumn("Log score", text="{log_score:.1f}"),
+    TableColumn("Log score", on="page", text="{log_score:.1f}"),
     TableColumn("CRPS", on="page", text="{held_out[crps_um]:.3g} µm"),
     TableColumn("NRMSE", text="{held_out[nrmse]:.2%}"),
     TableColumn("95% covers", text="{held_out[coverage]:.1%} ± {held_out[coverage_error]:.1%}"),
-    TableColumn("95% width", on="page", text="{held_out[width_um]:.3g} µm"),
-    TableColumn("Log evidence", text="{evidence}"),
-    TableColumn("Priors' share", text="{prior_share:.1f}"),
+    TableColumn("95% width", text="{held_out[width_um]:.3g} µm"),
+    TableColumn("Log evidence", on="page", text="{evidence}"),
+    TableColumn("Priors' share", on="page", text="{prior_share:.1f}"),
     TableColumn("AIC", on="page", text="{aic:.1f}"),
     TableColumn("BIC", on="page", text="{bic:.1f}"),
 )

@@ -266,16 +266,41 @@ def show(report: Report, console: Console) -> None:
             _say(line, console)
     for block in report.all_blocks():
         if isinstance(block, Table) and block.on != "page" and block.rows:
-            columns, rows = block.cells("screen")
-            grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-            for i, column in enumerate(columns):
-                title = f"{column.group}: {column.title}" if column.group else column.title
-                grid.add_column(escape(_plain(title)), no_wrap=i == 0)
-            for row in rows:
-                grid.add_row(*(escape(_plain(text)) for text in row))
-            console.print(grid)
+            for grid in _grids(block, console.width):
+                console.print(grid)
         elif isinstance(block, Text) and block.on != "page":
             _say(escape(_plain(block.text)), console)
+
+
+def _grids(table: Table, width: int) -> Iterator[Grid]:
+    """Yield a table for a screen: as many columns at a time as fit beside that of the rows' names.
+
+    A short text stays on one line, a title and a longer text are wrapped at their blanks.
+    """
+    columns, rows = table.cells("screen")
+    titles = [f"{c.group}: {c.title}" if c.group else c.title for c in columns]
+    texts = [[_plain(text) for text in column] for column in zip(titles, *rows, strict=True)]
+    wanted = [max(map(len, column)) for column in texts]
+    least = []
+    for number, (title, *cells) in enumerate(texts):
+        whole = number == 0 or max(map(len, cells)) <= 24
+        words = [*title.split(), *(cells if whole else " ".join(cells).split())]
+        least.append(min(max(map(len, words), default=1), width // 2))
+    parts = [[0]]
+    for i in range(1, len(texts)):
+        if len(parts[-1]) > 1 and sum(least[n] + 2 for n in [*parts[-1], i]) > width:
+            parts.append([0])
+        parts[-1].append(i)
+    for shown in parts:
+        spare = width - sum(least[i] + 2 for i in shown)
+        grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+        for i in shown:
+            more = max(min(wanted[i] - least[i], spare), 0)
+            spare -= more
+            grid.add_column(escape(texts[i][0]), width=least[i] + more, overflow="fold")
+        for cells in zip(*(texts[i][1:] for i in shown), strict=True):
+            grid.add_row(*map(escape, cells))
+        yield grid
 
 
 def as_text(report: Report, width: int = 110) -> str:

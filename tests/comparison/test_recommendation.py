@@ -14,7 +14,7 @@ from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.report.report import as_text
+from bwbayes.report.report import Table, as_text
 
 
 def noise(seed: int, size: int = 10) -> FloatArray:
@@ -146,10 +146,22 @@ def test_what_has_not_converged_is_listed_and_never_recommended() -> None:
     assert comparison.caveats == ("lost has not converged (budget used up) and is not judged",)
     assert comparison.lines[0] == "plain is recommended"
     assert comparison.lines[-1].startswith("only screened")
-    assert "about -300" in str(comparison)
+    models, *_ = comparison.report().blocks
+    assert isinstance(models, Table)
+    assert "about -300" in models.rows[1]
     comparison = recommend([lost])
     assert comparison.recommended is None
     assert "not converged" in str(comparison)
+
+
+def test_tables_fit_eighty_columns() -> None:
+    """Whole, with names as long as models have, and each table in one part."""
+    name = "maxwell-slip + quadratic"
+    comparison = recommend([model(name, COMMON, 1012.3), model("bouc-wen", COMMON - 15)])
+    text = as_text(replace(comparison, lines=("best",), caveats=()).report(), 80)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "\u2026" not in text
+    assert 2 == sum("─" in line for line in text.splitlines())
 
 
 @pytest.mark.parametrize(("holds", "status"), [(False, "VALIDATION FAILED"), (None, "Validation")])
