@@ -2,26 +2,28 @@
 
 Each candidate is a voltage that the amplifier can make. At some posterior draws the model is made
 linear in its parameters: the Fisher information of the readings that the candidate would bring,
-with the noise of that draw and an offset of the new record's own, adds to what is known already.
-What would be left of a standard deviation, averaged over the draws, is the promise; how far the
-draws scatter is its Monte Carlo error.
+with the noise of that draw, adds to what is known already. What a fit of the new record would not
+know of its start and its offset is not known here either. What would be left of a standard
+deviation, averaged over the draws, is the promise; how far the draws scatter is its Monte Carlo
+error.
 
-What the model is wrong about returns whenever the voltage takes the same way again, so a stretch
-that is driven several times counts once: a hundred periods of one sine show one loop, not a
-hundred. A fit, which trusts the noise model, may look surer than was promised of a steady drive.
+Every reading counts as often as a fit counts it, which trusts the noise model: what the model is
+wrong about returns with every period of a steady drive, and is not taken for new each time only as
+far as the discrepancy's correlation time says so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.comparison.designed import Promise
-from bwbayes.diagnosis.identifiability import stretches_once
 from bwbayes.errors import InputError, suggestion
+from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
 
@@ -37,13 +39,14 @@ def promises(
     """Rank candidates by what they would teach, the best first.
 
     With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
-    sampling, J the derivatives of the candidate's displacements there and C the noise's covariance,
+    sampling, and I the information of the candidate's readings about them and about the initial
+    state and offset of its record, whose prior is standard normal there
+    (:meth:`~bwbayes.inference.likelihood.Likelihood.score`),
 
-        Σ' = (Σ⁻¹ + Jᵀ C⁻¹ J)⁻¹,
+        Σ' = (Σ⁻¹ + Iₐₐ − Iₐᵣ (1 + Iᵣᵣ)⁻¹ Iᵣₐ)⁻¹.
 
-    the new record's offset integrated out, and each sample weighted by one over how often its
-    stretch is driven. A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its
-    gradient; along a drive the mean over its samples counts.
+    A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its gradient; along a drive the mean over its
+    samples counts.
 
     Parameters
     ----------
@@ -52,15 +55,15 @@ def promises(
     draws
         (draws, free), parameters in their own units.
     candidates
-        Voltages (samples,) by name, V, at the interval of the fitted record, from a demagnetized
-        actuator at rest.
+        Voltages (samples,) by name, V, at the interval of the fitted record. Their records start
+        as that one did: demagnetized and at rest, or in a state that nothing tells.
     target
         The name of a free parameter of the actuator, or a drive (samples,), V, whose parameter band
         is to be narrow.
     amplifier
         What can be driven.
     generator
-        Chooses draws.
+        Chooses draws, and draws the starts of the candidates' records.
 
     Raises
     ------
@@ -73,63 +76,58 @@ def promises(
     (1995) 273-304: c-optimality, averaged over the posterior.
     """
     dataset, prior = posterior.only, posterior.prior
-    declared = [d.name for d in dataset.actuator.declarations if d.scope == "actuator"]
-    names = [name for name in declared if name in prior.free_names]
+    scopes = {d.name: d.scope for d in dataset.actuator.declarations if d.name in prior.free_names}
+    names = [name for name, scope in scopes.items() if scope == "actuator"]
     if isinstance(target, str) and target not in names:
         hint = suggestion(target, names)
         raise InputError(f"design: {target!r} is not a free parameter of the actuator; {hint}")
-    columns = [prior.free_names.index(name) for name in names]
+    columns, new = (
+        np.array([prior.free_names.index(n) for n in scopes if (n in names) is shared], dtype=int)
+        for shared in (True, False)
+    )
     coordinates = prior.unconstrain(draws[:: max(len(draws) // 4000, 1)])
     covariance = np.atleast_2d(np.cov(coordinates[:, columns], rowvar=False))
     chosen = coordinates[
         generator.choice(len(coordinates), min(40, len(coordinates)), replace=False)
     ]
-    noise = dataset.table.noise(prior.theta(prior.constrain(chosen)[0]))
-    steps = 0.01 * np.sqrt(np.diag(covariance))
+    begun = chosen.copy()
+    begun[:, new] = generator.standard_normal((len(chosen), new.size))
+    possible = np.isfinite(prior.constrain(begun)[1])
+    chosen[possible] = begun[possible]
+    steps = np.full(coordinates.shape[1], 0.01)
+    steps[columns] *= np.sqrt(np.diag(covariance))
 
-    def derivatives(position: FloatArray, quantity: str | FloatArray) -> FloatArray:
-        """Return those (coordinates, ...) of a parameter, or of the displacement on a voltage."""
-        moved = np.tile(position, (2 * len(columns), 1))
-        rows = np.arange(len(columns))
-        moved[rows, columns] += steps
-        moved[len(columns) + rows, columns] -= steps
+    def derivatives(
+        position: FloatArray, moving: IntArray, quantity: str | Likelihood
+    ) -> FloatArray:
+        """Return those (moving, ...) of a parameter, or of the displacement of a record."""
+        moved = np.tile(position, (2 * moving.size, 1))
+        rows = np.arange(moving.size)
+        moved[rows, moving] += steps[moving]
+        moved[moving.size + rows, moving] -= steps[moving]
         theta = prior.theta(prior.constrain(moved)[0])
-        theta = dataset.table.replaced(theta, "initial", np.zeros(len(theta)))
         if isinstance(quantity, str):
             values = theta[:, [dataset.table.names.index(quantity)]]
         else:
-            models = dataset.table.actuator(theta)
-            values = posterior.likelihood.actuator.displacement(models, quantity, from_rest=True)
+            values = quantity.simulate(dataset.table.actuator(theta), quantity.voltage)
         above, below = np.split(values, 2)
-        return np.asarray((above - below) / (2 * steps[:, np.newaxis]))
+        return np.asarray((above - below) / (2 * steps[moving, np.newaxis]))
 
     factor = np.linalg.cholesky(covariance)
-    gradients = [derivatives(position, target) for position in chosen]
+    quantity = target if isinstance(target, str) else _planned(posterior, target)
+    gradients = [derivatives(position, columns, quantity) for position in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
-    offset_sd = next(
-        (
-            float(p.prior.frozen.std())
-            for p in prior.free
-            if p.name == "offset" and p.prior is not None
-        ),
-        0.0,
-    )
     scores = []
     for name, voltage in candidates.items():
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
         if refused:
             scores.append(Promise(name, np.nan, np.nan, refused))
             continue
-        once, _ = stretches_once(voltage, np.arange(voltage.size))
-        remaining = []
-        for position, sd, gradient in zip(chosen, noise, gradients, strict=True):
-            series = np.concatenate([derivatives(position, voltage), np.ones((1, voltage.size))])
-            (white,), _ = dataset.noise.whiten(sd[np.newaxis], series[np.newaxis])
-            products = (white * once) @ white.T
-            # The last row is the offset's, which is integrated out.
-            information, offset = products[:-1, :-1], products[:-1, -1:]
-            if offset_sd:
-                information = information - offset @ offset.T / (products[-1, -1] + offset_sd**-2)
+        likelihood, remaining = _planned(posterior, voltage), []
+        for position, gradient in zip(chosen, gradients, strict=True):
+            shapes = derivatives(position, np.concatenate([columns, new]), likelihood)
+            theta = prior.theta(prior.constrain(position[np.newaxis])[0])
+            information = _information(likelihood, theta, shapes, columns.size)
             # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
             inner = np.eye(len(factor)) + factor.T @ information @ factor
             after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
@@ -138,6 +136,31 @@ def promises(
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
         scores.append(Promise(name, float(np.mean(shares)), error))
     return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
+
+
+def _planned(posterior: Posterior, voltage: FloatArray) -> Likelihood:
+    """Return the likelihood of another record of one actuator, of which only readings are missing.
+
+    It starts as the one that was fitted.
+    """
+    nothing, whole = np.zeros(voltage.size), (slice(0, voltage.size),)
+    planned = replace(posterior.only, voltage=voltage, displacement=nothing, training=whole)
+    return planned.likelihood(posterior.engine)
+
+
+def _information(
+    likelihood: Likelihood, theta: FloatArray, shapes: FloatArray, count: int
+) -> FloatArray:
+    """Return that (count, count) of a record about the first of shapes (shapes, readings), um.
+
+    The sizes of the others are unknowns of the record, with standard normal priors.
+    """
+    nothing = np.zeros((1, shapes.shape[1]))
+    information = likelihood.score(theta, shapes, nothing).information[0]
+    known, across = information[:count, :count], information[:count, count:]
+    start = information[count:, count:] + np.eye(len(shapes) - count)
+    remaining: FloatArray = known - across @ np.linalg.solve(start, across.T)
+    return remaining
 
 
 def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:

@@ -211,8 +211,9 @@ class Design(Product, Sequence[Promise]):
             rows,
             records=[asdict(promise) for promise in self.promises],
             note="The error is that of Monte Carlo. Expected from the posterior's draws, with the "
-            "model made linear in its parameters at each: what a new record with an offset of its "
-            "own would add. A stretch that a signal drives several times counts once, because what "
-            "the model is wrong about returns with it.",
+            "model made linear in its parameters at each: what a fit would gain from a new record "
+            "with an offset and an initial state of its own (none where the record that was fitted "
+            "starts from rest). The noise model is trusted: what the model is wrong about returns "
+            "each time that a signal repeats itself.",
             on="both",
         )

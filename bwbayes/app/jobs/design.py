@@ -61,8 +61,8 @@ def design(
         or the ``Path`` of a record's file, or of a signal's name.
     candidates
         A TOML file with a table for each signal, or the preset. Its keys are those of a config's
-        [record.signal]. In Python also voltages (samples,) by name, V, from rest, at the fitted
-        record's interval (of several that whose voltage turns most).
+        [record.signal]. In Python also voltages (samples,) by name, V, at the fitted record's
+        interval (of several that whose voltage turns most), and starting as it does.
     voltage
         Lowest and highest voltage of the amplifier, V; default: what was fitted.
     slew

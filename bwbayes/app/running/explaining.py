@@ -154,10 +154,8 @@ def improve_model(
         if followed_causes(found) or not parts:
             break
         explanation = parts[0]
-        notes.append(f"model improved: {explanation.text} ({explanation.worth}); {explanation.fix}")
-        console.print(
-            f"added: {explanation.text} ({explanation.worth})", highlight=False, soft_wrap=True
-        )
+        notes.append(f"model improved: {explanation.text} ({explanation.worth})")
+        console.print(f"added: {explanation.text}", highlight=False, soft_wrap=True)
         config = problem.changed(config, explanation.changes, explanation.parameters)
     record = config.records[name]
     noted = record.model_copy(update={"remarks": [*(record.remarks or []), *notes]})
