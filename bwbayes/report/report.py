@@ -298,8 +298,8 @@ def _grids(table: Table, width: int) -> Iterator[Grid]:
             more = max(min(wanted[i] - least[i], spare), 0)
             spare -= more
             grid.add_column(escape(texts[i][0]), width=least[i] + more, overflow="fold")
-        for cells in zip(*(texts[i][1:] for i in shown), strict=True):
-            grid.add_row(*map(escape, cells))
+        for row in zip(*(texts[i][1:] for i in shown), strict=True):
+            grid.add_row(*map(escape, row))
         yield grid
 
 

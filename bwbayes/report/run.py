@@ -196,8 +196,8 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     ]
     if result.loops is not None:
         measured = tables.loops_table(result.loops)
-        titles = [row[0] for row in measured.rows]
-        terms = [pair for pair in LOOP_TERMS.items() if any(t.startswith(pair[0]) for t in titles)]
+        rows = [row[0] for row in measured.rows]
+        terms = [pair for pair in LOOP_TERMS.items() if any(r.startswith(pair[0]) for r in rows)]
         loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
         blocks.append(Section("Loops", loops, folded=False))
     if result.steps:
