@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
-from bwbayes.record.io.series import Series, Source
+from bwbayes.record.io.series import Clock, Series, Source
 from bwbayes.record.io.units import (
     COMMON_UNITS,
     QUANTITIES,
@@ -107,6 +107,7 @@ class FileColumn:
     name: str
     values: NDArray[Any]
     unit: str
+    clock: Clock | None = None
 
     def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
         """Return values in this column's unit in the package's."""
@@ -164,7 +165,8 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     """
     chosen = {q: _named(source, name, q) for q, name in naming.columns.items()}
     by_unit = _recognize(source, chosen, naming)
-    has_rate = naming.fs is not None or source.interval is not None
+    timed = [series for quantity, series in chosen.items() if quantity != "time"] or source.series
+    has_rate = naming.fs is not None or all(series.clock for series in timed)
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
     units = {q: naming.units.get(q) or _unit_of(s.label, s.unit, q) for q, s in chosen.items()}
     if "time" in units:
@@ -185,6 +187,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
             chosen[quantity].name,
             chosen[quantity].numbers(path, readings=quantity == "displacement"),
             unit,
+            chosen[quantity].clock,
         )
         for quantity, unit in units.items()
         if unit
@@ -211,6 +214,8 @@ def _named(source: Source, name: str, quantity: str) -> Series:
     """Return the series that a naming means: by its path, the end of its path, or its number."""
     exact = [s for s in source.series if s.name == name.strip()]
     matches = exact or [s for s in source.series if s.label == name.strip()]
+    if not matches:  # without its unit, which a reader may have appended
+        matches = [s for s in source.series if name.strip() == _bare(s.label, quantity)]
     if not matches and name.strip().isdecimal():
         matches = list(source.series[int(name) - 1 : int(name)]) if int(name) else []
     if len(matches) == 1:
@@ -256,11 +261,17 @@ def _likeness(label: str, unit: str, quantity: str) -> int | None:
     stated = {q: _unit_of(label, unit, q) for q in QUANTITIES}
     if any(stated.values()) and stated[quantity] is None:
         return None
-    ending = unit_in(label, quantity) or ""
-    bare = re.sub(rf"[\s_/.\-\[(]*{re.escape(ending)}[\])\s_]*$", "", label) if ending else label
-    if bare.strip().lower() in _WORDS[quantity] or word.lower() == quantity:
+    if _bare(label, quantity).lower() in _WORDS[quantity] or word.lower() == quantity:
         return 1
     return 2 if stated[quantity] else None
+
+
+def _bare(label: str, quantity: str) -> str:
+    """Return a name without the unit of the quantity at its end."""
+    unit = unit_in(label, quantity)
+    return (
+        re.sub(rf"[\s_/.\-\[(]*{re.escape(unit)}[\])\s_]*$", "", label).strip() if unit else label
+    )
 
 
 def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:

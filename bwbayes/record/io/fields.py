@@ -17,8 +17,10 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.record.io.clocks import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
+from bwbayes.record.io.series import Clock
 
 VoltageIs = Literal["command", "output"]
 """What a voltage column is: the command that a DAC holds, or the amplifier's output."""
@@ -52,6 +54,7 @@ def record_fields(
     InputWarning
         If samples are missing, or times scatter.
     """
+    table = align_clocks(table)
     _check_lengths(table)
     try:
         kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
@@ -191,9 +194,11 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
 def _grid(table: ColumnTable) -> tuple[ColumnTable, Grid]:
     if "time" in table.columns:
         return time_grid(table, _converted(table, "time"))
-    interval = 1 / table.naming.fs if table.naming.fs else table.source.interval or 0.0
-    require_plausible(table, interval, next(iter(table.columns.values())).values.size)
-    return table, Grid(table.source.start, interval)
+    column = next(iter(table.columns.values()))
+    stated, start, _ = column.clock or Clock(0.0)
+    interval = 1 / table.naming.fs if table.naming.fs else stated
+    require_plausible(table, interval, column.values.size)
+    return table, Grid(start, interval)
 
 
 def _without_gaps(

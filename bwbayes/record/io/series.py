@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,31 @@ RATES = {
 }
 
 
+class Clock(NamedTuple):
+    """When a series without a time column was sampled: every ``interval`` s, first at ``start``.
+
+    The ``start``, s, counts from the file's own zero or, where the file states one, from ``zero``.
+    """
+
+    interval: float
+    start: float = 0.0
+    zero: np.datetime64 | None = None
+
+    def delay(self, other: Clock) -> float:
+        """Return how much later than another series this one starts, s."""
+        delay = self.start - other.start
+        if self.zero is not None and other.zero is not None:
+            delay += float((self.zero - other.zero) / np.timedelta64(1, "ns")) / 1e9
+        return delay
+
+
 @dataclass(frozen=True)
 class Series:
     """A row of numbers: its path in the file, which begins with its group, and how to load it.
 
     ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values, and
-    ``load_readings``, if it is given, the same of which some may be missing: words are nan.
+    ``load_readings``, if it is given, the same of which some may be missing: words are nan. A
+    ``clock`` is what the file states in place of a time column.
     """
 
     name: str
@@ -44,6 +63,7 @@ class Series:
     unit: str = ""
     group: str = ""
     load_readings: Callable[[], NDArray[Any]] | None = None
+    clock: Clock | None = None
 
     @property
     def label(self) -> str:
@@ -79,16 +99,13 @@ class Source:
     """What a file holds.
 
     ``notes`` are what it says in words (`NOTES`), by the group of the series that they are of.
-    ``lines`` are those of the samples in a text file, from 1 on. ``interval`` and ``start``, s, are
-    those of a file that states them in place of a time column.
+    ``lines`` are those of the samples in a text file, from 1 on.
     """
 
     path: Path
     series: tuple[Series, ...]
     notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     lines: Sequence[int] = ()
-    interval: float | None = None
-    start: float = 0.0
 
     def stated_rate(self, default: float = 0.0) -> float:
         """Return the sampling rate, Hz, that is stated beside the series, or the default."""
@@ -169,13 +186,14 @@ def array_source(
     notes: Mapping[str, str] | None = None,
 ) -> Source:
     """Return arrays (samples,), or a row or a column, by name as a file called ``origin``."""
+    clock = None if interval is None else Clock(interval, start)
     series = [
-        Series(name, np.size(values), partial(_vector, values, origin, name))
+        Series(name, np.size(values), partial(_vector, values, origin, name), clock=clock)
         for name, values in arrays.items()
         if values is not None
     ]
     groups = {"": {"origin": origin, **(notes or {})}}
-    return Source(Path(origin), tuple(series), groups, interval=interval, start=start)
+    return Source(Path(origin), tuple(series), groups)
 
 
 def read_numpy(path: Path) -> Source:

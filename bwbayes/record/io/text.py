@@ -39,7 +39,7 @@ from bwbayes.record.io.layout import (
     find_layout,
     split_header,
 )
-from bwbayes.record.io.series import RATES, Series, Source, in_seconds
+from bwbayes.record.io.series import RATES, Clock, Series, Source, in_seconds
 from bwbayes.record.record import Record
 
 type Marks = tuple[str, str | None]
@@ -62,9 +62,10 @@ def read_text(path: Path) -> Source:
     InputWarning
         If lines above the header are skipped.
     """
-    text, interval = _decoded(path), None
+    text = _decoded(path)
+    clocks: dict[int, Clock] = {}
     if text.startswith("LabVIEW Measurement"):
-        text, interval = plain_lvm(path, text)
+        text, clocks = plain_lvm(path, text)
     lines = text.split("\n")
     # What programs write below the numbers is no sample, and shows that the last one is whole.
     is_whole = False
@@ -114,9 +115,13 @@ def read_text(path: Path) -> Source:
         stated = "s" if is_clock else unit
         load = partial(_numbers, path, frame[column], marks, name, numbers, is_clock=is_clock)
         series.append(
-            Series(name, len(body), load, stated, load_readings=partial(load, words=True))
+            Series(
+                *(name, len(body), load, stated),
+                load_readings=partial(load, words=True),
+                clock=clocks.get(column),
+            )
         )
-    return Source(path, tuple(series), {"": notes}, numbers, interval)
+    return Source(path, tuple(series), {"": notes}, numbers)
 
 
 def write_text(record: Record, path: Path) -> None:
