@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -12,8 +14,10 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from hypothesis import given
+from hypothesis import strategies as st
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io import matlab
 
@@ -286,3 +290,91 @@ def test_python_objects_in_an_archive_are_passed_over(tmp_path: Path) -> None:
     np.testing.assert_array_equal(VOLTAGE, read_record(tmp_path / "record.npz").voltage)
     np.save(tmp_path / "alone.npy", np.array([{}], dtype=object))
     assert fault(tmp_path / "alone.npy").startswith(": damaged or cut off (")
+
+
+@given(
+    st.sampled_from(["i2", "u2", "i4", "f4"]),
+    st.floats(0.01, 10),
+    st.floats(-50, 50),
+    st.sampled_from(["_FillValue", "missing_value"]),
+    st.sets(st.integers(0, SAMPLES - 1), max_size=10),
+)
+def test_packed_numbers_are_unpacked_and_their_marks_missing(
+    tmp_path_factory: pytest.TempPathFactory,
+    dtype: str,
+    scale: float,
+    offset: float,
+    mark: str,
+    missing: set[int],
+) -> None:
+    """As the CF conventions have it; a mark alone leaves all other numbers as they are."""
+    path = tmp_path_factory.getbasetemp() / "packed.nc"
+    packed = np.arange(100, 100 + SAMPLES).astype(dtype)
+    packed[[*missing]] = 9999
+    for attributes in (
+        {mark: packed.dtype.type(9999)},
+        {"scale_factor": scale, "add_offset": offset},
+    ):
+        with h5py.File(path, "w") as file:
+            file["time"], file["voltage_V"], file["displacement_um"] = TIME, VOLTAGE, packed
+            file["time"].attrs["units"] = "seconds since 2026-03-03"
+            file["displacement_um"].attrs.update({mark: packed.dtype.type(9999)} | attributes)
+        is_plain = "scale_factor" not in attributes
+        expected = packed.astype(float) if is_plain else scale * packed.astype(float) + offset
+        expected[[*missing]] = np.nan
+        np.testing.assert_array_equal(expected, read_record(path).displacement)
+
+
+WRITER = """
+import sys, h5py, numpy as np
+file = h5py.File(sys.argv[1], "w", libver="latest" if sys.argv[2] == "swmr" else None)
+for name in ("time_s", "voltage_V", "displacement_um"):
+    file[name] = np.arange(24.0)
+if sys.argv[2] == "swmr":
+    file.swmr_mode = True
+if sys.argv[2] != "open":
+    file.flush()
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("state", ["flushed", "swmr", "open"])
+def test_a_file_that_its_writer_holds_open_is_read_as_far_as_it_is_written(
+    tmp_path: Path, state: str
+) -> None:
+    path = tmp_path / "a.h5"
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path), state],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        if state == "open":
+            assert fault(path).startswith(": another program has it open, or ended without")
+        else:
+            with pytest.warns(InputWarning, match="another program has it open; what that has"):
+                assert SAMPLES == read_record(path).samples
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content.ljust(-(-len(content) // 8) * 8, b"\0")
+
+
+def test_a_matlab_object_is_named_with_how_to_save_it(tmp_path: Path) -> None:
+    """In version 5 and 7.3; the nameless array that MATLAB keeps of objects is no series."""
+    path = store(tmp_path, "mat", GOOD)
+    opaque = element(6, struct.pack("<II", 17, 0))
+    opaque += b"".join(element(1, text) for text in (b"log", b"MCOS", b"timetable"))
+    nameless = element(6, struct.pack("<II", 9, 0)) + element(5, struct.pack("<ii", 1, 24))
+    nameless += element(1, b"") + element(2, bytes(24))
+    path.write_bytes(path.read_bytes() + element(14, opaque) + element(14, nameless))
+    with pytest.warns(InputWarning, match=r"log: a MATLAB timetable.*timetable2table\(log\)"):
+        assert {*GOOD} == {series.name for series in matlab.read_mat(path).series}
+    path = store(tmp_path, "7.3", GOOD)
+    with h5py.File(path, "r+") as file:
+        file["log"] = np.zeros(6, dtype="u4")
+        file["log"].attrs.update({"MATLAB_class": np.bytes_("table"), "MATLAB_object_decode": 3})
+    with pytest.warns(InputWarning, match=r"log: a MATLAB table.*table2struct\(log"):
+        assert SAMPLES == read_record(path).samples

@@ -1,7 +1,8 @@
 """Records in HDF5 files: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
 Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
-says a dataset's unit, one like ``fs`` or ``dt`` how fast it was sampled; columns of a table or
+says a dataset's unit, one like ``fs`` or ``dt`` how fast it was sampled; packed numbers, as netCDF
+has them, are unpacked by ``scale_factor``, ``add_offset`` and ``_FillValue``; columns of a table or
 matrix are series of their own, ``table.u`` and ``log[2]``. Beside the datasets may stand
 ``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``, as attributes or, in MATLAB's
 files of version 7.3, as variables.
@@ -11,7 +12,9 @@ from __future__ import annotations
 
 import mmap
 import struct
+import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -20,7 +23,16 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.record.io.series import NOTES, RATES, Series, Source, note, vectors
+from bwbayes.errors import InputError, InputWarning
+from bwbayes.record.io.series import (
+    NOTES,
+    RATES,
+    Series,
+    Source,
+    note,
+    pass_over_object,
+    vectors,
+)
 from bwbayes.record.record import Record
 
 
@@ -38,7 +50,7 @@ def read_hdf5(path: Path) -> Source:
                     raise ValueError("a list in it has no end")
                 at = data.find(mark, at + 1)
     notes: dict[str, dict[str, str]] = {}
-    with h5py.File(path, "r") as file:
+    with _open(path, remark=True) as file:
         series = tuple(_series(path, file, notes, set()))
     return Source(path, series, notes)
 
@@ -100,6 +112,9 @@ def _series(
         is_text = "MATLAB_class" in item.attrs and _note(item.attrs, "MATLAB_class") == "char"
         if "MATLAB_empty" in item.attrs or item.shape is None:
             continue
+        if "MATLAB_object_decode" in item.attrs:
+            pass_over_object(path, name, _note(item.attrs, "MATLAB_class"))
+            continue
         if name in NOTES and is_text:
             codes = np.asarray(item[()], dtype="<u2")
             notes[prefix][name] = codes.tobytes().decode("utf-16-le", errors="replace")
@@ -109,6 +124,7 @@ def _series(
             stated = [key for key in item.attrs if key.lower() in RATES]
             notes[f"{prefix}{name}"] = {key: _note(item.attrs, key) for key in stated}
             unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
+            unit = unit.partition(" since ")[0]  # of dates: "seconds since 2026-03-03"
             load = partial(_loaded, path, item.name)
             yield from vectors(prefix, name, item.shape, item.dtype, load, unit)
     for item in items.values():
@@ -123,9 +139,61 @@ def _note(attributes: Any, name: str) -> str:
     return "" if is_list else note(attributes[name])
 
 
+def _open(path: Path, *, remark: bool = False) -> Any:
+    """Open a file to read it, even while another program writes it, as far as that is possible.
+
+    Raises
+    ------
+    InputError
+        Too little of it is written.
+
+    Warns
+    -----
+    InputWarning
+        If another program has it open, where a ``remark`` is wanted.
+    """
+    try:
+        return h5py.File(path, "r", locking="best-effort")
+    except OSError as error:
+        if not isinstance(error, BlockingIOError) and "already open" not in str(error):
+            raise
+    for swmr in (False, True):
+        with suppress(OSError, RuntimeError):
+            file = h5py.File(path, "r", locking=False, swmr=swmr)
+            if remark:
+                text = f"{path}: another program has it open; what that has not written is missing"
+                warnings.warn(text, InputWarning, stacklevel=5)
+            return file
+    problem = "another program has it open, or ended without closing it, and it is not complete"
+    raise InputError(f"{path}: {problem}; close it there, or run `h5clear -s` on it, and try again")
+
+
 def _loaded(path: Path, name: str) -> Any:
-    with h5py.File(path, "r") as file:
-        return file[name][()]
+    with _open(path) as file:
+        return _unpacked(file[name][()], file[name].attrs)
+
+
+def _unpacked(values: Any, attributes: Any) -> Any:
+    """Return packed numbers by the CF conventions: ``scale_factor * values + add_offset``.
+
+    Those equal to ``_FillValue`` or ``missing_value`` are nan. Source: CF 1.11, 2.5.1 and 8.1.
+    """
+    if values.dtype.kind not in "iuf":
+        return values
+    keys = ("scale_factor", "add_offset", "_FillValue", "missing_value")
+    stated = {
+        key: np.ravel(attributes[key])
+        for key in keys
+        if key in attributes and attributes.get_id(key).dtype.kind in "iuf"
+    }
+    marks = [mark for key in keys[2:] for mark in stated.get(key, ())]
+    is_missing = np.isin(values, marks)
+    if is_missing.any() or keys[0] in stated or keys[1] in stated:
+        scale, offset = (
+            float(stated.get(key, [d])[0]) for key, d in zip(keys, (1, 0), strict=False)
+        )
+        values = np.where(is_missing, np.nan, scale * values.astype(np.float64) + offset)
+    return values
 
 
 def _is_circle(data: mmap.mmap, base: int, heap: int) -> bool:

@@ -23,7 +23,15 @@ import scipy
 
 from bwbayes.errors import InputError
 from bwbayes.record.io.hdf5 import record_arrays, record_notes
-from bwbayes.record.io.series import MAXIMUM_SAMPLES, NOTES, Series, Source, note, vectors
+from bwbayes.record.io.series import (
+    MAXIMUM_SAMPLES,
+    NOTES,
+    Series,
+    Source,
+    note,
+    pass_over_object,
+    vectors,
+)
 from bwbayes.record.record import Record
 
 MatVersion = Literal["5", "7.3"]
@@ -34,7 +42,7 @@ _TYPES = {
     **{12: "i8", 13: "u8", 16: "u1", 17: "u2", 18: "u4"},
 }
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _CHAR = 1, 2, 4
+_CELL, _STRUCT, _CHAR, _OPAQUE = 1, 2, 4, 17
 _NUMERIC = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 _IS_LOGICAL, _IS_COMPLEX = 0x0200, 0x0800
 
@@ -62,7 +70,12 @@ def read_mat(path: Path) -> Source:
             ((kind, matrix),) = _elements(unpacked, order)  # noqa: PLW2901
         if kind != _MATRIX:
             raise ValueError(f"unknown element {kind}")
-        series += _series("", matrix, order, notes)
+        flags, *inner = _elements(matrix, order)
+        if struct.unpack_from(f"{order}I", flags[1])[0] & 0xFF == _OPAQUE:
+            name, _, class_name = (text.decode("latin-1") for _, text in inner[:3])
+            pass_over_object(path, name, class_name)
+        elif inner[1][1]:  # without a name is what MATLAB keeps of its objects
+            series += _series("", matrix, order, notes)
     return Source(path, tuple(series), {"": notes})
 
 

@@ -7,6 +7,7 @@ when they are needed, since a file may hold much else.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning, one_line
 
 MAXIMUM_SAMPLES = 10**8
 # What a file may say beside its numbers.
@@ -161,6 +162,21 @@ def note(value: Any) -> str:
     if isinstance(first, bytes):
         return first.decode("utf-8", errors="replace")
     return repr(float(first)) if np.asarray(first).dtype.kind in "iuf" else str(first)
+
+
+def pass_over_object(path: Path, name: str, kind: str) -> None:
+    """Say that a MATLAB object, as a table or a timeseries, is not read, and how to save it."""
+    struct = "s = table2struct({}, 'ToScalar', true)"
+    ways = {
+        "timeseries": f"s.Time = {name}.Time; s.Data = {name}.Data",
+        "table": struct.format(name),
+        "timetable": struct.format(f"timetable2table({name})"),
+    }
+    advice = "save its numbers as variables"
+    if kind in ways:
+        advice = f"{ways[kind]}; save('record.mat', '-struct', 's')"
+    text = f"{path}: {name}: a MATLAB {kind}, which only MATLAB reads, is left out; {advice}"
+    warnings.warn(one_line(text), InputWarning, stacklevel=5)
 
 
 def in_seconds(times: Any) -> NDArray[Any]:
