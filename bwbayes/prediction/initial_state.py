@@ -166,8 +166,8 @@ def estimate_initial_states(
     """
     training = posterior.only
     hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
-    low, high = training.span
-    span = Span(min(float(np.min(record.voltage)), low), max(float(np.max(record.voltage)), high))
+    (low, high), voltage = training.span, record.path.voltage
+    span = Span(min(float(np.min(voltage)), low), max(float(np.max(voltage)), high))
     actuator = replace(training.actuator, interval=record.interval, hold=hold, span=span)
     memory = training.noise.correlation_time(training.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
@@ -177,7 +177,7 @@ def estimate_initial_states(
         assert record.displacement is not None
         readings = Readings.of(record.displacement, [window])
     whole = Likelihood(
-        record.voltage,
+        voltage,
         readings,
         actuator,
         training.noise,

@@ -116,7 +116,7 @@ def forecast(
     planned = np.asarray(voltage, dtype=np.float64)
     if planned.ndim != 1 or planned.size == 0 or not np.isfinite(planned).all():
         raise InputError(f"{name}: voltage of shape {planned.shape}; give one finite row, in V")
-    joined = np.concatenate([record.voltage, planned])
+    joined = np.concatenate([record.path.voltage, planned])
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
@@ -195,7 +195,7 @@ def _bands(
 
     begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
     with ThreadPoolExecutor(threads) as executor:
-        for simulated in start.pieces(record.voltage[: window.stop], PIECE):
+        for simulated in start.pieces(record.path.voltage[: window.stop], PIECE):
             first, begin = max(begin, window.start), begin + simulated.shape[1]
             if begin <= first:
                 continue
@@ -213,7 +213,7 @@ def _bands(
     return Bands(
         name=name,
         time=record.time[window],
-        voltage=record.voltage[window],
+        voltage=record.path.voltage[window],
         measured=None if record.displacement is None else record.displacement[window],
         truth=None if record.truth is None else record.truth[window],
         mean=joined["mean"],

@@ -69,7 +69,7 @@ class StepResponse:
 
 def step_of(record: Record) -> Step | None:
     """Return the step from zero that a record's voltage is, or None if it is something else."""
-    voltage = record.voltage
+    voltage = record.path.voltage
     height = float(np.median(voltage[voltage.size // 2 :]))
     slack = 0.02 * abs(height)
     up = np.abs(voltage - height) <= slack

@@ -13,6 +13,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -24,6 +25,7 @@ from bwbayes.record.io.fields import VoltageIs, record_fields, require_voltage_i
 from bwbayes.record.io.grid import clock
 from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.record.io.units import QUANTITIES
+from bwbayes.record.voltage_path import VoltagePath, estimate_path
 from bwbayes.shown import brief
 
 Window = tuple[float, float]
@@ -199,6 +201,16 @@ class Record:
     def samples(self) -> int:
         """Number of samples."""
         return self.voltage.size
+
+    @cached_property
+    def path(self) -> VoltagePath:
+        """The voltage that drives a model: the measured one without its noise.
+
+        A command, and a planned voltage without a displacement, have no noise.
+        """
+        if self.voltage_is == "command" or self.displacement is None:
+            return VoltagePath(self.voltage)
+        return estimate_path(self.voltage)
 
     @property
     def time(self) -> FloatArray:

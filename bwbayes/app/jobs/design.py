@@ -86,7 +86,7 @@ def design(
     # Of several records, what all of them taught of the actuator, seen from the one whose voltage
     # turns most: the new one is to be alike.
     records = problem.records
-    record = max(records, key=lambda name: turning_points(records[name].voltage).size)
+    record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
     signals = candidates_of(candidates, records[record], amplifier)
     quantity: str | FloatArray
     parameter, drive = None, None

@@ -82,7 +82,7 @@ def contexts_of(
     Raises InputError: voltage or displacement does not vary there, in any of them.
     """
     ranges = {
-        name: ranges_of(record.voltage, readings_of(record), record.interval, training[name])
+        name: ranges_of(record.path.voltage, readings_of(record), record.interval, training[name])
         for name, record in records.items()
     }
     varied = [
@@ -248,8 +248,8 @@ def actuator_of(model: ActuatorConfig, record: Record, records: Sequence[Record]
     hold: Hold = "zero" if record.voltage_is == "command" else "first"
     if isinstance(model, ModelConfig) and model.hold != "auto":
         hold = model.hold
-    ranges = [record.range_voltage for record in records]
-    span = Span(min(low for low, _ in ranges), max(high for _, high in ranges))
+    paths = [record.path.voltage for record in records]
+    span = Span(float(min(map(np.min, paths))), float(max(map(np.max, paths))))
     stated = {name: getattr(model, name) for name in OPTIONS}
     options = {name: tuple(v) if isinstance(v, list) else v for name, v in stated.items()}
     creep = None

@@ -106,6 +106,8 @@ class Problem:
         """What to know of the records, one line each."""
         sources = self.config.records
         remarks = [text for source in sources.values() for text in source.remarks or ()]
+        measured = {**self.records, **self.others}
+        remarks += [f"{n}: {r.path.remark}" for n, r in measured.items() if r.path.remark]
         remarks += [
             f"{name}: {finding}" for name, all_ in self.findings.items() for finding in all_
         ]
@@ -178,7 +180,8 @@ class Problem:
         for name, validation in self.validations.items():
             record, windows = validation.record or self.records[validation.of], validation.windows
             window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
-            found[name] = beyond_training(self.posterior, record.voltage, record.interval, window)
+            voltage = record.path.voltage
+            found[name] = beyond_training(self.posterior, voltage, record.interval, window)
         return found
 
     def reconfigured(
@@ -300,7 +303,7 @@ def _posterior(
         actuator = actuator_of(config.model, record, list(records.values()))
         datasets.append(
             Dataset(
-                record.voltage,
+                record.path.voltage,
                 readings_of(record),
                 training[name],
                 actuator,

@@ -129,13 +129,14 @@ def predict_another(problem: Problem, flat: FloatArray, other: Validation, name:
     """
     assert other.record is not None
     posterior = problem.posterior
-    beyond = beyond_training(posterior, other.record.voltage, other.record.interval)
+    path = other.record.path
+    beyond = beyond_training(posterior, path.voltage, other.record.interval)
     subset = thinned(flat, generator(problem.config.seed, "draws"))
     bands = _of_another(problem, subset, other, name, beyond)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
-    remarks = tuple(finding.note for finding in beyond)
+    remarks = (*[path.remark] * bool(path.remark), *(finding.note for finding in beyond))
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
 
 
@@ -148,7 +149,7 @@ def predict_after(
     in :func:`predict_another`; see :func:`~bwbayes.prediction.prediction.forecast`.
     """
     seed, record = problem.config.seed, problem.records[of]
-    joined = np.concatenate([record.voltage, voltage])
+    joined = np.concatenate([record.path.voltage, voltage])
     after = slice(record.samples, None)
     beyond = beyond_training(problem.posterior, joined, record.interval, after)
     subset = thinned(flat, generator(seed, "draws"))

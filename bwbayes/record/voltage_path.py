@@ -1,0 +1,338 @@
+"""The path of a measured voltage: what is left of it without the noise of its reading.
+
+Rate-independent hysteresis, dh = α du − β |du| h − γ du |h|, remembers every reversal of its input.
+White noise of the sd s on the reading of a voltage u adds a path of 2 s / √π per sample, and erases
+memory that the actuator still has. What counts of a path is which reversals are real, how high they
+are, and that it is monotone between them:
+
+1. The noise's sd comes from differences of rising order p, sd(Δᵖ u) = s √C(2p, p) for noise alone:
+   the share of a smooth voltage dies out. While the estimates still fall, no noise can be told.
+2. Local quadratics over windows of 4, 8, 16, ... samples to the left, to the right and around each
+   sample, each as long as the intervals of all windows so far intersect (Goldenshluger and
+   Nemirovski, Math. Methods Stat. 6 (1997) 135; Katkovnik, IEEE Trans. Signal Process. 47 (1999)
+   2567), joined by their precision. Where the sides contradict each other, the sd grows.
+3. A reversal is real if it goes beyond √(2 ln n), the largest of n normal deviates, times the sds
+   of the two samples that it is between.
+4. Between reversals the path is the isotonic regression of the fits. The samples about an extreme
+   that their mean describes become this mean, or a parabola, where that is the more certain.
+5. Lines of the residual's spectrum, such as mains hum, move the actuator too: they are set aside
+   before and added again. Hum of the monitor alone cannot be told from them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb, log, sqrt
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.shown import brief
+
+# Sds: half the intervals of windows that have to intersect, and how far the mean of the samples
+# about an extreme may lie from the outermost of them.
+WITHIN, ABOUT = 1.5, 3.0
+
+# Parts of the range: what seems noise beyond the first is a voltage that changes too fast for its
+# sampling; from the second on the path is not known well enough for parameters.
+LARGEST, REPAIRABLE = 0.03, 0.005
+
+# The same of a step to which the voltage is rounded: a hold's level is known to half of it.
+COARSE = 0.003
+
+# Excess of path that does no harm, as a part of the path; of what is in doubt, in sds.
+HARMLESS, DOUBTFUL = 1e-3, 3.0
+
+# Fewer samples show no noise.
+FEWEST = 50
+
+# Spectral lines that are set aside, and rounds to find them.
+LINES, ROUNDS = 3, 8
+
+
+@dataclass(frozen=True)
+class VoltagePath:
+    """The voltage that moves the actuator, as far as its reading shows it.
+
+    ``voltage`` (samples,), V, is the measured one bit for bit where noise adds nothing to its path.
+    ``noise_sd``, V, is the sd of the noise on it (0: none was found, or nothing to find it by),
+    ``reversals`` the number of its reversals that are real, where there is noise, and ``remark``
+    what to know of it, if anything.
+    """
+
+    __repr__ = brief
+
+    voltage: FloatArray
+    noise_sd: float = 0.0
+    reversals: int = 0
+    remark: str = ""
+
+
+def estimate_path(voltage: FloatArray) -> VoltagePath:
+    """Estimate the path of a measured voltage (samples,), V, under white noise of unknown sd.
+
+    A voltage whose reversals are all real comes back bit for bit, and so does one that changes too
+    fast for its sampling, with a remark. The path of a u + b is a times that of u, plus b.
+    """
+    low, high = float(np.min(voltage)), float(np.max(voltage))
+    extent, center = high - low, (high + low) / 2
+    if voltage.size < FEWEST or extent == 0:
+        return VoltagePath(voltage)
+    u = voltage - center
+    step = rounding_step(u)
+    hum, frequencies, last = np.zeros_like(u), list[float](), 0.0
+    for searched in range(ROUNDS):
+        sd, settled = noise_sd(u - hum)
+        # To round is monotone: that alone adds no reversal.
+        if sd == 0 or (settled and sd < 1.1 * step / sqrt(12)):
+            return VoltagePath(voltage)
+        fitted = _fit(u - hum, max(sd, step / 2))
+        # The first and the last may not have shown yet that they are real.
+        if settled and not searched and turns(u) <= fitted.reversals + 1:
+            return VoltagePath(voltage, sd, fitted.reversals)
+        residual = u - hum - fitted.path
+        frequency = _line(residual, sd)
+        known = any(abs(frequency - other) < 6 / u.size for other in frequencies)
+        if not frequency or (len(frequencies) == LINES and not known):
+            break
+        frequencies += [] if known else [frequency]
+        phases = np.outer(np.arange(u.size), frequencies)
+        waves = np.hstack([np.cos(phases), np.sin(phases)])
+        more = waves @ np.linalg.lstsq(waves.T @ waves, waves.T @ residual)[0]
+        size = float(np.std(more))
+        if sqrt(2) * size < step / np.pi:  # the error of rounding a ramp has such a line
+            break
+        # The path follows a part of the hum, so what is left of it falls by one factor each time.
+        left = size / last if known and last else 0.0
+        last = 0.0 if left else size
+        hum = hum + (more / (1 - left) if left < 0.95 else more)
+    if not settled:
+        remark = "voltage changes too fast for its sampling to tell its noise: none is removed"
+        return VoltagePath(voltage, remark=remark)
+    path = fitted.path + hum
+    shown = f"noise of {sd:.2g} V SD ({100 * sd / extent:.2g}% of its range)"
+    length = _length(path)
+    excess = _length(u) - length
+    if excess <= max(HARMLESS * length, DOUBTFUL * fitted.length_sd):
+        left_in = f"voltage may have {shown}, which cannot be told from the drive: none is removed"
+        return VoltagePath(voltage, sd, fitted.reversals, left_in * (excess > HARMLESS * length))
+    remark = (
+        f"voltage has {shown}: the model is driven by its estimated path, with {fitted.reversals} "
+        f"reversals for {turns(u)}"
+    )
+    if sd > REPAIRABLE * extent or step > COARSE * extent:
+        remark = (
+            f"voltage has {shown}, too much to repair: do not trust the parameters; measure the "
+            'voltage with less noise, or give the command (voltage_is = "command")'
+        )
+    return VoltagePath(path + center, sd, fitted.reversals, remark)
+
+
+def rounding_step(voltage: FloatArray) -> float:
+    """Return the step of which all differences of a voltage are multiples, V, or 0."""
+    gaps = np.diff(np.unique(voltage))
+    gaps = gaps[gaps > 1e-6 * np.ptp(voltage)]  # not the rounding of doubles
+    if gaps.size < 2:
+        return 0.0
+    multiples = gaps / gaps.min()
+    return float(gaps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0
+
+
+def noise_sd(voltage: FloatArray) -> tuple[float, bool]:
+    """Return the sd of the white noise on a voltage, V, and whether it is that: see step 1.
+
+    If not, the voltage changes too fast for its sampling, and the noise's sd may be less.
+    """
+    extent, orders, sds = float(np.ptp(voltage)), range(4, 11), list[float]()
+    differences = np.diff(voltage, orders[0] - 1)
+    for order in orders:
+        differences = np.diff(differences)
+        # A median, as corners and steps are few.
+        sd = float(np.median(np.abs(differences))) / 0.6745 / sqrt(comb(2 * order, order))
+        sds.append(sd)
+    if sds[-1] < 1e-9 * extent:
+        return 0.0, True
+    if sds[-1] < 0.8 * sds[-3]:  # it still falls
+        return (0.0, True) if sds[-1] < 1e-4 * extent else (sds[-1], False)
+    return min(sds), min(sds) < LARGEST * extent
+
+
+def turns(voltage: FloatArray) -> int:
+    """Return how often a voltage turns."""
+    steps = np.diff(voltage)
+    return int(np.count_nonzero(np.diff(np.sign(steps[steps != 0]))))
+
+
+def _length(path: FloatArray) -> float:
+    return float(np.sum(np.abs(np.diff(path))))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A path (samples,) between so many reversals, and the sd of its length at the most, V."""
+
+    path: FloatArray
+    reversals: int
+    length_sd: float
+
+
+def _fit(voltage: FloatArray, noise_sd: float) -> _Fit:
+    """Return the path of a voltage with white noise: see steps 2 to 4."""
+    fits, sd, agreeing_sd = _local_fits(voltage, noise_sd)
+    extrema, first_is_top = _real_reversals(fits, sqrt(2 * log(voltage.size)) * sd)
+    weights = 1 / sd**2
+    path = _monotone(fits, extrema, first_is_top, weights)
+    path = _leveled(voltage, path, noise_sd, agreeing_sd, extrema, first_is_top)
+    path = _monotone(path, extrema, first_is_top, weights)
+    return _Fit(path, extrema.size, float(2 * np.sum(agreeing_sd[extrema])))
+
+
+class _Side:
+    """The local fits (samples,) of windows to one side, as long as their intervals intersect."""
+
+    def __init__(self, voltage: FloatArray, noise_sd: float) -> None:
+        self.fit = voltage.copy()
+        self.variance = np.full(voltage.size, noise_sd**2)
+        self.low, self.high = voltage - WITHIN * noise_sd, voltage + WITHIN * noise_sd
+        self.open = np.ones(voltage.size, dtype=np.bool_)
+
+    def lengthen(self, samples: slice, fit: FloatArray, variance: float) -> bool:
+        """Take the fits of longer windows, where they agree; return whether any does."""
+        low = np.maximum(self.low[samples], fit - WITHIN * sqrt(variance))
+        high = np.minimum(self.high[samples], fit + WITHIN * sqrt(variance))
+        agrees: BoolArray = self.open[samples] & (low <= high)
+        self.open[:] = False
+        self.open[samples], self.low[samples], self.high[samples] = agrees, low, high
+        self.fit[samples] = np.where(agrees, fit, self.fit[samples])
+        self.variance[samples] = np.where(agrees, variance, self.variance[samples])
+        return bool(agrees.any())
+
+
+def _local_fits(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return fits (samples,) to a voltage, their sds, and what these are where the sides agree, V.
+
+    A window of m samples has the orthogonal polynomials 1, x and x² − q about its center, whose
+    coefficients are sums of u, j u and j² u over it: those of two windows of half its length.
+    """
+    sides = [_Side(voltage, noise_sd) for _ in range(3)]
+    sum0, sum1, sum2 = voltage, np.zeros(voltage.size), np.zeros(voltage.size)
+    m, lengthened = 1, True
+    while lengthened and 2 * m <= voltage.size:
+        windows = sum0.size - m
+        sum2 = sum2[:windows] + sum2[m:] + 2 * m * sum1[m:] + m * m * sum0[m:]
+        sum1 = sum1[:windows] + sum1[m:] + m * sum0[m:]
+        sum0 = sum0[:windows] + sum0[m:]
+        m *= 2
+        if m < 4:
+            continue
+        center, quadratic = (m - 1) / 2, m >= 8
+        norm1, q = m * (m * m - 1) / 12, (m * m - 1) / 12
+        norm2 = m * (m * m - 1) * (m * m - 4) / 180
+        mean, slope = sum0 / m, (sum1 - center * sum0) / norm1
+        bend = (sum2 - 2 * center * sum1 + (center**2 - q) * sum0) / norm2
+        lengthened = False
+        for side, at in zip(sides, (0, m - 1, m // 2) if quadratic else (0, m - 1), strict=False):
+            x = at - center
+            fit, variance = mean + slope * x, 1 / m + x * x / norm1
+            if quadratic:
+                fit, variance = fit + bend * (x * x - q), variance + (x * x - q) ** 2 / norm2
+            samples = slice(at, at + windows)
+            lengthened |= side.lengthen(samples, fit, noise_sd**2 * variance)
+    weight = sum(1 / side.variance for side in sides)
+    fits = sum(side.fit / side.variance for side in sides) / weight
+    apart = sum((side.fit - fits) ** 2 / side.variance for side in sides) / weight
+    least = np.minimum.reduce([side.variance for side in sides])
+    return fits, np.sqrt(least + apart), np.sqrt(least)
+
+
+def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, bool]:
+    """Return the samples of the real reversals, and whether the first is a top: see step 3.
+
+    The first of them is the extreme that the path begins at.
+    """
+    reached_above, reached_below = (fits - margin).tolist(), (fits + margin).tolist()
+    found: list[int] = []
+    top = bottom = direction = 0
+    first_is_top = False
+    for i in range(1, fits.size):
+        if direction >= 0 and reached_above[i] > reached_above[top]:
+            top = i
+        if direction <= 0 and reached_below[i] < reached_below[bottom]:
+            bottom = i
+        if direction <= 0 and reached_above[i] > reached_below[bottom]:
+            found.append(bottom)
+            direction, top = 1, i
+        elif direction >= 0 and reached_below[i] < reached_above[top]:
+            first_is_top = first_is_top or not found
+            found.append(top)
+            direction, bottom = -1, i
+    return np.array(found, dtype=np.int64), first_is_top
+
+
+def _monotone(
+    path: FloatArray, extrema: IntArray, first_is_top: bool, weights: FloatArray
+) -> FloatArray:
+    """Return the weighted isotonic regression of a path between its extrema."""
+    if not extrema.size:
+        return np.full_like(path, np.average(path, weights=weights))
+    result, rising, start = np.empty_like(path), first_is_top, 0
+    for end in [*extrema.tolist(), path.size - 1]:
+        # Each extreme belongs to the branch behind it.
+        branch = slice(start, end + 1)
+        fitted = isotonic_regression(path[branch], weights=weights[branch], increasing=rising)
+        result[branch] = fitted.x
+        rising, start = not rising, end
+    return result
+
+
+def _leveled(
+    voltage: FloatArray,
+    path: FloatArray,
+    noise_sd: float,
+    sd: FloatArray,
+    extrema: IntArray,
+    first_is_top: bool,
+) -> FloatArray:
+    """Return a path with the samples about each extreme at one level or a parabola: see step 4."""
+    result, is_top = path.copy(), first_is_top
+    bounds = np.concatenate([[0], extrema, [path.size - 1]])
+    for before, extremum, after in zip(bounds, extrema, bounds[2:], strict=False):
+        away = np.abs(path[before : after + 1] - path[extremum])
+        nearest = np.argsort(away, kind="stable")
+        count = np.arange(1, nearest.size + 1)
+        outermost = away[nearest] - np.cumsum(away[nearest]) / count
+        inside = nearest[: np.flatnonzero(outermost <= ABOUT * noise_sd / np.sqrt(count))[-1] + 1]
+        part = slice(before + inside.min(), before + inside.max() + 1)
+        near = voltage[part]
+        level, error = np.full(near.size, np.mean(near)), noise_sd / sqrt(near.size)
+        x = np.arange(near.size) - (near.size - 1) / 2
+        bend = x * x - (near.size**2 - 1) / 12
+        if near.size >= 5 and (bend @ near) * (-1 if is_top else 1) > 3 * noise_sd * sqrt(
+            bend @ bend
+        ):
+            level += (bend @ near) / (bend @ bend) * bend + (x @ near) / (x @ x) * x
+            error *= 1.5
+        if near.size >= 3 and error < sd[extremum]:
+            result[part] = level
+        is_top = not is_top
+    return result
+
+
+def _line(residual: FloatArray, noise_sd: float) -> float:
+    """Return the strongest line of a residual, rad per sample, or 0: 20 times its surroundings."""
+    n = residual.size
+    if n < 300:
+        return 0.0
+    power = np.abs(np.fft.rfft(residual * np.hanning(n))) ** 2 / (0.375 * n * noise_sd**2)
+    first = n // 200 + 20
+    k = first + int(np.argmax(power[first:]))
+    near = np.median(power[max(k - 40, 1) : k + 41])
+    if power[k] < max(12 + log(n), 20 * near):
+        return 0.0
+    # Between the bins, by sums over parts along which a wave of the bin is off by little.
+    parts = np.arange(0, n, max(n // 256, 1))
+    sums = np.add.reduceat(residual * np.exp(-2j * np.pi * k / n * np.arange(n)), parts)
+    offsets = 2 * np.pi / n * np.linspace(-1, 1, 81)
+    sizes = np.abs(np.exp(-1j * np.outer(offsets, parts)) @ sums)
+    return float(2 * np.pi * k / n + offsets[int(np.argmax(sizes))])

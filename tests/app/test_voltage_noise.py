@@ -1,0 +1,70 @@
+"""Noise on a record's voltage: the model is driven without it, the record stays as measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record, predict_windows
+from bwbayes.record import Record, write_record
+from tests.record.drives import drive
+
+TEXT = (
+    '[record]\nfile = "noisy.h5"\n[validation.next]\nfile = "next.h5"\n[model]\nnoise = "white"\n'
+)
+
+
+def noisy_record(seed: int, **options: object) -> Record:
+    """Return a record of a straight actuator whose voltage has noise of 0.2% of its range."""
+    rng = np.random.default_rng(seed)
+    clean = 90 * drive("decaying sine", 500.0, rng)
+    measured = clean + 0.18 * rng.standard_normal(clean.size)
+    reading = 0.1 * clean + 0.01 * rng.standard_normal(clean.size)
+    return Record(measured, reading, 0.002, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_record(noisy_record(1), tmp_path / "noisy.h5")
+    write_record(noisy_record(2), tmp_path / "next.h5")
+    return tmp_path
+
+
+def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder: Path) -> None:
+    problem = resolve(parse(TEXT, "my.toml"), folder)
+    record, measured = problem.record, noisy_record(1)
+    np.testing.assert_array_equal(record.voltage, measured.voltage)
+    assert record.sha256 == measured.sha256
+    np.testing.assert_array_equal(problem.posterior.only.voltage, record.path.voltage)
+    assert np.std(record.path.voltage - record.voltage) > 0.1
+    said = [remark for remark in problem.remarks if "voltage has noise of 0.1" in remark]
+    assert [remark.split(":")[0] for remark in said] == ["record", "next"]
+    draws = problem.posterior.prior.draw(np.random.default_rng(0), 20)
+    rng = np.random.default_rng(0)
+    (bands,) = predict_windows(problem.posterior, draws, record, {"all": slice(0, 5000)}, rng)
+    np.testing.assert_array_equal(bands.voltage, record.path.voltage)
+    other = noisy_record(2)
+    bands = predict_record(problem.posterior, draws, other, Start(from_rest=True), rng)
+    np.testing.assert_array_equal(bands.voltage, other.path.voltage)
+
+
+def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folder: Path) -> None:
+    problem = resolve(parse(TEXT, "my.toml"), folder)
+    kept = RunFolder.create(folder / "run", problem, overwrite=False)
+    again = RunFolder.open(kept.path).problem()
+    np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
+    np.testing.assert_array_equal(again.posterior.only.voltage, problem.posterior.only.voltage)
+    assert again.remarks == problem.remarks
+
+
+def test_a_command_is_what_it_says(folder: Path) -> None:
+    text = TEXT.replace('"noisy.h5"\n', '"noisy.h5"\nvoltage_is = "command"\n')
+    problem = resolve(parse(text, "my.toml"), folder)
+    np.testing.assert_array_equal(problem.posterior.only.voltage, problem.record.voltage)
+    assert not any(remark.startswith("record: voltage has") for remark in problem.remarks)
