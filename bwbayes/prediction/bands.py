@@ -49,18 +49,18 @@ class LeadIn:
 class Bands:
     """Pointwise bands along one stretch of samples.
 
-    All arrays are (samples,): ``time`` in s, ``voltage`` (the record's path) in V, the others in
-    um; ``measured`` and ``truth`` (the noise-free displacement) are None where there is none.
-    ``lower`` and ``upper`` hold a band's edges by kind and level. ``pit`` is the probability integral
-    transform of each reading under the sensor's distribution, ``crps`` its continuous ranked
-    probability score in um, ``log_score`` the log of its density there, nats; all None without a
-    measurement. Samples before ``scored_from`` served to estimate the record's offset and are not judged. ``interval``
+    All arrays are (samples,): ``time`` in s, ``voltage`` in V, the others in um; ``measured`` and
+    ``truth`` (the noise-free displacement) are None where there is none. ``lower`` and ``upper``
+    hold a band's edges by kind and level. ``pit`` is the probability integral transform of each
+    reading under the sensor's distribution, ``crps`` its continuous ranked probability score in
+    um, ``log_score`` the log of its density there, nats; all None without a measurement. Samples
+    before ``scored_from`` served to estimate the record's offset and are not judged. ``interval``
     is the sampling interval in s; ``training`` says that the samples were fitted to. ``lead_in``
     says how well the lead-in fits, if there was one. ``inside`` (samples,) tells which samples the
     bands are about, where they are several windows of a record: the others have no reading here.
     ``time_offset`` is what the file's own clock adds to the times, s; ``common_sd`` the sd of what
     the parameters leave unsure of all samples alike, as an offset does, um; ``separate`` says that
-    it is another record than any that was fitted.
+    it is another record than any that was fitted. The voltage is the path that drives the model.
     """
 
     __repr__ = brief
