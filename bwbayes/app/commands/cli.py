@@ -9,6 +9,7 @@ Commands that build on a run end with the status of that run.
 from __future__ import annotations
 
 import gc
+import io
 import os
 import signal
 import sys
@@ -133,6 +134,10 @@ def main() -> None:
     # To load libraries and to compile makes hundreds of thousands of objects that stay: to look for
     # garbage among them again and again would take a twentieth of a run.
     gc.set_threshold(50_000, 1_000)
+    # A code page may lack a character of a text, and no text is worth a traceback.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     # A polite request to stop ends a run as Ctrl-C does.
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # nohup ignores it
