@@ -158,7 +158,7 @@ def compare_models(
         runs = [
             (name, folders[name], future)
             for name, values in criteria.items()
-            if not screen or folders[name].summary.is_file() or np.any(values >= within_reach)
+            if not screen or folders[name].numbers() or np.any(values >= within_reach)
         ]
         for candidate in batch(_sampled, runs, kind="models sampled", **together):
             candidates[candidate.name] = candidate
@@ -267,7 +267,7 @@ def _screened(name: str, folder: RunFolder) -> Candidate:
 
 def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     """Sample a model to its end, from wherever it stands, and say what it is worth."""
-    is_finished = folder.summary.is_file()
+    is_finished = bool(folder.numbers())
     quiet = Console(quiet=True)
     fit = finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
     with open_executor(1, fit.problem.posterior.engine) as pool:

@@ -182,15 +182,19 @@ class RunFolder(Folder):
         return resolve(load(self.config), self.path)
 
     def numbers(self) -> dict[str, Any]:
-        """Return the numbers of its summary; none as long as it is not finished."""
-        if not self.summary.is_file():
+        """Return the numbers of its summary; none as long as it is not finished.
+
+        A summary that is cut off, as on a full disk, is none.
+        """
+        try:
+            numbers = json.loads(self.summary.read_bytes())
+        except (FileNotFoundError, ValueError):
             return {}
-        numbers: dict[str, Any] = json.loads(self.summary.read_text(encoding="utf-8"))
-        return numbers
+        return numbers if isinstance(numbers, dict) else {}
 
     def require_finished(self) -> None:
         """Raise an InputError if the run is not finished."""
-        if not self.summary.is_file():
+        if not self.numbers():
             raise InputError(f"{self.path}: is not finished; resume with {self.resuming}")
 
 

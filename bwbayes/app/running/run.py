@@ -114,7 +114,7 @@ def resume(
         )
         if answer is not None:
             answer(fit)
-        if files and not folder.summary.exists():
+        if files and not folder.numbers():
             with ProgressLine(console, "writing figures and files ..."):
                 write_files(fit, folder, artist)
     return fit
