@@ -36,7 +36,7 @@ from typing import Any, Literal
 import cloudpickle
 from threadpoolctl import threadpool_limits
 
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.engine import Engine
 
 # What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
@@ -90,8 +90,18 @@ def open_executor(
             yield pool
     elif kind == "processes":
         with processes(count) as pool:
-            yield pool
-    else:
+            if pool is not None:
+                yield pool
+                return
+        # The result is the same on any number of workers.
+        warnings.warn(
+            "no worker process starts, so that this one computes alone; put a script's calls "
+            'under `if __name__ == "__main__":`, and see that /dev/shm is writable',
+            InputWarning,
+            stacklevel=2,
+        )
+        kind, count = "threads", 1
+    if kind == "threads":
         threads = ThreadPoolExecutor(count)
         try:
             yield threads
@@ -124,19 +134,28 @@ def _kind_of(executor: str | None) -> tuple[str, str]:
 
 
 @contextmanager
-def processes(count: int, method: Literal["spawn", "fork"] = "spawn") -> Iterator[ByValue]:
+def processes(count: int, method: Literal["spawn", "fork"] = "spawn") -> Iterator[ByValue | None]:
     """Give an executor with processes, which end at once if whoever has it is interrupted.
+
+    None where no process starts: without semaphores, or from a script without a main guard.
 
     "spawn" starts Python in each; "fork" copies this process as it is, at once and with all that it
     has loaded, which only a process without other threads may do.
     """
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context(method), _settle)
+    # A worker that still loads its parent's script, which has no main guard and calls this again.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        os._exit(1)
+    try:
+        pool = ProcessPoolExecutor(count, multiprocessing.get_context(method), _settle)
+    except (ImportError, NotImplementedError, OSError):
+        yield None
+        return
     try:
         with warnings.catch_warnings():
             # Python warns of any thread; those of the linear algebra library stop for a fork.
             warnings.filterwarnings("ignore", ".*multi-threaded", DeprecationWarning)
-            _start(pool, count)
-        yield ByValue(pool)
+            started = _starts(pool, count)
+        yield ByValue(pool) if started else None
     except BaseException:
         # Whoever is interrupted does not wait for the end of what nobody will read.
         for process in [*(pool._processes or {}).values()]:
@@ -180,19 +199,29 @@ def one_thread() -> AbstractContextManager[object]:
     return limited
 
 
-def _start(pool: Executor, count: int) -> None:
+def _starts(pool: Executor, count: int) -> bool:
     """Start workers that ignore the signals that stop a run: its own process handles those.
+
+    Returns whether one has started.
 
     Without that, Ctrl-C would kill the workers first, or while they start make each complain.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    stopping = {signal.SIGINT, signal.SIGTERM}
+    blocks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, stopping) if blocks else set()
     try:
-        for _ in range(count):  # each starts a worker, which inherits what is blocked
-            pool.submit(os.getpid)
+        # Each starts a worker, which inherits what is blocked.
+        first, *_ = [pool.submit(os.getpid) for _ in range(count)]
+    except (BrokenExecutor, OSError):
+        return False
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if blocks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        first.result()
+    except BrokenExecutor:
+        return False
+    return True
 
 
 def _settle() -> None:
