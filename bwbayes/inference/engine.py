@@ -8,6 +8,7 @@ that is there.
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from typing import Literal
 
@@ -23,13 +24,17 @@ def choose(choice: EngineChoice = "auto") -> Engine:
     Raises
     ------
     InputError
-        ``choice`` is not an engine, or is ``"numba"`` where numba is not installed.
+        ``choice`` is not an engine, or is ``"numba"`` where numba is not installed or switched off.
     """
     if choice not in ("auto", "numpy", "numba"):
         raise InputError(f"engine: {choice!r} is unknown; write one of auto, numpy, numba")
     installed = find_spec("numba") is not None
+    # Numba's own switch; what is compiled would then be walked through by Python.
+    disabled = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
     if choice == "numba" and not installed:
         raise InputError(
             "engine: numba is not installed; pip install numba, or choose the numpy engine"
         )
-    return "numba" if installed and choice != "numpy" else "numpy"
+    if choice == "numba" and disabled:
+        raise InputError("engine: NUMBA_DISABLE_JIT is set; unset it, or choose the numpy engine")
+    return "numba" if installed and not disabled and choice != "numpy" else "numpy"

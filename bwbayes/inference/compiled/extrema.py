@@ -8,9 +8,9 @@ samples are worked out together.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import formula
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
@@ -35,7 +35,7 @@ def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
     return group
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def deepest(voltage: FloatArray, levels: FloatArray, direction: float) -> int:
     """Return how many extrema are remembered at most: the largest ones that models have, at first.
 
@@ -57,7 +57,7 @@ def deepest(voltage: FloatArray, levels: FloatArray, direction: float) -> int:
     return slots
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def _closing(stack: FloatArray, depth: int, s: float) -> float:
     """Return the voltage at which the branch from the last extremum is forgotten, V, times s.
 
@@ -69,7 +69,7 @@ def _closing(stack: FloatArray, depth: int, s: float) -> float:
     return s * closing
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def _remaining(stack: FloatArray, depth: int, s: float, u: float) -> int:
     """Return how many extrema remain once a voltage has come to u in direction s."""
     while s * u >= _closing(stack, depth, s):
@@ -77,7 +77,7 @@ def _remaining(stack: FloatArray, depth: int, s: float, u: float) -> int:
     return depth
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def _ends(voltage: FloatArray, first: int, last: int) -> IntArray:
     """Return, for samples ``first`` to ``last`` that the voltage moves to, where it turns next."""
     ends = np.full(last - first, last)
@@ -90,7 +90,7 @@ def _ends(voltage: FloatArray, first: int, last: int) -> IntArray:
     return ends
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def along_branches(
     operator: RemembersExtrema,
     group: FloatArray,
@@ -133,7 +133,7 @@ def along_branches(
             out[t * LANES + i] = w[t] - group[REST + i]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@compile_cached(error_model="numpy", fastmath={"contract", "nsz"})
 def _branch(
     operator: RemembersExtrema,
     numbers: FloatArray,

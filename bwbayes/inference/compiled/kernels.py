@@ -15,10 +15,11 @@ The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lane
 from __future__ import annotations
 
 import numpy as np
-from numba import float64, int64, njit, none
+from numba import float64, int64, none
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import filter as noise
+from bwbayes.inference.compiled.caching import compile_cached
 
 # isort: off
 # fmt: off
@@ -172,7 +173,7 @@ def _aligned(size: int) -> FloatArray:
     return row[skipped : skipped + size]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compile_cached(error_model="numpy")
 def sums(
     voltage: FloatArray,
     displacement: FloatArray,

@@ -11,16 +11,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.model.creep import MOST_TIMES
 
 
 def inner(**options: Any) -> Any:
     """Compile what compiled functions alone call, without what Python would call it by."""
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return njit(nogil=True, cache=True, **options)
+    return compile_cached(**options)
 
 
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.

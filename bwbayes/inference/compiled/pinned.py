@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.model.compiled import compiled
 from bwbayes.model.declaration import Values
 from bwbayes.model.operators import walls as formulas
@@ -40,7 +41,7 @@ def drive(
     return w, StateMemory(float(joined[-1]), state)
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def _follow(
     spins: bool,
     walls: FloatArray,

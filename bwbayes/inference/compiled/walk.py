@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
 from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
@@ -70,7 +70,7 @@ def walk(
     return onwards
 
 
-@njit(nogil=True, cache=True)
+@compile_cached()
 def _walk(
     kind: Kind,
     groups: FloatArray,

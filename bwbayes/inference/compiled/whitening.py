@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import inner
 
 # Readings whose series are put side by side at a time.
 PIECE = 64
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compile_cached(error_model="numpy")
 def whitened(
     transitions: FloatArray,
     gained: FloatArray,
