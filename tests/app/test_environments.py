@@ -1,0 +1,98 @@
+"""What the environment lacks ends in no traceback: encodings, readers, processes, caches."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.errors import InputError
+
+
+def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "latin-1", "gbk", "ascii"])
+def test_text_goes_to_a_stream_of_any_encoding(encoding: str) -> None:
+    for arguments in (
+        ["models"],
+        ["run", "--help"],
+        ["config"],
+        ["run", "\N{GREEK SMALL LETTER MU}"],
+    ):
+        ended = python("-m", "bwbayes", *arguments, PYTHONIOENCODING=encoding)
+        assert ended.returncode == (2 if arguments[-1] == "\N{GREEK SMALL LETTER MU}" else 0)
+        assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("stream", ["| true", ">&-"])
+def test_a_reader_that_has_gone_is_no_error(stream: str) -> None:
+    command = f"{sys.executable} -m bwbayes models {stream}"
+    ended = subprocess.run(["sh", "-c", command], capture_output=True, check=False)
+    assert ended.stderr == b""
+
+
+def test_numba_may_be_switched_off() -> None:
+    script = "from bwbayes.inference.engine import choose; print(choose())"
+    assert python("-c", script, NUMBA_DISABLE_JIT="1").stdout == "numpy\n"
+    script = script.replace("choose()", "choose('numba')")
+    assert "NUMBA_DISABLE_JIT is set" in python("-c", script, NUMBA_DISABLE_JIT="1").stderr
+
+
+def test_without_a_place_for_a_cache_functions_are_compiled_all_the_same() -> None:
+    script = """
+import numba.core.caching as caching
+for locator in caching.CacheImpl._locator_classes:
+    locator.from_function = classmethod(lambda *_: None)
+from bwbayes.inference.compiled.caching import compile_cached
+for number in range(2):
+    assert compile_cached()(lambda x: x + 1)(number) == number + 1
+"""
+    ended = python("-c", script)
+    assert ended.returncode == 0, ended.stderr
+    assert "no cache can be written" in ended.stderr
+
+
+WORK = """
+from bwbayes.app.running.workers import open_executor
+{broken}
+with open_executor(2) as pool:
+    print(pool.submit(abs, -3).result())
+"""
+NO_SEMAPHORES = """
+import multiprocessing.synchronize
+def refuse(*_, **__):
+    raise OSError(38, "Function not implemented")
+multiprocessing.synchronize.SemLock.__init__ = refuse
+"""
+
+
+@pytest.mark.parametrize("broken", ["", NO_SEMAPHORES])
+def test_where_no_process_starts_this_one_computes(tmp_path: Path, broken: str) -> None:
+    """A script without a main guard, and a system without semaphores."""
+    script = tmp_path / "script.py"
+    script.write_text(WORK.format(broken=broken))
+    ended = python(str(script))
+    assert (ended.returncode, ended.stdout) == (0, "3\n"), ended.stderr
+    assert ended.stderr.count("no worker process starts") == 1
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"a": 1', "[]", "\0"])
+def test_a_summary_that_is_cut_off_is_not_finished(tmp_path: Path, text: str) -> None:
+    folder = RunFolder(tmp_path)
+    folder.summary.write_text(text)
+    with pytest.raises(InputError, match="is not finished; resume with"):
+        folder.require_finished()
