@@ -26,6 +26,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
+from bwbayes.watching import Watch, unwatched, watched
 
 
 def promises(
@@ -35,6 +36,7 @@ def promises(
     target: str | FloatArray,
     amplifier: Limits,
     generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> list[Promise]:
     """Rank candidates by what they would teach, the best first.
 
@@ -64,6 +66,8 @@ def promises(
         What can be driven.
     generator
         Chooses draws, and draws the starts of the candidates' records.
+    watch
+        Called with the share that is done.
 
     Raises
     ------
@@ -118,7 +122,7 @@ def promises(
     gradients = [derivatives(position, columns, quantity) for position in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
     scores = []
-    for name, voltage in candidates.items():
+    for name, voltage in watched([*candidates.items()], watch):
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
         if refused:
             scores.append(Promise(name, np.nan, np.nan, refused))

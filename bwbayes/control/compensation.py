@@ -39,6 +39,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.prediction.initial_state import InitialStates, Start, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
+from bwbayes.watching import Watch, part, unwatched
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class _Plan:
             square += float(np.sum(np.mean((displacement - self.references[1]) ** 2, axis=1)))
         return math.sqrt(square / len(self.draws)), mean
 
-    def played(self, voltage: FloatArray) -> Played:
-        """Predict a command."""
+    def played(self, voltage: FloatArray, watch: Watch) -> Played:
+        """Predict a command; ``watch`` is called with the share that is done."""
         bands = predict_record(
             self.posterior, self.draws, self.record(voltage), self.start, self.rng()
         )
@@ -108,6 +109,7 @@ class _Plan:
             errors += noise.draw_all(theta[rows], voltage.size, rng)[0][:, np.newaxis]
             rms[rows] = np.sqrt(np.mean(errors**2, axis=2))
             largest[rows] = np.max(np.abs(errors), axis=2)
+            watch(min(rows.stop / len(theta), 1.0))
         expected = np.sqrt(np.mean(squares, axis=0)).tolist()
         smoothed = Errors(rms[:, 1], largest[:, 1], expected[1])
         return Played(rms[:, 0], largest[:, 0], expected[0], voltage, bands, smoothed)
@@ -125,6 +127,7 @@ def compensate(
     limits: Limits | None = None,
     nearest: bool = False,
     limit: float | None = None,
+    watch: Watch = unwatched,
 ) -> Compensation:
     """Return the command for a reference, and what is promised of it.
 
@@ -149,6 +152,8 @@ def compensate(
         zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
         Of the tracking error, um.
+    watch
+        Called with the share that is done.
 
     Raises
     ------
@@ -203,14 +208,15 @@ def compensate(
             if not error < smallest:
                 break
             voltage, smallest = trial, error
-    played, between = plan.played(voltage), _between(actuator, model, voltage, from_rest)
+    played = plan.played(voltage, part(watch, 0.0, 0.5))
+    between = _between(actuator, model, voltage, from_rest)
     notes = _notes(reference, voltage, actuator, limits, nearest)
     if between > np.mean(played.rms):
         notes.append(
             f"between samples the displacement leaves a straight line by up to {between:.3g} um, "
             "more than the rms error at them; choose a shorter sampling interval"
         )
-    straight = plan.played(linear)
+    straight = plan.played(linear, part(watch, 0.5, 1.0))
     return Compensation(
         reference, command, played, straight, hold, between, from_rest, limit, tuple(notes)
     )

@@ -21,6 +21,7 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.state_space import Noise, root
 from bwbayes.model.operator import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
+from bwbayes.watching import Watch, unwatched, watched
 
 # Each with whether it looks at the readings.
 CONTROLLERS = {
@@ -102,7 +103,11 @@ class TrackingErrors(NamedTuple):
 
 
 def plan_loops(
-    model: SampledModel, references: Sequence[tuple[FloatArray, int]], ends: Span, stand: Stand
+    model: SampledModel,
+    references: Sequence[tuple[FloatArray, int]],
+    ends: Span,
+    stand: Stand,
+    watch: Watch = unwatched,
 ) -> Iterator[LoopPlan]:
     """Yield what the four controllers do to follow references.
 
@@ -116,6 +121,8 @@ def plan_loops(
         The displacements, um, that slow sweeps between the amplifier's limits end at.
     stand
         The test stand.
+    watch
+        Called with the share that is done, before the first is yielded.
 
     Notes
     -----
@@ -133,7 +140,7 @@ def plan_loops(
     state, last = model.begin(np.zeros(model.models)), np.zeros(model.models)
     # A voltage is known to a small part of the DAC's step.
     tolerance = 1e-4 * stand.amplifier.step
-    for t in range(longest - 1):
+    for t in watched(range(longest - 1), watch):
         displacements[:, t] = model.displacement(state)
         guess, last = 2 * state.voltage - last, state.voltage
         voltages[:, t], state = model.inverse(state, together[:, t + 1], limits, guess, tolerance)
@@ -161,6 +168,7 @@ def follow(
     noise: LoopNoise,
     stand: Stand,
     generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> TrackingErrors:
     """Close the loop around every draw.
 
@@ -179,6 +187,8 @@ def follow(
         The test stand.
     generator
         Source of discrepancy and sensor noise.
+    watch
+        Called with the share that is done.
     """
     controllers, signals, samples = plan.ahead.shape
     shape = controllers, signals, len(noise.parameters)
@@ -194,7 +204,7 @@ def follow(
     answer, errors = np.zeros(shape), [np.zeros(shape), np.zeros(shape)]
     squares, largest, limited = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     noises = noise.walk(gains.interval, generator)
-    for t in range(samples):
+    for t in watched(range(samples), watch):
         drift, white = next(noises)
         moved = draws.displacement(state).reshape(shape) + drift
         if t >= plan.begins:

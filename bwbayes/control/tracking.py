@@ -37,6 +37,7 @@ from bwbayes.report.report import (
     standing_banner,
 )
 from bwbayes.shown import brief
+from bwbayes.watching import WatchSteps, part, unwatched
 
 # What dynamics that matter leave of a sine: half of its power.
 LEFT = math.sqrt(0.5)
@@ -271,6 +272,7 @@ def track(
     frequencies: Sequence[float] | None = None,
     amplitude: float | None = None,
     all_theta: FloatArray | None = None,
+    watch: WatchSteps = unwatched,
 ) -> Tracking:
     """Follow the paper's signals with four controllers.
 
@@ -290,6 +292,8 @@ def track(
     all_theta
         (draws, parameters): all draws that the controller must be stable with, and whose mean is
         the model; by default those that are simulated.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -328,9 +332,14 @@ def track(
     signals = tuple(TRACKED)
     models = SampledModel.of(actuator, np.tile(mean_theta, (len(frequencies) * len(signals), 1)))
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(signals), 1)))
+    # What is still to be followed is known by the samples.
+    shares = np.cumsum([0, *(desired.shape[1] for desired, _ in references)])
+    shares = shares / shares[-1]
+    plans = plan_loops(models, references, ends, stand, partial(watch, "feed-forward"))
+    loops = partial(watch, "closed loops")
     errors = [
-        follow(plan, gains, rows, noise, stand, generator)
-        for plan in plan_loops(models, references, ends, stand)
+        follow(plan, gains, rows, noise, stand, generator, part(loops, *shares[at : at + 2]))
+        for at, plan in enumerate(plans)
     ]
     rms, largest, limited = (np.stack(values, axis=1) for values in zip(*errors, strict=True))
     return Tracking(

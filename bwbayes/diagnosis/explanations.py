@@ -15,6 +15,7 @@ import numpy as np
 from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.watching import Watch, unwatched
 
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
 # good fit refuses at once; the others explain what the discrepancy takes up.
@@ -49,9 +50,7 @@ LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
 TIED = float(np.log(20))
 
 
-def explain(
-    scene: Scene, watch: Callable[[float], None] = lambda _: None
-) -> tuple[Explanation, ...]:
+def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
     Only the first of them where the discrepancy takes up too little for any other to be worth more
@@ -76,6 +75,7 @@ def explain(
         for explanation in sorted(found, key=lambda explanation: explanation.nats):
             best[explanation.kind] = explanation
         watch((number + 1) / len(kinds))
+    watch(1.0)
     return tuple(sorted(best.values(), key=lambda explanation: -explanation.nats))
 
 

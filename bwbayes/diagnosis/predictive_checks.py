@@ -19,6 +19,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, unwatched
 
 # What is looked at: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
@@ -81,6 +82,7 @@ def check_predictions(
     draws: FloatArray,
     generator: np.random.Generator,
     record: str | None = None,
+    watch: Watch = unwatched,
 ) -> PredictiveChecks:
     """Check the training readings of a record against replicated ones.
 
@@ -94,6 +96,8 @@ def check_predictions(
         Chooses draws, and draws their noise.
     record
         The record's name; may be left out of one alone.
+    watch
+        Called with the share that is done.
     """
     dataset = posterior.only if record is None else posterior.alone(record).only
     count = min(200, len(draws))  # p-values come in steps of one over them
@@ -103,9 +107,12 @@ def check_predictions(
     noise = dataset.table.noise(posterior.table.of(theta, dataset.name))
     # Simulated twice, rather than to keep all: first for their mean and their spread about it.
     total, squares, origin = np.zeros(rows.size), np.zeros(rows.size), dataset.readings.values
+    done = 0
     for simulated in posterior.simulations(theta, rows, record):
         total += np.sum(simulated - origin, axis=0)
         squares += np.sum((simulated - origin) ** 2, axis=0)
+        done += len(simulated)
+        watch(done / (2 * count))
     away = total / count
     variance = np.mean(np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0))
     sd = np.sqrt(variance + np.maximum(squares / count - away**2, 0.0))
@@ -121,6 +128,8 @@ def check_predictions(
                 drawn = dataset.noise.draw(next(noises), int(rows[-1]) + 1, generator)
                 readings[i] += np.sum(drawn, axis=0)[rows]
             statistics.append(work_out(readings))
+            done += len(readings)
+            watch(done / (2 * count))
     replicates = np.concatenate(statistics)
     observed = work_out(dataset.readings.values[np.newaxis])[0]
     lower, upper = np.quantile(replicates, [0.025, 0.975], axis=0)

@@ -21,6 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.thinning import thinned
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, part, unwatched, watched
 
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
@@ -51,8 +52,10 @@ class PointFit:
     prior_covariance: FloatArray
 
 
-def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
+def fit(posterior: Posterior, generator: np.random.Generator, watch: Watch = unwatched) -> PointFit:
     """Find the mode of a posterior and the Gaussian approximation there.
+
+    ``watch`` is called with the share that is done.
 
     Raises
     ------
@@ -63,9 +66,9 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     probes = posterior.prior.theta(posterior.prior.draw(generator.spawn(1)[0], PROBES))
     short = thinned(posterior, probes, SAMPLES)
     if short is posterior:
-        places, noise, spread = _places(posterior, generator)
+        places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))
     else:
-        point = fit(short, generator)
+        point = fit(short, generator, part(watch, 0.0, 0.5))
         places, noise, spread = [*point.optima], np.empty((0, 0)), point.prior_covariance
     modes: list[_Mode] = []
 
@@ -75,7 +78,7 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
             modes.append(mode)
             modes.sort(key=lambda mode: -mode.log_density)
 
-    for position in places:
+    for position in watched(places, part(watch, 0.5, 0.9)):
         climb(position)
     # A mode that is less probable than the best one by so many nats holds nothing of the posterior,
     # and an ensemble that starts there stays for hundreds of steps.
@@ -83,6 +86,7 @@ def fit(posterior: Posterior, generator: np.random.Generator) -> PointFit:
     for position, log_density in _at_rest(posterior, modes[0].position, noise):
         if log_density > modes[0].log_density - 2 * negligible:  # it may yet climb
             climb(position)
+    watch(1.0)
     best = modes[0]
     worth = [m.position for m in modes if m.log_density > best.log_density - negligible]
     optima = distinct(worth, best.covariance)
@@ -121,7 +125,10 @@ def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray
 
 
 def _places(
-    posterior: Posterior, generator: np.random.Generator, starts: int = STARTS
+    posterior: Posterior,
+    generator: np.random.Generator,
+    starts: int = STARTS,
+    watch: Watch = unwatched,
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Return places (free,) to climb from; of prior draws, the noise and the covariance."""
     prior = posterior.prior
@@ -131,7 +138,7 @@ def _places(
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
     optima = []
-    for steps in (False, True):
+    for steps in watched((False, True), watch):
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
         optima += _valleys(least_squares, least_squares.optima(draws[order[:starts]]))

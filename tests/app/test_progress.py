@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bwbayes.app.fit.fitted import converged
+from bwbayes.app.jobs.check import check
+from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
+from bwbayes.inference import map_estimate
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
+from tests.inference.problems import short_posterior
 
 
 class Watched:
@@ -174,7 +180,7 @@ def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes it for a terminal
     said = bwbayes(command, *COMMANDS[command], *again(command))
     assert said.status == silent.status
-    assert f"{command} ..." in said.err
+    assert re.search(rf"{command} \.\.\.|\d%   ETA", said.err)
     if command == "compensate":
         assert "" == bwbayes(command, *COMMANDS[command], *again(command), "--quiet").err
 
@@ -182,3 +188,73 @@ def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
 def again(command: str) -> tuple[str, ...]:
     """Return what a command needs to write its files again."""
     return () if command in ("init", "check", "report") else ("--overwrite",)
+
+
+# Every step has a name, and tells what share of it is done
+
+
+class Steps:
+    """Takes note of the shares of each step, in turn."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, list[float]] = {}
+
+    def __call__(self, step: str, share: float) -> None:
+        """Take note of a share."""
+        self.shares.setdefault(step, []).append(share)
+
+    def require(self, *names: str) -> None:
+        """Require steps of these names alone, whose shares rise to one."""
+        assert names == tuple(self.shares)
+        for shares in self.shares.values():
+            assert 0.0 < shares[0]
+            assert shares == sorted(shares)
+            assert shares[-1] == pytest.approx(1.0, abs=1e-12)
+
+
+JOBS: dict[str, tuple[str, tuple[object, ...], dict[str, object], tuple[str, ...]]] = {
+    "predict": ("predict:predict", (), {"signal": "step50", "from_rest": True}, ("predictions",)),
+    "compensate": (
+        "control:compensate",
+        ("sine",),
+        {"amplitude": 20.0, "frequency": 1.0, "from_rest": True},
+        ("predicted error",),
+    ),
+    "design": ("design:design", ("beta",), {}, ("candidates",)),
+    "track": (
+        "control:track",
+        (),
+        {"frequencies": (2.0, 5.0), "draws": 3, "rate": 100.0},
+        ("feed-forward", "closed loops"),
+    ),
+}
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_every_job_tells_what_share_of_its_steps_is_done(copy: RunFolder, job: str) -> None:
+    where, arguments, options, names = JOBS[job]
+    module, _, name = where.partition(":")
+    steps = Steps()
+    call = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
+    call(converged(copy.path), *arguments, **options, watch=steps)
+    steps.require(*names)
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_a_check_tells_what_share_of_its_steps_is_done(tmp_path: Path) -> None:
+    steps = Steps()
+    check(small.config(), tmp_path, tmp_path / "out", steps)
+    steps.require("MAP estimate", "noise model", "explanations")
+
+
+@pytest.mark.parametrize("samples", [100, 100_000], ids=["thinned", "whole"])
+def test_a_map_estimate_tells_what_share_is_done(
+    monkeypatch: pytest.MonkeyPatch, samples: int
+) -> None:
+    monkeypatch.setattr(map_estimate, "SAMPLES", samples)
+    shares: list[float] = []
+    map_estimate.fit(short_posterior(samples=400), np.random.default_rng(1), shares.append)
+    assert shares == sorted(shares)
+    assert 1.0 == shares[-1]
+    # Not only when all is done.
+    assert 4 <= len({share for share in shares if share < 1.0})

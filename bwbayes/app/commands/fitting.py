@@ -66,10 +66,10 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
     """
     chosen, _ = _config_or_proposal(config, record, naming, "check", quiet=True)
     out = out or Path("results") / f"{config.stem}-check"
-    with working():
+    with working() as watch:
         from bwbayes.app.jobs.check import check as check_config
 
-        checked = check_config(chosen, config.parent, out)
+        checked = check_config(chosen, config.parent, out, watch)
     show_report(checked)
     click.echo(f"report: {out / 'check.html'}")
     return 0

@@ -34,14 +34,15 @@ def _saved(
     **options: Any,
 ) -> int:
     """Do a job with the run in a folder, save and show its product; return the exit status."""
-    with working():
+    with working() as watch:
         from bwbayes.app.fit.fitted import converged
         from bwbayes.report.outputs import refuse_existing
 
         # What takes long is refused at once, and every single file when it is saved.
         refuse_existing([out / f"{name}.json"], overwrite=overwrite)
         job = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
-        product = job(converged(folder), *arguments, **options)
+        product = job(converged(folder), *arguments, watch=watch, **options)
+        watch("figures and files", 0.0)
         files = product.save(out, overwrite=overwrite)
         report = product.report()
     return present(report, files, product.standing, quiet=quiet)
@@ -51,7 +52,7 @@ def _saved(
 @folder_argument
 @click.option("--record", type=FILE, help="Record to predict (measured, or voltage only).")
 @naming_options
-@options_of("bwbayes.app.jobs.predict:predict", "name", "own_offset")
+@options_of("bwbayes.app.jobs.predict:predict", "name", "own_offset", "watch")
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
@@ -80,7 +81,7 @@ def predict(
     files = [table, table.with_suffix(".json"), table.with_suffix(".png")]
     if table in files[1:]:
         raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
-    with working():
+    with working() as watch:
         import numpy as np
 
         from bwbayes.app.fit.fitted import converged
@@ -98,7 +99,8 @@ def predict(
                 other = read_record(
                     record, need_displacement=False, columns=columns, units=units, fs=fs
                 )
-            bands = predict_record(fit, other, name=name, own_offset=not same_offset, **options)
+            options |= {"name": name, "own_offset": not same_offset, "watch": watch}
+            bands = predict_record(fit, other, **options)
         except ColumnsError as error:
             line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
             raise error.in_command(line) from None
@@ -132,7 +134,7 @@ def predict(
 @click.option(
     "--reference", type=FILE, help="A file with time and displacement, in place of SHAPE."
 )
-@options_of("bwbayes.app.jobs.control:compensate", smoothed="smooth")
+@options_of("bwbayes.app.jobs.control:compensate", "watch", smoothed="smooth")
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option
 @quiet_option
@@ -160,7 +162,7 @@ def compensate(
 @click.option(
     "--drive", type=FILE, help="Or the drive whose band is to be narrow: a record or a signal."
 )
-@options_of("bwbayes.app.jobs.design:design")
+@options_of("bwbayes.app.jobs.design:design", "watch")
 @click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
 @overwrite_option
 @quiet_option
@@ -212,7 +214,7 @@ def export(folder: Path, out: Path | None, **options: Any) -> int:
 @click.command()
 @folder_argument
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/track.")
-@options_of("bwbayes.app.jobs.control:track", frequencies="frequency")
+@options_of("bwbayes.app.jobs.control:track", "watch", frequencies="frequency")
 @overwrite_option
 @quiet_option
 def track(folder: Path, out: Path | None, **options: Any) -> int:

@@ -27,7 +27,7 @@ from bwbayes.app.config import LARGEST_SEED
 from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
-    from bwbayes.app.running.progress import ProgressLine
+    from bwbayes.app.running.progress import StepProgress
     from bwbayes.diagnosis.validation import Standing
     from bwbayes.report.report import Report
 
@@ -182,14 +182,14 @@ def show_report(report: Report) -> None:
     show(report, Console())
 
 
-def working() -> ProgressLine:
-    """Return a line that says on a terminal which command is at work, and for how long."""
+def working() -> StepProgress:
+    """Return a line that says on a terminal which command is at work, at what, and for how long."""
     # Here, because it is slow to load.
-    from bwbayes.app.running.progress import ProgressLine
+    from bwbayes.app.running.progress import StepProgress
 
     context = click.get_current_context()
     console = Console(stderr=True, quiet=context.params.get("quiet", False))
-    return ProgressLine(console, f"{context.info_name} ...", announced=False)
+    return StepProgress(console, f"{context.info_name} ...", announced=False)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ with it.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from markupsafe import Markup
@@ -19,18 +20,20 @@ from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
 from bwbayes.report.tables import priors_table
+from bwbayes.watching import WatchSteps, unwatched
 
 
-def check(config: Config, folder: Path, out: Path) -> Report:
+def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched) -> Report:
     """Check a config and its record, fit a point, write ``out/check.html``; return its report.
 
-    The config's files are relative to `folder`; an existing page is replaced.
+    The config's files are relative to `folder`; an existing page is replaced. ``watch`` is called
+    with the name of a step and the share of it that is done.
 
     Raises InputError: the config or its record cannot be used.
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, point, why = find_map(resolve(config, folder))
+    problem, point, why = find_map(resolve(config, folder), watch)
     posterior, seed = problem.posterior, config.seed
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
@@ -40,7 +43,7 @@ def check(config: Config, folder: Path, out: Path) -> Report:
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
     for name in problem.records:
-        remarks += lines(explained(problem, name, point.optima))
+        remarks += lines(explained(problem, name, point.optima, partial(watch, "explanations")))
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)

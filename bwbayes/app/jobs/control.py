@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +40,7 @@ from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference
 from bwbayes.report.outputs import refuse_existing, write_summary
+from bwbayes.watching import WatchSteps, unwatched
 
 FILES = ("model.json", "actuator.c")  # of an export
 
@@ -63,6 +65,7 @@ def compensate(
     current: float | None = None,
     capacitance: float | None = None,
     nearest: bool = False,
+    watch: WatchSteps = unwatched,
 ) -> Compensation:
     """Return the voltage for a displacement, and its predicted error.
 
@@ -113,6 +116,8 @@ def compensate(
         The actuator's capacitance, F.
     nearest
         If limits are exceeded, return the nearest feasible command.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -146,6 +151,7 @@ def compensate(
         limits=limits,
         nearest=nearest,
         limit=limit,
+        watch=partial(watch, "predicted error"),
     )
     extrapolations = beyond_training(alone.posterior, compensation.voltage, desired.interval)
     remarks = (*compensation.remarks, *(finding.note for finding in extrapolations))
@@ -277,6 +283,7 @@ def track(
     gain_margin: float = 2.0,
     phase_margin: float = 60.0,
     draws: int = 200,
+    watch: WatchSteps = unwatched,
 ) -> Tracking:
     """Say how well a closed loop would follow the paper's signals, with and without the model.
 
@@ -301,6 +308,8 @@ def track(
         Phase margin that all draws keep, degrees.
     draws
         Simulated actuators. The margins hold for a thousand draws.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -329,6 +338,7 @@ def track(
         frequencies=frequencies or None,
         amplitude=amplitude,
         all_theta=dataset.table.actuator(theta),
+        watch=watch,
     )
     name = problem.config.name or problem.record.origin
     return replace(tracking, standing=fit.standing, name=name)

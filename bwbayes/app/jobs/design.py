@@ -8,6 +8,7 @@ parameter band's width along a drive.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from bwbayes.record.waveforms import (
     signal,
     signal_names,
 )
+from bwbayes.watching import WatchSteps, unwatched
 
 
 def design(
@@ -49,6 +51,7 @@ def design(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    watch: WatchSteps = unwatched,
 ) -> Design:
     """Rank signals by what they would leave of an sd, or of a band's width; the best first.
 
@@ -71,6 +74,8 @@ def design(
         Its largest current, A; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -104,6 +109,7 @@ def design(
         quantity,
         amplifier,
         generator(problem.config.seed, "design"),
+        partial(watch, "candidates"),
     )
     if promises[0].refused:
         raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from bwbayes.app.fit.fitted import Fit
@@ -17,6 +18,7 @@ from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
 from bwbayes.report.outputs import write_bands, write_summary
+from bwbayes.watching import WatchSteps, unwatched
 
 
 def predict(
@@ -32,6 +34,7 @@ def predict(
     lead_in_from: float | None = None,
     after: bool = False,
     of: str | None = None,
+    watch: WatchSteps = unwatched,
 ) -> Prediction:
     """Predict another record, a planned voltage without a displacement, or a signal.
 
@@ -62,6 +65,8 @@ def predict(
         record, behind which the signal follows.
     of
         Training record whose per-record parameters to use; default: the first.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -111,7 +116,8 @@ def predict(
     declared_hold = None if hold == "auto" else hold
     start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
     other = Validation((), record, start, window, of)
-    return predict_another(problem, fit.flat_draws, other, name or "prediction")
+    name, watching = name or "prediction", partial(watch, "predictions")
+    return predict_another(problem, fit.flat_draws, other, name, watching)
 
 
 def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:

@@ -6,7 +6,6 @@ What is worked out is kept with the run, and read from there; see
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +33,7 @@ from bwbayes.report.result import Result
 from bwbayes.sampling.chain import PHASES, draws, log_densities
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
+from bwbayes.watching import WatchSteps, unwatched
 
 
 def assemble(
@@ -41,7 +41,7 @@ def assemble(
     chain: ChainFile,
     outcome: Outcome,
     artist: Artist | None = None,
-    watch: Callable[[str, float], None] = lambda *_: None,
+    watch: WatchSteps = unwatched,
 ) -> Result:
     """Put a result together: draws, remarks and, if the chain has converged, predictions.
 
@@ -111,7 +111,7 @@ def assemble(
         for name, texts in said.items():
             remarks += [f"{name}: {text}" if several else str(text) for text in texts]
     remarks += [f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes]
-    watch("posterior checks", 0.0)
+    watch("information gain", 0.0)
     source = generator(seed, "checks")
     return replace(
         result,
@@ -119,7 +119,13 @@ def assemble(
         explanations=explanations,
         learned=information_gain(posterior.prior, result.draws, result.log_density, source),
         replicated={
-            dataset.name: check_predictions(posterior, subset, source, dataset.name)
+            dataset.name: check_predictions(
+                posterior,
+                subset,
+                source,
+                dataset.name,
+                partial(watch, f"checks of {dataset.name}" if several else "posterior checks"),
+            )
             for dataset in posterior.datasets
         },
         remarks=tuple(remarks),

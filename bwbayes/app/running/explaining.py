@@ -13,7 +13,8 @@ not do: no part of a model mends a transient.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.progress import ProgressLine
+from bwbayes.app.running.progress import StepProgress
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.innovations import innovations
@@ -33,13 +34,14 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
+from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
 
 
 def explained(
     problem: Problem,
     name: str,
     places: FloatArray,
-    watch: Callable[[float], None] = lambda _: None,
+    watch: Watch = unwatched,
 ) -> tuple[Explanation, ...]:
     """Explain a training record's readings better than its fit does, the best explanation first.
 
@@ -72,23 +74,25 @@ def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
             yield f"explained better by: {text}. Fix: {explanation.fix}."
 
 
-def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
+def chosen_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) -> tuple[str, str]:
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
     always compared; any other has nothing to gain where the innovations are white already. The
-    evidence of several records is the sum of what each has alone.
+    evidence of several records is the sum of what each has alone. ``watch`` is called with the
+    share that is done.
     """
     default, posterior = "discrepancy", problem.posterior
     rough = {
         name: climb(posterior.alone(name), posterior.select_draws(point.optima, name))
-        for name in problem.records
+        for name in watched([*problem.records], part(watch, 0.0, 1 / len(NOISES)))
     }
     evidence = {default: sum(fit.log_evidence for fit in rough.values())}
     # Innovations less likely than this by chance may be explained by another noise.
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
-    for noise in [n for n in NOISES if n not in evidence and (n == "white" or p < colored)]:
+    others = [n for n in NOISES if n not in evidence and (n == "white" or p < colored)]
+    for noise in watched(others, part(watch, 1 / len(NOISES), 1.0)):
         other = problem.reconfigured({"noise": noise}, {})
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
@@ -101,6 +105,7 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
         # Not one that takes up the readings, of which it would tell nothing anew.
         if all(fit.follows for fit in fits):
             evidence[noise] = sum(fit.log_evidence for fit in fits)
+    watch(1.0)
     best = max(evidence, key=lambda noise: evidence[noise])
     if evidence[best] < evidence[default] + TIED:
         best = default
@@ -114,22 +119,25 @@ def chosen_noise(problem: Problem, point: PointFit) -> tuple[str, str]:
     return best, f"noise: {best} ({', '.join(against)})"
 
 
-def find_map(problem: Problem) -> tuple[Problem, PointFit, str]:
+def find_map(problem: Problem, watch: WatchSteps = unwatched) -> tuple[Problem, PointFit, str]:
     """Return a problem with the noise that it shows, its MAP estimate, and why it has that noise.
 
-    The problem as it is, and no reason, if its config names a noise.
+    The problem as it is, and no reason, if its config names a noise. ``watch`` is called with the
+    name of a step and the share of it that is done.
     """
-    point = _fit_point(problem)
+    point = _fit_point(problem, partial(watch, "MAP estimate"))
     if problem.config.model.noise != "auto":
         return problem, point, ""
-    noise, why = chosen_noise(problem, point)
+    noise, why = chosen_noise(problem, point, partial(watch, "noise model"))
     chosen = problem.with_noise(noise)
-    same = chosen.posterior is problem.posterior
-    return chosen, point if same else _fit_point(chosen), why
+    if chosen.posterior is not problem.posterior:
+        point = _fit_point(chosen, partial(watch, f"MAP estimate, {noise} noise"))
+    return chosen, point, why
 
 
-def _fit_point(problem: Problem) -> PointFit:
-    return map_estimate.fit(problem.posterior, generator(problem.config.seed, "point fit"))
+def _fit_point(problem: Problem, watch: Watch) -> PointFit:
+    source = generator(problem.config.seed, "point fit")
+    return map_estimate.fit(problem.posterior, source, watch)
 
 
 def improve_model(
@@ -147,9 +155,9 @@ def improve_model(
     while True:
         problem = resolve(config, folder, records)
         (name,) = problem.records
-        with ProgressLine(console, "searching for missing parts of the model ..."):
-            point = _fit_point(problem)
-            found = explained(problem, name, point.optima)
+        with StepProgress(console, "searching for missing parts of the model ...") as watch:
+            point = _fit_point(problem, partial(watch, "MAP estimate"))
+            found = explained(problem, name, point.optima, partial(watch, "explanations"))
         parts = likely_causes([cause for cause in found if cause.changes])
         if followed_causes(found) or not parts:
             break

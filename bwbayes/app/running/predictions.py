@@ -32,6 +32,7 @@ from bwbayes.record.record import Record
 from bwbayes.report.figures import drawn
 from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
+from bwbayes.watching import Watch, unwatched
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,12 +119,18 @@ class Prediction(Shown, Bands):
         )
 
 
-def predict_another(problem: Problem, flat: FloatArray, other: Validation, name: str) -> Prediction:
+def predict_another(
+    problem: Problem,
+    flat: FloatArray,
+    other: Validation,
+    name: str,
+    watch: Watch = unwatched,
+) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
     ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
     which a thousand are used. The ``other`` record may have any sampling interval; ``name`` is that
-    of the bands.
+    of the bands. ``watch`` is called with the share that is done.
 
     Raises InputError: a lead-in or window that does not fit into the record.
     """
@@ -132,7 +139,8 @@ def predict_another(problem: Problem, flat: FloatArray, other: Validation, name:
     path = other.record.path
     beyond = beyond_training(posterior, path.voltage, other.record.interval)
     subset = thinned(flat, generator(problem.config.seed, "draws"))
-    bands = _of_another(problem, subset, other, name, beyond)
+    more = _of_total(other.record.samples, watch)
+    bands = _of_another(problem, subset, other, name, beyond, more)
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
@@ -163,7 +171,7 @@ def predict_after(
 def predictions(
     problem: Problem,
     flat: FloatArray,
-    watch: Callable[[float], None] = lambda _: None,
+    watch: Watch = unwatched,
     *,
     training: bool = True,
 ) -> tuple[Bands, ...]:
@@ -175,13 +183,7 @@ def predictions(
     subset = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
     total = sum(r.samples for r in (*problem.records.values(), *problem.others.values()))
-    done = 0
-
-    def more(samples: int) -> None:
-        nonlocal done
-        done += samples
-        watch(min(done / total, 1.0))
-
+    more = _of_total(total, watch)
     for name, alone, own_draws in posterior.each(subset):
         windows = problem.windows(name) if training else problem.held_out(name)
         if windows:
@@ -194,6 +196,18 @@ def predictions(
             beyond = problem.extrapolations[name]
             bands.append(_of_another(problem, subset, held_out, name, beyond, more))
     return tuple(bands)
+
+
+def _of_total(total: int, watch: Watch) -> Callable[[int], None]:
+    """Return what is called with numbers of samples that are done, of a total."""
+    done = 0
+
+    def more(samples: int) -> None:
+        nonlocal done
+        done += samples
+        watch(min(done / total, 1.0))
+
+    return more
 
 
 def _of_another(

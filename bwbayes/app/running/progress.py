@@ -70,8 +70,8 @@ class ProgressLine(Live):
 class StepProgress(ProgressLine):
     """Watches steps, one after the other, of which the share that is done is known."""
 
-    def __init__(self, console: Console, step: str = "") -> None:
-        super().__init__(console, step)
+    def __init__(self, console: Console, step: str = "", *, announced: bool = True) -> None:
+        super().__init__(console, step, announced=announced)
         self.latest = self.started_at
 
     def __call__(self, step: str, share: float) -> None:

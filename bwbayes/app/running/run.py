@@ -137,8 +137,8 @@ def _open_chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists():
-        with ProgressLine(console, "computing the MAP estimate ..."):
-            problem, point, why = find_map(problem)
+        with StepProgress(console, "computing the MAP estimate ...") as watch:
+            problem, point, why = find_map(problem, watch)
         posterior, config = problem.posterior, problem.config
         if why:  # the noise was chosen
             console.print(why, highlight=False, soft_wrap=True)
