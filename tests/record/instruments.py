@@ -152,6 +152,32 @@ def _(folder: Path) -> Written:
     return Written(path, {"displacement": "laser"}, {"displacement": "um"})
 
 
+@_instrument("Excel workbook, units in a second row")
+def _(folder: Path) -> Written:
+    from openpyxl import Workbook  # noqa: PLC0415  # an extra
+
+    book = Workbook()
+    book.active.title = "Notes"
+    book.active.append(["Bench 3", "piezo"])
+    sheet = book.create_sheet("Run 1")
+    sheet.append(["Measurement 7, loops"])
+    sheet.merge_cells("A1:C1")
+    sheet.append(["Time", "Voltage", "Displacement", "Remark"])
+    sheet.append(["s", "V", "um"])
+    for row in zip(*COLUMNS, strict=True):
+        sheet.append([float(value) for value in row])
+    book.save(folder / "a.xlsx")
+    return Written(folder / "a.xlsx")
+
+
+@_instrument("pandas to Excel, with dates")
+def _(folder: Path) -> Written:
+    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(TIME, unit="s")
+    frame = pd.DataFrame({"Time": moments, "U [V]": VOLTAGE, "x [um]": DISPLACEMENT})
+    frame.to_excel(folder / "a.xlsx", index=False)
+    return Written(folder / "a.xlsx")
+
+
 def _mat(folder: Path, variables: dict[str, Any], *names: str) -> Written:
     scipy.io.savemat(folder / "a.mat", variables)
     return Written(folder / "a.mat", _named(*names), UNITS)

@@ -34,7 +34,7 @@ from bwbayes.record.record import Record
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
 # What a folder of records is searched for.
-SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".gz")
+SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".xlsx", ".gz")
 
 
 def read_record(
@@ -146,15 +146,18 @@ def read_source(path: Path) -> Source:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
     has_arrays = begin.startswith(b"\x93NUMPY") or _is_npz(path)
-    if not has_arrays and begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
-        raise InputError(f"{path}: a workbook or an archive; export it as CSV")
+    is_workbook = begin.startswith(b"PK") and path.suffix.lower() in (".xlsx", ".xlsm")
+    if not has_arrays and not is_workbook and begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+        raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
     try:
-        if has_arrays:
-            return read_numpy(path)
-        if h5py.is_hdf5(path):
-            return read_hdf5(path)
+        if has_arrays or h5py.is_hdf5(path):
+            return read_numpy(path) if has_arrays else read_hdf5(path)
         if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
             return read_mat(path)
+        if is_workbook:
+            from bwbayes.record.io.workbook import read_workbook  # noqa: PLC0415  # as of text
+
+            return read_workbook(path)
         if begin.startswith(b"TDSm"):
             return read_tdms(path)
         if path.suffix.lower() in _BINARY:

@@ -62,13 +62,19 @@ def read_text(path: Path) -> Source:
     InputWarning
         If lines above the header are skipped.
     """
-    text = _decoded(path)
+    return text_source(path, _decoded(path))
+
+
+def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
+    """Return the columns of a text that was read from a file; one that ``is_whole`` was not cut.
+
+    Raises and warns as :func:`read_text` does.
+    """
     clocks: dict[int, Clock] = {}
     if text.startswith("LabVIEW Measurement"):
         text, clocks = plain_lvm(path, text)
     lines = text.split("\n")
     # What programs write below the numbers is no sample, and shows that the last one is whole.
-    is_whole = False
     while len(lines) > 1 and (not lines[-1].strip() or lines[-1].startswith(("#", "%"))):
         lines.pop()
         is_whole = True
