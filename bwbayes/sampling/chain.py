@@ -7,7 +7,7 @@ blocks of the sampling whose proposal turned out not to cover the posterior.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -28,8 +28,22 @@ MOST_DRAWS = 2**19
 Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
-# Names of the moves, in the order in which a block counts them.
-MOVES = ("differential evolution", "snooker", "mixture")
+
+# A generator's state as emcee has it: its kind, 624 words, a position, and a normal that it kept.
+RandomState = tuple[str, NDArray[np.uint32], int, int, float]
+
+
+def unpack_random_state(words: NDArray[np.uint32]) -> RandomState:
+    """Return the state of a generator that :func:`pack_random_state` has packed."""
+    normal = float(np.ascontiguousarray(words[626:628]).view(np.float64)[0])
+    return "MT19937", words[:624], int(words[624]), int(words[625]), normal
+
+
+def pack_random_state(state: RandomState) -> NDArray[np.uint32]:
+    """Return a generator's state, (628,): 624 words, position, and the normal number it kept."""
+    _, words, position, has_normal, normal = state
+    position_and_flag = np.array([position, has_normal], dtype=np.uint32)
+    return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
 
 
 @dataclass(frozen=True)
@@ -52,14 +66,14 @@ class Block:
     """What an ensemble did.
 
     ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
-    (walkers,) moves, ``moves`` (kinds, 2) how often each kind of move was proposed to a walker and
-    accepted, and the ``end`` it goes on from.
+    (walkers,) moves, ``moves`` how often each move was proposed to a walker and accepted, by its
+    name, and the ``end`` it goes on from.
     """
 
     coordinates: FloatArray
     log_density: FloatArray
     accepted: IntArray
-    moves: IntArray
+    moves: Mapping[str, tuple[int, int]]
     end: EnsembleState
 
 
@@ -110,6 +124,9 @@ class Chain:
         """Add the next block of every ensemble."""
         self._blocks[phase].append(tuple(blocks))
 
+    def publish(self) -> None:
+        """Let others read the draws that count so far; nobody does in memory."""
+
     def blocks(self, phase: Phase) -> int:
         """Return how many blocks each ensemble has, without those that were set aside."""
         return len(self._counting(phase))
@@ -152,12 +169,13 @@ class Chain:
 
         Kinds that were never proposed are left out.
         """
-        counts = np.zeros((len(MOVES), 2), dtype=np.int64)
+        totals: dict[str, tuple[int, int]] = {}
         for blocks in self._counting(phase):
             for block in blocks:
-                counts[: len(block.moves)] += block.moves
-        pairs = zip(MOVES, counts.tolist(), strict=True)
-        return {name: (proposed, accepted) for name, (proposed, accepted) in pairs if proposed}
+                for name, (proposed, accepted) in block.moves.items():
+                    before = totals.get(name, (0, 0))
+                    totals[name] = before[0] + proposed, before[1] + accepted
+        return {name: counts for name, counts in totals.items() if counts[0]}
 
     def _counting(self, phase: Phase) -> list[tuple[Block, ...]]:
         """Return the blocks that count."""

@@ -2,29 +2,28 @@
 
 :func:`advance` is a pure function of the posterior and each :class:`EnsembleState`, random state
 included. So it does not matter where, when or in which order ensembles run: a run with two
-workers, or one that was interrupted and goes on, gives the same bits.
-
-An ensemble walks as a generator: it yields the places whose density it needs next and is sent the
-densities, so that one call of the density serves all ensembles that move together. It draws its
-random numbers in the order in which emcee does. Where an independence proposal stands does not
-depend on where the walkers are, so steps in a row that make one are proposed all together, their
-densities are asked for at once, and only then is it decided, step by step, who goes where.
+workers, or one that was interrupted and resumes, gives the same bits. The steps themselves are
+those of ``emcee.EnsembleSampler``, by whatever emcee moves it is given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 
+import emcee
 import numpy as np
-from emcee.moves import RedBlueMove
-from numpy.typing import NDArray
 
-from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.sampling.chain import Block, EnsembleState
-from bwbayes.sampling.moves import AmongPlaces, Weighted
+from bwbayes.sampling.chain import (
+    Block,
+    EnsembleState,
+    pack_random_state,
+    unpack_random_state,
+)
+from bwbayes.sampling.moves import Counted, WeightedMoves
 
 
 def start(
@@ -63,162 +62,57 @@ def start(
             "be finite; check priors and record"
         )
     random = np.random.RandomState(np.random.MT19937(generator.integers(2**63)))
-    return EnsembleState(coordinates, log_density, _words(random))
+    return EnsembleState(coordinates, log_density, pack_random_state(random.get_state()))
 
 
 def advance(
     posterior: Posterior,
-    moves: Sequence[Weighted],
     states: Sequence[EnsembleState],
+    moves: Sequence[WeightedMoves],
     steps: int,
 ) -> list[Block]:
-    """Move ensembles ``steps`` steps on, each by ``moves`` of its own, with one density call.
+    """Advance ensembles by ``steps`` steps, one after the other, each by ``moves`` of its own.
 
-    Each step takes one of an ensemble's moves at random, with its weight, for all walkers. An
-    ensemble moves as it does alone: bit for bit where a density does not depend on the others of
-    its batch, to rounding where it does (a record's are worked out for groups of models, whose
-    noise settles together). On a short record a call costs more than the models in it, so that
-    four ensembles cost little more than one.
+    Each step takes one of an ensemble's moves at random, with its weight, for all walkers.
     """
-    walks = [_walk(weighted, state, steps) for weighted, state in zip(moves, states, strict=True)]
-    blocks: dict[int, Block] = {}
-    # Far away a proposal may overflow: such a place has no density.
+    return [
+        _run(posterior, state, weighted, steps)
+        for state, weighted in zip(states, moves, strict=True)
+    ]
+
+
+class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]  # emcee has no types
+    """emcee's sampler; a place that is not finite has no density, where emcee would end.
+
+    Far away a proposal may overflow. Without a proper posterior walkers come there sooner or later.
+    """
+
+    def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:
+        """Return the log density of coordinates (walkers, free)."""
+        finite = np.isfinite(coords).all(axis=1)
+        log_prob = np.full(len(coords), -np.inf)
+        if finite.any():
+            log_prob[finite], _ = super().compute_log_prob(coords[finite])
+        return log_prob, None
+
+
+def _run(posterior: Posterior, state: EnsembleState, moves: WeightedMoves, steps: int) -> Block:
+    walkers, free = state.coordinates.shape
+    counted = {name: (Counted(move), weight) for name, (move, weight) in moves.items()}
+    sampler = _Sampler(
+        walkers, free, posterior.log_density, moves=[*counted.values()], vectorize=True
+    )
+    begin = emcee.State(
+        state.coordinates,
+        log_prob=state.log_density,
+        random_state=unpack_random_state(state.random_state),
+    )
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        proposed = {number: next(walk) for number, walk in enumerate(walks)}
-        while proposed:
-            places = np.concatenate([*proposed.values()])
-            # Without a proper posterior walkers come to places that are not finite sooner or later.
-            finite = np.isfinite(places).all(axis=1)
-            density = np.full(len(places), -np.inf)
-            if finite.any():
-                density[finite] = posterior.log_density(places[finite])
-            ends = np.cumsum([len(proposal) for proposal in proposed.values()])[:-1]
-            answers = zip([*proposed], np.split(density, ends), strict=True)
-            proposed = {}
-            for number, answer in answers:
-                try:
-                    proposed[number] = walks[number].send(answer)
-                except StopIteration as end:
-                    blocks[number] = end.value
-    return [blocks[number] for number in range(len(walks))]
-
-
-class _Path:
-    """Where the walkers of an ensemble are, and the steps behind them."""
-
-    def __init__(self, state: EnsembleState, steps: int, kinds: int) -> None:
-        self.here, self.density = state.coordinates.copy(), state.log_density.copy()
-        # The state is as `_words` lays it out.
-        words = state.random_state
-        normal = float(np.ascontiguousarray(words[626:628]).view(np.float64)[0])
-        self.random = np.random.RandomState(np.random.MT19937(0))
-        self.random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
-        walkers, free = self.here.shape
-        self.coordinates = np.empty((steps, walkers, free))
-        self.log_density = np.empty((steps, walkers))
-        self.accepted: IntArray = np.zeros(walkers, dtype=np.int64)
-        self.moves: IntArray = np.zeros((kinds, 2), dtype=np.int64)
-        self.done = 0
-
-    @property
-    def is_complete(self) -> bool:
-        return self.done == len(self.coordinates)
-
-    def step(self, kind: int, accepted: BoolArray, places: FloatArray, density: FloatArray) -> None:
-        """Let those who accepted go where it was proposed, and add the step."""
-        np.copyto(self.here, places, where=accepted[:, np.newaxis])
-        np.copyto(self.density, density, where=accepted)
-        self.coordinates[self.done], self.log_density[self.done] = self.here, self.density
-        self.accepted += accepted
-        self.moves[kind] += accepted.size, np.count_nonzero(accepted)
-        self.done += 1
-
-    def block(self) -> Block:
-        end = EnsembleState(self.here, self.density, _words(self.random))
-        return Block(self.coordinates, self.log_density, self.accepted, self.moves, end)
-
-
-# Yields places (count, free), is sent their log densities (count,).
-_Walk = Generator[FloatArray, FloatArray, Block]
-
-
-def _walk(moves: Weighted, state: EnsembleState, steps: int) -> _Walk:
-    """Walk ``steps`` steps on."""
-    path = _Path(state, steps, len(moves))
-    random = path.random
-    ends = np.cumsum([weight for _, weight in moves])
-    ends = (ends / ends[-1]).tolist()
-
-    def choose() -> int:
-        uniform = random.random_sample()
-        return next(kind for kind, end in enumerate(ends) if uniform < end)
-
-    kind = choose()
-    while True:
-        move = moves[kind][0]
-        following = None
-        if isinstance(move, AmongPlaces):
-            proposed, chances = [], []
-            while following in (None, kind):
-                proposed.append(move.proposal.draw(random, move.places * len(path.here)))
-                chances.append(random.rand(len(path.here)))
-                if path.done + len(chances) == steps:
-                    break
-                following = choose()
-            yield from _independent_steps(move, kind, path, proposed, chances)
-        else:
-            yield from _split_step(move, kind, path)
-        if path.is_complete:
-            return path.block()
-        kind = choose() if following is None else following
-
-
-def _split_step(
-    move: RedBlueMove, kind: int, path: _Path
-) -> Generator[FloatArray, FloatArray, None]:
-    """Move one split of the walkers after the other."""
-    random = path.random
-    places, density = path.here.copy(), path.density.copy()
-    move.setup(places)
-    splits = np.arange(len(places)) % move.nsplits
-    if move.randomize_split:
-        random.shuffle(splits)
-    accepted = np.zeros(len(places), dtype=bool)
-    for split in range(move.nsplits):
-        movers = np.flatnonzero(splits == split)
-        others = [places[splits == other] for other in range(move.nsplits) if other != split]
-        proposed, factor = move.get_proposal(places[movers], others, random)
-        offered = yield proposed
-        moved = factor + offered - density[movers] > np.log(random.rand(movers.size))
-        goers = movers[moved]
-        places[goers], density[goers], accepted[goers] = proposed[moved], offered[moved], True
-    path.step(kind, accepted, places, density)
-
-
-def _independent_steps(
-    move: AmongPlaces,
-    kind: int,
-    path: _Path,
-    proposed: Sequence[FloatArray],
-    chances: Sequence[FloatArray],
-) -> Generator[FloatArray, FloatArray, None]:
-    """Make steps of an independence proposal, whose straight places are known already."""
-    walkers, free = path.here.shape
-    here = path.density - move.proposal.log_density(path.here)
-    places, log_density = move.proposal.evaluate(np.concatenate(proposed))
-    offered = yield places
-    shape = (len(chances), move.places, walkers)
-    weight = (offered - log_density).reshape(shape)
-    offered, places = offered.reshape(shape), places.reshape(*shape, free)
-    rows = np.arange(walkers)
-    for step, chance in enumerate(chances):
-        which, accepted, log_weight = move.choose(here, weight[step], chance)
-        path.step(kind, accepted, places[step, which, rows], offered[step, which, rows])
-        np.copyto(here, log_weight, where=accepted)
-
-
-def _words(random: np.random.RandomState) -> NDArray[np.uint32]:
-    """Return a generator's state, (628,): 624 words, position, and the normal number it kept."""
-    _, words, position, has_normal, normal = random.get_state()
-    position_and_flag = np.array([position, has_normal], dtype=np.uint32)
-    return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
+        end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True)
+    return Block(
+        sampler.get_chain(),
+        sampler.get_log_prob(),
+        sampler.backend.accepted.astype(np.int64),
+        {name: (move.proposed, move.accepted) for name, (move, _) in counted.items()},
+        EnsembleState(end.coords, end.log_prob, pack_random_state(end.random_state)),
+    )

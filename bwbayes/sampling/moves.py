@@ -11,13 +11,19 @@ snooker, so that whatever the fit does not cover is reached, and left again.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import emcee
 import numpy as np
 from emcee import moves
+from emcee.model import Model
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.proposals import StudentMixture
 
-Weighted = list[tuple[moves.Move, float]]
+# Moves of emcee with their weights, by their name in reports.
+WeightedMoves = Mapping[str, tuple[moves.Move, float]]
 
 
 class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
@@ -51,28 +57,57 @@ class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no type
         return z + proposed * direction, factor[:, 0]
 
 
-class AmongPlaces(moves.Move):  # type: ignore[misc]  # emcee has no types
-    """A step to one of several places that a proposal q proposes independently of the walker.
+class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
+    """A step to one of several tries that a proposal q draws independently of the walker.
 
-    With w = π/q, places x₁ … xₙ drawn from q, and the walker at x₀, one of them is chosen with the
-    probability wᵢ / (w₁ + … + wₙ), and taken with
+    With w = π/q, tries x₁ … xₙ drawn from q, and the walker at x₀, one of them is chosen with the
+    probability wᵢ / (w₁ + … + wₙ), and accepted with
 
         min(1, (w₁ + … + wₙ) / (w₀ + … + wₙ − wᵢ)),
 
     after Liu (1996), Biometrika 83, 681-682. A walker where q is too small by a factor leaves n
-    times as soon. One place is a Metropolis step, as ``emcee.moves.MHMove`` makes it.
+    times as soon. One try is a Metropolis-Hastings step. It is a move of emcee like any other:
+    ``emcee.EnsembleSampler(..., moves=[(IndependenceMove(proposal), 0.9), (DEMove(), 0.1)])``.
+
+    Parameters
+    ----------
+    proposal
+        q.
+    tries
+        n, for each walker and step.
+    ahead
+        Of how many steps the tries are drawn at once, for they do not depend on the walkers: on a
+        short record a call of the density costs more than the models in it.
     """
 
-    def __init__(self, proposal: StudentMixture, places: int = 1) -> None:
-        self.proposal, self.places = proposal, places
+    def __init__(self, proposal: StudentMixture, tries: int = 1, ahead: int = 1) -> None:
+        self.proposal, self.tries, self.ahead = proposal, tries, ahead
+        self._drawn: list[_Tries] = []
+        self._left: tuple[FloatArray, FloatArray] | None = None
+
+    def propose(self, model: Model, state: emcee.State) -> tuple[emcee.State, BoolArray]:
+        """Propose for all walkers, as emcee asks for it."""
+        walkers = len(state.coords)
+        if not self._drawn:
+            self._drawn = [*self._draw(model, walkers)]
+        tries = self._drawn.pop(0)
+        here = self._log_weight(state)
+        which, accepted, log_weight = self.choose(
+            here, tries.log_weight, model.random.rand(walkers)
+        )
+        rows = np.arange(walkers)
+        proposed = emcee.State(tries.coords[which, rows], log_prob=tries.log_prob[which, rows])
+        state = self.update(state, proposed, accepted)
+        self._left = state.coords.copy(), np.where(accepted, log_weight, here)
+        return state, accepted
 
     def choose(
         self, here: FloatArray, weight: FloatArray, chance: FloatArray
     ) -> tuple[IntArray, BoolArray, FloatArray]:
-        """Choose for each walker, at log w₀ (walkers,), one of log wᵢ (places, walkers).
+        """Choose for each walker, at log w₀ (walkers,), one of log wᵢ (tries, walkers).
 
-        Return which, whether it is taken, and its log weight, each (walkers,). One number from 0 to
-        1 does both: it falls into the part of the range that belongs to a place, and where in that
+        Return which, whether it is accepted, and its log weight, each (walkers,). One number from 0
+        to 1 does both: it falls into the part of the range that belongs to a try, and where in that
         part it falls is again such a number.
         """
         rows = np.arange(here.size)
@@ -86,16 +121,71 @@ class AmongPlaces(moves.Move):  # type: ignore[misc]  # emcee has no types
         accepted = (point - (ends[which, rows] - share)) * others < share * ends[-1]
         return which, accepted, chosen
 
+    def _log_weight(self, state: emcee.State) -> FloatArray:
+        """Return log w₀ (walkers,); as this move left the walkers, it is known."""
+        if self._left is not None and np.array_equal(self._left[0], state.coords):
+            return self._left[1]
+        log_weight: FloatArray = state.log_prob - self.proposal.log_density(state.coords)
+        return log_weight
 
-def pilot_moves(proposal: StudentMixture | None = None) -> Weighted:
+    def _draw(self, model: Model, walkers: int) -> Iterator[_Tries]:
+        """Draw the tries of the next steps, and ask for their densities at once."""
+        count = self.ahead * self.tries * walkers
+        coords, log_density = self.proposal.evaluate(self.proposal.draw(model.random, count))
+        log_prob, _ = model.compute_log_prob_fn(coords)
+        shape = self.ahead, self.tries, walkers
+        yield from map(
+            _Tries,
+            coords.reshape(*shape, -1),
+            log_prob.reshape(shape),
+            (log_prob - log_density).reshape(shape),
+        )
+
+
+class _Tries(NamedTuple):
+    """``coords`` (tries, walkers, free), and their log π and log w, (tries, walkers) each."""
+
+    coords: FloatArray
+    log_prob: FloatArray
+    log_weight: FloatArray
+
+
+class Counted(moves.Move):  # type: ignore[misc]
+    """Another move, and how often it was ``proposed`` to a walker and ``accepted``."""
+
+    def __init__(self, move: moves.Move) -> None:
+        self.move, self.proposed, self.accepted = move, 0, 0
+
+    def propose(self, model: Model, state: emcee.State) -> tuple[emcee.State, BoolArray]:
+        """Propose what the other move does."""
+        state, accepted = self.move.propose(model, state)
+        self.proposed += accepted.size
+        self.accepted += int(np.count_nonzero(accepted))
+        return state, accepted
+
+
+def pilot_moves(proposal: StudentMixture | None = None, ahead: int = 1) -> WeightedMoves:
     """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
-    if proposal is None:
-        return [(moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
-    return [(moves.DEMove(), 0.4), (SnookerMove(), 0.1), (AmongPlaces(proposal), 0.5)]
+    share = 0.0 if proposal is None else 0.5
+    return _with_independence(share, proposal, ahead=ahead)
 
 
-def sampling_moves(proposal: StudentMixture | None, places: int = 1) -> Weighted:
+def sampling_moves(
+    proposal: StudentMixture | None, tries: int = 1, ahead: int = 1
+) -> WeightedMoves:
     """Return moves and weights for the draws that count; as the pilot's without a proposal."""
-    if proposal is None:
-        return pilot_moves()
-    return [(moves.DEMove(), 0.12), (SnookerMove(), 0.03), (AmongPlaces(proposal, places), 0.85)]
+    share = 0.0 if proposal is None else 0.85
+    return _with_independence(share, proposal, tries, ahead)
+
+
+def _with_independence(
+    share: float, proposal: StudentMixture | None, tries: int = 1, ahead: int = 1
+) -> WeightedMoves:
+    """Return differential evolution and snooker, and a ``share`` of the independence move."""
+    weighted = {
+        "differential evolution": (moves.DEMove(), 0.8 * (1 - share)),
+        "snooker": (SnookerMove(), 0.2 * (1 - share)),
+    }
+    if proposal is not None:
+        weighted["mixture"] = IndependenceMove(proposal, tries, ahead), share
+    return weighted

@@ -1,7 +1,7 @@
 """How a posterior is sampled: the walkers, the target, the budget, and what a step may cost.
 
-On a short record a step is mostly Python's work, whatever the models in it: there all ensembles are
-moved with one call of the density, and a step has several places to choose from.
+On a short record a step is mostly Python's work, whatever the models in it: there an independence
+move draws the tries of several steps at once, and a step has several tries to choose from.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ class SamplingPlan:
         The budget: steps of each ensemble that count, and before.
     least_pilot_steps
         Steps of the pilot in any case.
-    together
-        Ensembles that are moved with one call of the density. A property of what is sampled, not
-        of who computes it: on the compiled engine the last bits of densities may depend on it.
-    places
-        Places that a step of the mixture has to choose from.
+    ensembles_per_task
+        Ensembles that one task advances.
+    tries
+        Tries of an independence move that counts, for each walker and step.
+    ahead
+        Steps of which an independence move draws the tries at once.
     """
 
     ess: float = 2000.0
@@ -43,8 +44,9 @@ class SamplingPlan:
     most_steps: int = 20_000
     least_pilot_steps: int = 25
     most_pilot_steps: int = 3_000
-    together: int = 1
-    places: int = 1
+    ensembles_per_task: int = 1
+    tries: int = 1
+    ahead: int = 1
 
     def __post_init__(self) -> None:
         if self.ensembles < 4:
@@ -53,8 +55,8 @@ class SamplingPlan:
             raise InputError("sampling.walkers: must be even; emcee moves one half at a time")
 
 
-def best_together(ensembles: int, walkers: int, samples: int) -> int:
-    """Return how many ensembles to move with one call, on a record of so many samples.
+def best_ensembles_per_task(ensembles: int, walkers: int, samples: int) -> int:
+    """Return how many ensembles one task advances, on a record of so many samples.
 
     All where a step is light: threads would wait for each other's Python. Half of them, for two
     threads, where the models take as long as Python does. Else each by itself.
@@ -63,10 +65,19 @@ def best_together(ensembles: int, walkers: int, samples: int) -> int:
     return ensembles if size <= 1 << 16 else ensembles // 2 if size <= 1 << 18 else 1
 
 
-def best_places(walkers: int, readings: int) -> int:
-    """Return how many places a step of the mixture has to choose from, for so many readings.
+def best_tries(walkers: int, readings: int) -> int:
+    """Return how many tries an independence move has, for so many readings.
 
     Several where readings are few, four of up to 32 with 64 walkers: what they leave open is wide
     and curved, and the mixture covers it badly.
     """
     return max(1, min(4, (1 << 13) // (walkers * readings)))
+
+
+def best_ahead(walkers: int, samples: int) -> int:
+    """Return of how many steps tries are drawn at once, on a record of so many samples.
+
+    Of eight where a call of the density costs more than the models in it. What a block of steps
+    leaves over is lost, which where models are dear would cost more than the calls.
+    """
+    return max(1, min(8, (1 << 17) // (walkers * samples)))

@@ -39,7 +39,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.map_estimate import PointFit, peaks
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import chain as chains
-from bwbayes.sampling.chain import MOVES, Block, Chain, Phase, constrain_steps, thinning
+from bwbayes.sampling.chain import Block, Chain, Phase, constrain_steps, thinning
 from bwbayes.sampling.curvature import TotalMap
 from bwbayes.sampling.diagnostics import (
     LARGEST_PARETO_K,
@@ -152,16 +152,19 @@ class _Sampling:
         """Advance every ensemble by a block, wherever the executor likes."""
         plan, chain = self.plan, self.chain
         proposal = chain.proposal_in_use(phase)
-        # Only where draws count has a step several places.
-        places = plan.places if phase == "sampling" else 1
+        # Only where draws count has a step several tries.
+        tries = plan.tries if phase == "sampling" else 1
         futures, ends = [], chain.ends
-        for group in (ends[i : i + plan.together] for i in range(0, len(ends), plan.together)):
-            # Moves of its own for each: some of emcee's write to themselves.
+        size = plan.ensembles_per_task
+        for group in (ends[i : i + size] for i in range(0, len(ends), size)):
+            # Moves of its own for each: they keep what they have drawn.
             moves = [
-                pilot_moves(proposal) if phase == "pilot" else sampling_moves(proposal, places)
+                pilot_moves(proposal, plan.ahead)
+                if phase == "pilot"
+                else sampling_moves(proposal, tries, plan.ahead)
                 for _ in group
             ]
-            futures.append(self.executor.submit(advance, self.posterior, moves, group, plan.block))
+            futures.append(self.executor.submit(advance, self.posterior, group, moves, plan.block))
         blocks: list[Block] = []
         for future in futures:
             for block in future.result():
@@ -196,7 +199,6 @@ class _Sampling:
         """
         plan, chain = self.plan, self.chain
         proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
-        independent = MOVES.index("mixture")
         begin, end, rate = 0, 1, 0.0
         while rate < 0.5 and end <= 4:
             if chain.blocks("tuning") < end:
@@ -204,10 +206,13 @@ class _Sampling:
             while chain.blocks("tuning") < end:
                 self._extend("tuning")
             proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
-            # Which part of the places that the proposal proposed was taken; 1 without one.
-            blocks = chain.history("tuning")[begin:end]
-            counts = [block.moves[independent:][:1] for ensembles in blocks for block in ensembles]
-            proposed, accepted = np.sum(np.concatenate(counts), axis=0)
+            # Which part of what the proposal proposed was accepted; 1 without one.
+            counts = [
+                block.moves.get("mixture", (0, 0))
+                for ensembles in chain.history("tuning")[begin:end]
+                for block in ensembles
+            ]
+            proposed, accepted = np.sum(counts, axis=0)
             rate = float(accepted / proposed) if proposed else 1.0
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
@@ -242,6 +247,8 @@ class _Sampling:
                 blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
                 continue
             latest = judgment.check()
+            if at_end:
+                chain.publish()
             self.watcher("sampling", latest)
             missing = latest.shortcomings(plan.ess)
             # One whose target was made smaller has converged before its end.

@@ -11,6 +11,10 @@ chain that a disk has damaged, what comes before the damage is used. This module
                                      log_density, accepted, moves, random_state
     set-aside.npz                    how many blocks of the sampling were set aside, and the
                                      proposal that was fitted to them
+
+Beside the folder stands ``chain.h5``: what counts of the sampling so far, as emcee stores it, one
+group an ensemble. ``emcee.backends.HDFBackend("chain.h5", name="ensemble_1")`` opens it, during a
+run and after it. It is written anew at each check of the chain, and read by nothing here.
 """
 
 from __future__ import annotations
@@ -25,14 +29,22 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import emcee
 import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.inference.map_estimate import PointFit
-from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
+from bwbayes.sampling.chain import (
+    PHASES,
+    Block,
+    Chain,
+    EnsembleState,
+    Phase,
+    unpack_random_state,
+)
 from bwbayes.sampling.proposals import StudentMixture
 
-FORMAT = 3
+FORMAT = 4
 
 Arrays = Mapping[str, Any]
 
@@ -165,7 +177,7 @@ class ChainFile(Chain):
             "coordinates": np.stack([b.coordinates for b in blocks], axis=1),
             "log_density": np.stack([b.log_density for b in blocks], axis=1),
             "accepted": np.stack([b.accepted for b in blocks]),
-            "moves": np.stack([b.moves for b in blocks]),
+            "moves": json.dumps([dict(b.moves) for b in blocks]),
             "random_state": np.stack([b.end.random_state for b in blocks]),
         }
         _write(self.path, _block_name(phase, len(self.history(phase))), arrays)
@@ -181,6 +193,40 @@ class ChainFile(Chain):
         """Set the first blocks of the sampling aside, on the disk too."""
         _write(self.path, "set-aside", {"blocks": blocks} | _arrays_of(refit))
         super().fall_back(blocks, refit)
+
+    def publish(self) -> None:
+        """Write the draws that count, so far, as emcee's ``HDFBackend`` does, to ``chain.h5``.
+
+        Raises
+        ------
+        InputError
+            There is no room for it; the chain is whole without it.
+        """
+        import h5py  # noqa: PLC0415  # slow to load
+
+        file = self.path.with_suffix(".h5")
+        draft = self.path.with_suffix(".h5.partial")
+        coordinates, log_density = self.coordinates("sampling"), self.log_density("sampling")
+        accepted = np.sum(self.accepted("sampling"), axis=0)
+        try:
+            with h5py.File(draft, "w") as opened:
+                opened.attrs.update(self._attributes)
+                for number, end in enumerate(self.ends):
+                    steps, _, walkers, free = coordinates.shape
+                    group = opened.create_group(f"ensemble_{number + 1}")
+                    group.attrs.update(
+                        version=emcee.__version__, nwalkers=walkers, ndim=free, has_blobs=False,
+                        iteration=steps,
+                    )  # fmt: skip
+                    for row, part in enumerate(unpack_random_state(end.random_state)):
+                        group.attrs[f"random_state_{row}"] = part
+                    group["chain"] = coordinates[:, number]
+                    group["log_prob"] = log_density[:, number]
+                    group["accepted"] = accepted[number].astype(np.float64)
+            draft.replace(file)
+        except OSError as error:
+            draft.unlink(missing_ok=True)
+            raise _not_written(file, error) from None
 
     @classmethod
     def _begun(cls, path: Path, arrays: Arrays | None) -> ChainFile:
@@ -207,12 +253,13 @@ class ChainFile(Chain):
                 if (arrays := load(_block_name(phase, number))) is None:
                     break
                 coordinates, log_density = arrays["coordinates"], arrays["log_density"]
+                moves = json.loads(str(arrays["moves"]))
                 blocks = [
                     Block(
                         coordinates[:, e],
                         log_density[:, e],
                         arrays["accepted"][e],
-                        arrays["moves"][e],
+                        {name: tuple(counts) for name, counts in moves[e].items()},
                         EnsembleState(coordinates[-1, e], log_density[-1, e], state),
                     )
                     for e, state in enumerate(arrays["random_state"])

@@ -83,7 +83,7 @@ def our_run(problem: Problem) -> Run:
 
 def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
     """Move an ensemble by emcee's default move."""
-    return advance(posterior, [[(StretchMove(), 1.0)]], [state], steps)[0]
+    return advance(posterior, [state], [{"stretch": (StretchMove(), 1.0)}], steps)[0]
 
 
 def sampling(rounds: int, steps: int) -> Iterator[tuple[str, Table]]:
@@ -123,7 +123,7 @@ def sampling(rounds: int, steps: int) -> Iterator[tuple[str, Table]]:
     yield (
         "ensembles",
         speed_up(
-            lambda: advance(posterior, [sampling_moves(proposal)], [end], 20),
+            lambda: advance(posterior, [end], [sampling_moves(proposal)], 20),
             rounds,
             "Two ensembles, 20 steps of ours, compiled engine",
         ),

@@ -21,7 +21,7 @@ place = np.median(posterior.prior.unconstrain(posterior.prior.draw(generator, 50
 nearby = 1e-6 * np.eye(place.size)
 point = PointFit(place, nearby, 0.0, place[np.newaxis], nearby)
 begin = start(posterior, point, 0, 64, generator)
-(block,) = advance(posterior, [pilot_moves()], [begin], 1)
+(block,) = advance(posterior, [begin], [pilot_moves()], 1)
 assert np.isfinite(block.log_density).all()
 """
 

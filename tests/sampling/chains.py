@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.inference.map_estimate import PointFit
-from bwbayes.sampling.chain import MOVES, PHASES, Block, Chain, EnsembleState, Phase
+from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.curvature import QuadraticMap, SkewMap, TotalMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
@@ -28,6 +28,7 @@ PLAN: tuple[tuple[Phase, int], ...] = (("pilot", 2), ("tuning", 2), ("sampling",
 
 def state(generator: np.random.Generator) -> EnsembleState:
     words = generator.integers(2**32, size=628, dtype=np.uint32)
+    words[624:626] = 17, 0  # a position that a generator may have, and no normal kept
     coordinates = generator.standard_normal((WALKERS, FREE))
     return EnsembleState(coordinates, generator.standard_normal(WALKERS), words)
 
@@ -43,7 +44,8 @@ def blocks(phase: Phase, number: int) -> list[Block]:
         density = generator.standard_normal((STEPS, WALKERS))
         coordinates[-1], density[-1] = end.coordinates, end.log_density
         accepted = generator.integers(STEPS, size=WALKERS)
-        moves = generator.integers(STEPS, size=(len(MOVES), 2))
+        counts = generator.integers(1, STEPS, size=(3, 2)).tolist()
+        moves = {f"move {number}": tuple(pair) for number, pair in enumerate(counts)}
         made.append(Block(coordinates, density, accepted, moves, end))
     return made
 

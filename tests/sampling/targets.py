@@ -16,13 +16,13 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
-from emcee.moves import Move
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.ensemble import advance, start
+from bwbayes.sampling.moves import WeightedMoves
 from bwbayes.sampling.proposals import StudentMixture
 
 REPLICATES = 12
@@ -187,7 +187,7 @@ TARGETS = {
 }
 
 
-def worst_score(known: Known, moves: list[tuple[Move, float]], steps: int) -> float:
+def worst_score(known: Known, moves: WeightedMoves, steps: int) -> float:
     """Largest |t| of means and mean squares over the replicates."""
     walkers = 200
     posterior = target(known.log_density, known.free)
@@ -199,7 +199,7 @@ def worst_score(known: Known, moves: list[tuple[Move, float]], steps: int) -> fl
         flat = target(lambda x: np.zeros(len(x)), known.free)
         state = start(flat, point, 0, walkers, generator)
         state = replace(state, coordinates=draws, log_density=known.log_density(draws))
-        chain = known.view(advance(posterior, [moves], [state], steps)[0].coordinates)
+        chain = known.view(advance(posterior, [state], [moves], steps)[0].coordinates)
         result.append([np.mean(chain**power, axis=(0, 1)) for power in (1, 2)])
     means = np.array(result)
     error = np.std(means, axis=0, ddof=1) / np.sqrt(REPLICATES)

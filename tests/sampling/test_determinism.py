@@ -55,8 +55,8 @@ def begin(path: Path, seed: int = 1) -> None:
     ChainFile.create(path, chain, POINT, PLAN.block, {})
 
 
-def go_on(path: Path, executor: Executor, blocks: int = 0, together: int = 1) -> Outcome:
-    plan = replace(PLAN, together=together)
+def go_on(path: Path, executor: Executor, blocks: int = 0, per_task: int = 1) -> Outcome:
+    plan = replace(PLAN, ensembles_per_task=per_task)
     return sample(POSTERIOR, plan, ChainFile.resume(path), executor, Stopper(blocks))
 
 
@@ -90,15 +90,15 @@ def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any]
         )
 
 
-@pytest.mark.parametrize("together", [1, 3])
+@pytest.mark.parametrize("per_task", [1, 3])
 def test_straight(
     tmp_path: Path,
     executor: Executor,
     expected: tuple[dict[str, Any], Outcome],
-    together: int,
+    per_task: int,
 ) -> None:
     begin(tmp_path / "chain")
-    outcome = go_on(tmp_path / "chain", executor, together=together)
+    outcome = go_on(tmp_path / "chain", executor, per_task=per_task)
     assert_same_end(tmp_path / "chain", outcome, expected)
 
 
@@ -111,7 +111,7 @@ def test_in_five_pieces(
     piece = total // PIECES
     for number in range(1, PIECES):
         with suppress(StoppedError):
-            go_on(path, executor, 4 * piece + 2, together=number)
+            go_on(path, executor, 4 * piece + 2, per_task=number)
         done = ChainFile.read(path)
         assert number * piece == sum(done.blocks(phase) for phase in PHASES)
     assert_same_end(path, go_on(path, executor), expected)

@@ -10,9 +10,15 @@ import pytest
 from emcee.moves import DEMove, StretchMove
 
 from bwbayes.arrays import FloatArray
-from bwbayes.sampling.chain import Block, EnsembleState
+from bwbayes.sampling.chain import (
+    Block,
+    EnsembleState,
+    pack_random_state,
+    unpack_random_state,
+)
 from bwbayes.sampling.ensemble import advance, start
-from bwbayes.sampling.moves import Weighted, pilot_moves
+from bwbayes.sampling.moves import WeightedMoves, pilot_moves, sampling_moves
+from bwbayes.sampling.proposals import StudentMixture
 from tests.sampling.targets import gaussian, target
 
 FREE, WALKERS = 3, 12
@@ -23,33 +29,36 @@ def begin(seed: int = 1) -> EnsembleState:
     return start(POSTERIOR, POINT, 0, WALKERS, np.random.default_rng(seed))
 
 
-def alone(moves: Weighted, state: EnsembleState, steps: int) -> Block:
-    return advance(POSTERIOR, [moves], [state], steps)[0]
+def alone(moves: WeightedMoves, state: EnsembleState, steps: int) -> Block:
+    return advance(POSTERIOR, [state], [moves], steps)[0]
 
 
-EMCEES: dict[str, Callable[[], Weighted]] = {
+PROPOSAL = StudentMixture.fitted(
+    np.random.default_rng(5).multivariate_normal(np.zeros(FREE), POINT.covariance, 500)
+)
+MOVES: dict[str, Callable[[], WeightedMoves]] = {
     "pilot": pilot_moves,
-    "stretch": lambda: [(StretchMove(), 1.0)],
-    "walkers in order": lambda: [(DEMove(randomize_split=False), 1.0)],
+    "sampling": lambda: sampling_moves(PROPOSAL, tries=2, ahead=5),
+    "stretch": lambda: {"stretch": (StretchMove(), 1.0)},
+    "walkers in order": lambda: {"DE": (DEMove(randomize_split=False), 1.0)},
 }
 
 
-@pytest.mark.parametrize("name", EMCEES)
-def test_the_steps_are_emcees_own(name: str) -> None:
+@pytest.mark.parametrize("name", MOVES)
+def test_anyone_may_use_the_moves_in_a_sampler_of_their_own(name: str) -> None:
+    """From the same random state it makes the same steps, and counts what was accepted."""
     state, steps = begin(), 60
-    words = state.random_state
-    normal = float(words[626:].view(np.float64)[0])
-    random = np.random.RandomState()
-    random.set_state(("MT19937", words[:624], int(words[624]), int(words[625]), normal))
     sampler = emcee.EnsembleSampler(
-        WALKERS, FREE, POSTERIOR.log_density, vectorize=True, moves=EMCEES[name]()
+        WALKERS, FREE, POSTERIOR.log_density, vectorize=True, moves=[*MOVES[name]().values()]
     )
-    begun = emcee.State(state.coordinates, random_state=random.get_state())
+    begun = emcee.State(state.coordinates, random_state=unpack_random_state(state.random_state))
     last = sampler.run_mcmc(begun, steps, skip_initial_state_check=True)
-    block = alone(EMCEES[name](), state, steps)
+    block = alone(MOVES[name](), state, steps)
     np.testing.assert_array_equal(sampler.get_chain(), block.coordinates)
     np.testing.assert_array_equal(sampler.backend.accepted, block.accepted)
-    np.testing.assert_array_equal(last.random_state[1], block.end.random_state[:624])
+    np.testing.assert_array_equal(pack_random_state(last.random_state), block.end.random_state)
+    proposed, accepted = np.sum([*block.moves.values()], axis=0)
+    assert (steps * WALKERS, np.sum(block.accepted)) == (proposed, accepted)
 
 
 def distance(point: FloatArray) -> float:

@@ -25,7 +25,7 @@ from tests.inference.problems import decaying_sine, posterior_of
 from tests.sampled import converged
 
 READINGS = 20
-PLAN = SamplingPlan(ess=2000, walkers=24, together=4, places=4)
+PLAN = SamplingPlan(ess=2000, walkers=24, ensembles_per_task=4, tries=4, ahead=8)
 
 # Readings whose share of the mode without a discrepancy is 1, 20 and 38%.
 SEEDS = (5, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 4)))

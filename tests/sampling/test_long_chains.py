@@ -35,7 +35,7 @@ generator = np.random.default_rng(1)
 chain = first_chain(posterior, point, plan, generator)
 mixture = StudentMixture.fitted(generator.standard_normal((2000, 10)))
 path = Path(sys.argv[1])
-moved, moves = np.full(64, 20), np.full((3, 2), 20)
+moved, moves = np.full(64, 20), {"mixture": (20, 20)}
 file = ChainFile.create(path, chain, point, plan.block, {})
 file.freeze("sampling", mixture)
 for phase, blocks in (("pilot", 60), ("tuning", 2), ("sampling", plan.most_steps // 50)):

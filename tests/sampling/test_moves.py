@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.moves import (
-    AmongPlaces,
+    IndependenceMove,
     SnookerMove,
-    Weighted,
+    WeightedMoves,
     sampling_moves,
 )
 from bwbayes.sampling.proposals import StudentMixture
@@ -54,7 +54,7 @@ def eager(factor: FloatArray) -> FloatArray:
     return factor + 1
 
 
-class Eager(AmongPlaces):
+class Eager(IndependenceMove):
     """Takes the place it has chosen, whatever place it leaves."""
 
     def choose(
@@ -65,19 +65,21 @@ class Eager(AmongPlaces):
         return one, np.ones_like(taken), chosen
 
 
-RIGHT: dict[str, Callable[[str], Weighted]] = {
-    "differential evolution": lambda _: [(DEMove(), 1.0)],
-    "snooker": lambda _: [(SnookerMove(), 1.0)],
-    "a place": lambda name: [(AmongPlaces(fitted(name)), 1.0)],
-    "one of several places": lambda name: [(AmongPlaces(TARGETS[name].proposal, 5), 1.0)],
+RIGHT: dict[str, Callable[[str], WeightedMoves]] = {
+    "differential evolution": lambda _: {"move": (DEMove(), 1.0)},
+    "snooker": lambda _: {"move": (SnookerMove(), 1.0)},
+    "a place": lambda name: {"move": (IndependenceMove(fitted(name)), 1.0)},
+    "one of several places": lambda name: {
+        "move": (IndependenceMove(TARGETS[name].proposal, 5), 1.0)
+    },
     "those that sample": lambda name: sampling_moves(fitted(name)),
 }
 # Differential evolution that accepts too easily, moves without their factor, and steps that take
 # every place that was chosen: the best of two is no draw of the target.
-WRONG: dict[str, Callable[[str], Weighted]] = {
-    "differential evolution": lambda _: [(planted(DEMove(), eager), 1.0)],
-    "snooker": lambda _: [(planted(SnookerMove(), forgotten), 1.0)],
-    "one of several places": lambda name: [(Eager(TARGETS[name].proposal, 2), 1.0)],
+WRONG: dict[str, Callable[[str], WeightedMoves]] = {
+    "differential evolution": lambda _: {"move": (planted(DEMove(), eager), 1.0)},
+    "snooker": lambda _: {"move": (planted(SnookerMove(), forgotten), 1.0)},
+    "one of several places": lambda name: {"move": (Eager(TARGETS[name].proposal, 2), 1.0)},
 }
 
 
@@ -96,7 +98,7 @@ def test_twin_a_wrong_move_is_found(kind: str, name: str) -> None:
 def test_twin_half_of_the_snooker_factor_is_found() -> None:
     """The move of emcee itself, up to 3.1.6, in nine dimensions."""
     halved = emcee.moves.DESnookerMove()
-    assert worst_score(TARGETS["gaussian"], [(halved, 1.0)], steps=40) > ALARM
+    assert worst_score(TARGETS["gaussian"], {"move": (halved, 1.0)}, steps=40) > ALARM
 
 
 @settings(max_examples=40, deadline=None)
@@ -104,7 +106,7 @@ def test_twin_half_of_the_snooker_factor_is_found() -> None:
 def test_a_step_to_one_of_several_places_and_its_way_back_are_in_balance(logs: list[float]) -> None:
     """With the other places given, w₀ P(0 → 1) = w₁ P(1 → 0), by a fine grid of chances."""
     grid = (np.arange(100_000) + 0.5) / 100_000
-    move = AmongPlaces(TARGETS["banana"].proposal, len(logs) - 1)
+    move = IndependenceMove(TARGETS["banana"].proposal, len(logs) - 1)
     flows = []
     for first, second in ((0, 1), (1, 0)):
         here = np.full(grid.size, logs[first])

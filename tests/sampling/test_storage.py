@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import emcee
 import numpy as np
 import pytest
 
@@ -205,3 +206,49 @@ def test_a_reader_meets_whole_blocks_alone_while_another_writes(tmp_path: Path) 
     writer.join()
     assert ChainFile.read(chain.path).blocks("sampling") == 40
     assert len(set(counts)) > 2
+
+
+def test_emcee_opens_each_ensemble_during_a_run_and_after_it_and_goes_on(tmp_path: Path) -> None:
+    """What it reads is what counts so far; its own sampler continues from there."""
+    chain = new(tmp_path / "chain")
+    finish(chain)
+    chain.fall_back(1)  # of the sampling, which counts no longer
+    chain.publish()
+    file = tmp_path / "chain.h5"
+    coordinates = chain.coordinates("sampling")
+    for number, end in enumerate(chain.ends):
+        backend = emcee.backends.HDFBackend(str(file), name=f"ensemble_{number + 1}")
+        np.testing.assert_array_equal(backend.get_chain(), coordinates[:, number])
+        np.testing.assert_array_equal(
+            backend.get_log_prob(), chain.log_density("sampling")[:, number]
+        )
+        np.testing.assert_array_equal(
+            backend.accepted, np.sum(chain.accepted("sampling")[:, number], axis=0)
+        )
+        last = backend.get_last_sample()
+        np.testing.assert_array_equal(last.random_state[1], end.random_state[:624])
+        walkers, free = last.coords.shape
+        sampler = emcee.EnsembleSampler(
+            walkers, free, lambda x: -0.5 * np.sum(x**2, axis=1), vectorize=True, backend=backend
+        )
+        sampler.run_mcmc(last, 3, skip_initial_state_check=True)
+        assert backend.iteration == len(coordinates) + 3
+    # The next check writes it anew; the chain itself is not read from it.
+    chain.publish()
+    assert emcee.backends.HDFBackend(str(file), name="ensemble_1").iteration == len(coordinates)
+    assert [chain.path, file] == sorted(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("length", [0, 100, 2000])
+def test_a_backend_that_is_cut_off_costs_nothing(tmp_path: Path, length: int) -> None:
+    """It becomes ``chain.h5`` only when it is whole, and the chain does without it."""
+    chain = new(tmp_path / "chain")
+    finish(chain)
+    chain.publish()
+    whole = (tmp_path / "chain.h5").read_bytes()
+    (tmp_path / "chain.h5.partial").write_bytes(whole[:length])
+    assert emcee.backends.HDFBackend(str(tmp_path / "chain.h5"), name="ensemble_1").initialized
+    resumed = ChainFile.resume(tmp_path / "chain")
+    assert_same(arrays(chain), arrays(resumed))
+    resumed.publish()
+    assert [chain.path, tmp_path / "chain.h5"] == sorted(tmp_path.iterdir())

@@ -59,7 +59,12 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import OPTIONS
 from bwbayes.record import Record
-from bwbayes.sampling.plan import SamplingPlan, best_places, best_together
+from bwbayes.sampling.plan import (
+    SamplingPlan,
+    best_ahead,
+    best_ensembles_per_task,
+    best_tries,
+)
 from bwbayes.shown import brief
 
 
@@ -339,7 +344,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
             f"use at least {fewest}"
         )
     samples = sum(dataset.readings.samples for dataset in posterior.datasets)
-    places = best_places(walkers, sum(len(data.readings.values) for data in posterior.datasets))
+    readings = sum(len(data.readings.values) for data in posterior.datasets)
     return SamplingPlan(
         ess=settings.ess,
         ensembles=settings.ensembles,
@@ -347,8 +352,9 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         block=settings.block,
         most_steps=settings.steps,
         most_pilot_steps=settings.pilot_steps,
-        together=best_together(settings.ensembles, walkers, samples),
-        places=places,
+        ensembles_per_task=best_ensembles_per_task(settings.ensembles, walkers, samples),
+        tries=best_tries(walkers, readings),
+        ahead=best_ahead(walkers, samples),
     )
 
 
