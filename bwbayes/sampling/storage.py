@@ -220,8 +220,10 @@ class ChainFile(Chain):
                     )  # fmt: skip
                     for row, part in enumerate(unpack_random_state(end.random_state)):
                         group.attrs[f"random_state_{row}"] = part
-                    group["chain"] = coordinates[:, number]
-                    group["log_prob"] = log_density[:, number]
+                    for name, series in (("chain", coordinates), ("log_prob", log_density)):
+                        values = series[:, number]
+                        # Not of a fixed length: emcee's sampler may go on with it.
+                        group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]))
                     group["accepted"] = accepted[number].astype(np.float64)
             draft.replace(file)
         except OSError as error:
