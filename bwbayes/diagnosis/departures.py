@@ -142,9 +142,11 @@ class Standardized:
         ``span`` are the lowest and the highest voltage of training, V, ``extent`` is the range of
         its readings, um.
         """
+        # A band that misses most of the readings has failed, unless that is likely luck.
+        limit = DOUBT if self._covered(95) < 0.5 else ALARM
         reasons = [
             *self._reversed(span),
-            *(text for text, chance in self.chances() if chance < ALARM),
+            *(text for text, chance in self.chances() if chance < limit),
         ]
         # Five readings six sds off, so that a bad start or spikes are not lost in a long record: a
         # good one has them once in five hundred million. A noise whose size is hardly known may
@@ -178,6 +180,36 @@ class Standardized:
         return reasons
 
     @property
+    def idle(self) -> str:
+        """That the readings decide nothing: any model covers a motion smaller than its band."""
+        width = float(np.mean((self.bands.upper["sensor", 95] - self.bands.mean)[self.scored])) * 2
+        motion = float(np.ptp(self.bands.mean[self.scored]))
+        if motion >= width:
+            return ""
+        return (
+            f"the 95% sensor band, {width:.3g} um, is wider than the motion of {motion:.3g} um; "
+            "validate on readings that move more"
+        )
+
+    @property
+    def excess_width(self) -> str:
+        """That the band is many times as wide as the sensor's noise; three are nine tenths of it.
+
+        Such a band covers nearly anything that the drive of training does.
+        """
+        whole, displacement = (
+            float(np.mean(self.bands.sd(kind)[self.scored] ** 2))
+            for kind in ("sensor", "displacement")
+        )
+        ratio = np.sqrt(whole / max(whole - displacement, 1e-9 * whole))
+        if ratio < 3:
+            return ""
+        return (
+            f"the 95% sensor band is {ratio:.2g} times as wide as the sensor's noise alone; most "
+            "of it is the model's error"
+        )
+
+    @property
     def offset_advice(self) -> str:
         """A large share of the offset in the variance, and the lead-in that makes it small."""
         lead, small = self.bands.lead_in, 0.15
@@ -202,14 +234,17 @@ class Standardized:
         residual: FloatArray = (self.bands.measured - self.bands.mean)[self.scored]
         return residual
 
+    def _covered(self, level: int) -> float:
+        """Part of the readings in a sensor band."""
+        assert self.bands.measured is not None
+        return float(np.mean(self.bands.covers("sensor", level, self.bands.measured)[self.scored]))
+
     def _coverage(self) -> Iterator[tuple[str, float]]:
         """Find levels at which fewer readings lie in the sensor band than stated."""
-        assert self.bands.measured is not None
         # Factors on the noise's sd, evenly probable, that the fit allows.
         scales = np.empty(0)
         for level in reversed(LEVELS):
-            hits = self.bands.covers("sensor", level, self.bands.measured)[self.scored]
-            covered, nominal = float(np.mean(hits)), level / 100
+            covered, nominal = self._covered(level), level / 100
             odds = covered / max(1 - covered, 1e-12) * (1 - nominal) / nominal
             if odds >= 1 / ODDS:
                 continue

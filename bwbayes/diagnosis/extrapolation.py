@@ -1,21 +1,25 @@
-"""Where a prediction leaves what was fitted: in voltage, speed, slowness or duration.
+"""For which drives bands were tested, and where a prediction leaves those.
 
-There the bands know how sure the parameters are, and of what else the actuator does only the creep
-after slower drives, by its prior (:mod:`bwbayes.inference.untried`): it saturates at higher
-voltages, lags behind faster ones, and drifts.
+In voltage, speed, reversals, slowness or duration. There the bands know how sure the parameters
+are, and of what else the actuator does only the creep after slower drives, by its prior
+(:mod:`bwbayes.inference.untried`): it saturates at higher voltages, lags behind faster ones, and
+drifts.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.reversals import fastest, time_between_turns
+from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
 
 # Part of the time between turning points over which a speed is taken: a sine's peak speed is then
 # 0.4% too low, and noise of 1% of its range adds a tenth.
@@ -26,6 +30,56 @@ PART = 0.1
 # decade: half a decade is half of the one or two percent that a model misses anyway.
 LONGER = 3.0
 
+# Mean distance of a drive's voltages and last reversals from those of training, in parts of the
+# range: of drives alike it is at most 0.02, of others at least 0.03.
+ALIKE = 0.025
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What training drove the actuator with: all that a validation on its readings speaks for.
+
+    Attributes
+    ----------
+    low, high
+        Lowest and highest voltage, V.
+    frequency
+        Of the fastest swing, Hz; 0 without any.
+    depths
+        Smallest and largest swing between two reversals, V; none without any.
+    """
+
+    low: float
+    high: float
+    frequency: float = 0.0
+    depths: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Self:
+        """Return the drive of the windows that were fitted."""
+        low, high = _fitted_range(posterior)
+        frequencies, depths = [], []
+        for dataset in posterior.datasets:
+            for window in dataset.training:
+                voltage = dataset.voltage[window]
+                turns = turning_points(voltage, RETURN * (high - low))
+                if turns.size > 1:
+                    fastest_swing = float(np.min(np.diff(turns))) * dataset.actuator.interval
+                    frequencies.append(0.5 / fastest_swing)
+                    depths += np.abs(np.diff(voltage[turns])).tolist()
+        if not depths:
+            return cls(low, high)
+        return cls(low, high, max(frequencies), (min(depths), max(depths)))
+
+    def __str__(self) -> str:
+        text = f"{self.low:.4g} to {self.high:.4g} V"
+        if self.depths is None:
+            return text
+        smallest, largest = self.depths
+        return (
+            f"{text}, up to {self.frequency:.2g} Hz, reversals of {smallest:.2g} to {largest:.3g} V"
+        )
+
 
 def beyond_training(
     posterior: Posterior,
@@ -35,8 +89,9 @@ def beyond_training(
 ) -> list[Finding]:
     """Return in what a drive leaves those that the model was fitted to.
 
-    Findings of kind "range" and "speed" leave what any model knows; "slow" and "duration" leave
-    room for creep and drift, which may be as small as the bands allow.
+    Findings of kind "range" and "speed" leave what any model knows, and "reversals" the loops on
+    which this one was tested; "slow" and "duration" leave room for creep and drift, which may be as
+    small as the bands allow.
 
     Parameters
     ----------
@@ -49,8 +104,7 @@ def beyond_training(
     window
         The samples that are predicted; those before are what the actuator went through.
     """
-    windows = [data.voltage[part] for data in posterior.datasets for part in data.training]
-    low, high = min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
+    low, high = _fitted_range(posterior)
     turn_times = [
         time_between_turns(data.voltage, data.actuator.interval, data.training)
         for data in posterior.datasets
@@ -60,7 +114,7 @@ def beyond_training(
     if np.min(planned) < low - slack or np.max(planned) > high + slack:
         text = (
             f"voltage {np.min(planned):.4g} to {np.max(planned):.4g} V exceeds the training range "
-            f"{low:.4g} to {high:.4g} V; the bands extrapolate"
+            f"{low:.4g} to {high:.4g} V; the bands extrapolate, their level untested"
         )
         findings.append(Finding("range", text, "train on a record that spans this range"))
     turn_time, speeds = time_between_turns(planned, interval), []
@@ -74,9 +128,17 @@ def beyond_training(
     if speed > 1.5 * slower:
         text = (
             f"voltage speed of up to {speed:.3g} V/s exceeds the {slower:.3g} V/s of training; the "
-            "bands extrapolate, because the lag is not known that well"
+            "bands extrapolate, their level untested, because the lag is not known that well"
         )
         findings.append(Finding("speed", text, "train on a record that is as fast"))
+    distance = _distance(posterior, (low, high), voltage, window)
+    if distance > ALIKE:
+        text = (
+            f"voltage and last reversal are {100 * distance:.2g}% of the range away from those of "
+            "training on average; the bands' level is untested on these loops"
+        )
+        fix = "train on a record with reversals at all voltages, such as a multisine"
+        findings.append(Finding("reversals", text, fix))
     findings += _slow(posterior, (low, high), min(turn_times), voltage, interval, window)
     duration = voltage[: window.stop].size * interval
     before = max(
@@ -85,10 +147,49 @@ def beyond_training(
     if duration > LONGER * before:
         text = (
             f"duration of {duration:.4g} s exceeds the {before:.4g} s of training; the bands "
-            "extrapolate, with slow creep at its prior and no drift"
+            "extrapolate, their level untested, with slow creep at its prior and no drift"
         )
         findings.append(Finding("duration", text, "train on a record that is as long"))
     return findings
+
+
+def _fitted_range(posterior: Posterior) -> tuple[float, float]:
+    """Lowest and highest voltage that was fitted, V."""
+    windows = [data.voltage[part] for data in posterior.datasets for part in data.training]
+    return min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
+
+
+def _distance(
+    posterior: Posterior, span: tuple[float, float], voltage: FloatArray, window: slice
+) -> float:
+    """Mean distance of a drive's loops from the nearest ones of training, in parts of the range.
+
+    Rate-independent memory goes along a branch that begins at the last reversal.
+    """
+    extent = span[1] - span[0]
+    fitted = np.concatenate(
+        [
+            _branches(data.voltage, part, RETURN * extent)
+            for data in posterior.datasets
+            for part in data.training
+        ]
+    )
+    # What is beyond the range is said by itself; a drive without a reversal has no loop.
+    planned = _branches(np.clip(voltage, *span), window, RETURN * extent)
+    if not (fitted.size and planned.size):
+        return 0.0
+    distances, _ = scipy.spatial.KDTree(fitted / extent).query(planned / extent)
+    return float(np.mean(distances))
+
+
+def _branches(voltage: FloatArray, window: slice, threshold: float) -> FloatArray:
+    """Voltage and last reversal (samples, 2), V, of some thousand samples after a reversal."""
+    turns = turning_points(voltage[: window.stop], threshold)
+    rows = np.arange(voltage.size)[window]
+    rows = rows[:: max(rows.size // 5_000, 1)]
+    number = np.searchsorted(turns, rows, side="right")
+    rows, number = rows[number > 0], number[number > 0]
+    return np.stack([voltage[rows], voltage[turns[number - 1]]], axis=1)
 
 
 def _slow(
@@ -130,7 +231,7 @@ def _slow(
         reached = f"at {('least', 'most')[side]} {(sides * before)[side, at]:.3g} V"
         text = (
             f"voltage averages {planned[side, at]:.3g} V over {times[at]:.3g} s, in training "
-            f"{reached}; the bands extrapolate, with slow creep at its prior"
+            f"{reached}; the bands extrapolate, their level untested, with slow creep at its prior"
         )
         yield Finding("slow", text, "train on a record that is as slow, or is held as long")
 

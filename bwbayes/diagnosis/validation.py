@@ -244,6 +244,8 @@ def assess(
         span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
         p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
         notes = (f"the lead-in of {span} s does not fit the model ({p_value})",)
+    if bands.training and standard.excess_width:
+        notes += (standard.excess_width,)
     verdict = Verdict(bands.name, bands.training, True, notes=notes, separate=bands.separate)
     if reasons:
         why = joined(likely_causes(explanations)) or (
@@ -265,6 +267,8 @@ def assess(
         parts = all(each.changes for each in better_models(explanations))
         way = "; --improve adds it" if parts else ", which no key of [model] adds"
         doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){way}")
+    if standard.idle and not bands.training:
+        doubts.append(standard.idle)
     least = 5.0  # worth fewer independent readings a record cannot show that bands hold
     if standard.effective_size < least:
         doubts.append(

@@ -66,7 +66,9 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     )
     cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
     text = f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
-    moves = Text(text, on="screen")
+    moves = [Text(text, on="screen")]
+    if result.outcome.converged and result.verdicts and not result.standing.headline:
+        moves.append(Text(f"validation passed {_scope(result)}", on="screen"))
     shown = ("record", "fitted", "model", "noise")
     about = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
     held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
@@ -75,7 +77,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
         title=result.name,
         about="; ".join(about),
         banners=[*_verdict_banners(result, numbers), *remarks_banner(result.remarks)],
-        blocks=[*blocks, moves, *_details(result, numbers, pictures)],
+        blocks=[*blocks, *moves, *_details(result, numbers, pictures)],
     )
 
 
@@ -89,7 +91,7 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
         if result.verdicts:
             is_held_out = any(not verdict.training for verdict in result.verdicts.values())
             data = "held-out data" if is_held_out else "the training data"
-            headline += f"; validation passed on {data}"
+            headline += f"; validation passed on {data}, {_scope(result)}"
         return [Banner("good", headline, blocks=_results(result), on="page")]
     meaning = (
         "the readings do not tell whether the bands hold"
@@ -108,6 +110,11 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
     blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), glossary]
     (on_screen,) = standing_banner(standing, on="screen")
     return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
+
+
+def _scope(result: Result) -> str:
+    """Return what a validation that passed speaks for: no other drives than those of training."""
+    return f"for drives like the training record's ({result.facts['drive']})"
 
 
 def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:

@@ -126,7 +126,7 @@ def run(
         moves={"differential evolution": (1000, 123), "mixture": (3800, 1221)},
         bands=every,
         scores={b.name: scores() for b in every if b.measured is not None},
-        facts={"record": "made up"},
+        facts={"record": "made up", "drive": "-100 to 100 V"},
         remarks=("the sensor was clipped",),
         truth={"d": 0.7, "lag": 2e-3},
     )

@@ -44,7 +44,7 @@ walkers = 18
 window = [5.0, 6.0]
 
 [validation.sine]
-signal = { amplitude = 60.0, frequency = 0.5, duration = 4.0 }
+signal = { amplitude = 75.0, frequency = 0.5, duration = 4.0 }
 from_rest = true
 """
 

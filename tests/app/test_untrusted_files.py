@@ -227,7 +227,7 @@ def page(text: str, converged: bool) -> str:
     run: Result = example.run(converged, parameters=tuple(odd))
     origin = Record(np.arange(20.0), None, 1.0, origin=text).origin
     run = dataclasses.replace(
-        run, name=text, remarks=(text,), facts={"record": origin, "config": text}
+        run, name=text, remarks=(text,), facts={"record": origin, "drive": text, "config": text}
     )
     return example.page(run, pictures={"trace": b"png"})
 

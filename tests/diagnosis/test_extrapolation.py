@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from tests.inference.problems import short_posterior
@@ -54,7 +56,8 @@ def test_range_and_speed_are_said_one_by_one() -> None:
     assert ["range", "speed"] == kinds(SLOW, sine(5.0, 1e-3, 100.0), 1e-3)
     (wide,) = beyond_training(SLOW, sine(0.1, 0.05, 100.0), 0.05)
     assert wide.text == (
-        "voltage 0 to 200 V exceeds the training range 0 to 150 V; the bands extrapolate"
+        "voltage 0 to 200 V exceeds the training range 0 to 150 V; the bands extrapolate, "
+        "their level untested"
     )
 
 
@@ -91,21 +94,54 @@ def test_slowness_is_remarked_on_from_a_factor_of_three(
 def test_rest_small_drives_and_long_ones_of_the_same_frequency_are_not_slow() -> None:
     rested = np.where(TIME < 4, 75 * np.sin(4 * np.pi * TIME), 0.0)
     small = 5 * np.sin(0.2 * np.pi * TIME)
-    assert [] == [*kinds(FAST, rested, 0.005), *kinds(FAST, small, 0.005)]
+    assert [] == kinds(FAST, rested, 0.005)
+    assert ["reversals"] == kinds(FAST, small, 0.005)
     repeated = np.tile(FAST.only.voltage, 4)
     assert ["duration"] == kinds(FAST, repeated, 0.005)
     assert [] == kinds(fitted(repeated, 0.005), FAST.only.voltage, 0.005)
 
 
 def test_held_out_part_of_the_same_drive_is_no_extrapolation() -> None:
-    """Noise of half a volt, decaying amplitudes, and every rate from 50 Hz to 2 kHz."""
+    """Noise of half a volt, and every rate from 50 Hz to 2 kHz; its twin has smaller loops."""
     generator = np.random.default_rng(1)
     alarms = 0
     for _ in range(100):
         interval, other = 10 ** generator.uniform(-3.3, -1.7, 2)
         one = sine(1.0, interval, periods=5.0)
         two = sine(1.0, other, periods=generator.uniform(1.0, 5.0))
-        two *= np.linspace(1.0, 0.5, two.size)
         noise = [0.5 * generator.standard_normal(v.size) for v in (one, two)]
-        alarms += len(beyond_training(fitted(one + noise[0], interval), two + noise[1], other))
+        posterior, decay = fitted(one + noise[0], interval), np.linspace(1.0, 0.5, two.size)
+        alarms += len(beyond_training(posterior, two + noise[1], other))
+        assert set(kinds(posterior, decay * two + noise[1], other)) <= {"reversals"}
     assert alarms == 0
+
+
+def test_a_drive_is_told_by_its_range_its_fastest_swing_and_its_reversals() -> None:
+    """Noise makes no reversal, and of a ramp alone the range is all there is to say."""
+    decay = 50 + 40 * np.exp(-0.2 * TIME) * np.sin(2 * np.pi * 1.5 * TIME)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(TIME.size)
+    for voltage in (decay, decay + noise):
+        drive = Drive.of(fitted(voltage, 0.005))
+        assert drive.depths is not None
+        smallest, largest = drive.depths
+        assert abs(drive.frequency - 1.5) < 0.2
+        assert abs(drive.low - voltage.min()) + abs(drive.high - voltage.max()) == 0
+        assert smallest < 8
+        assert abs(largest - np.ptp(decay)) < 2
+    text = "13.81 to 88.7 V, up to 1.5 Hz, reversals of 4.3 to 74.9 V"
+    assert str(Drive.of(fitted(decay, 0.005))) == text
+    assert str(Drive.of(fitted(5 * TIME, 0.005))) == "0 to 79.98 V"
+
+
+@settings(max_examples=20, deadline=None)
+@given(phase=st.floats(0, 6.2), frequency=st.floats(0.3, 2.0), low=st.floats(-20, 20))
+def test_a_drive_with_reversals_elsewhere_is_told_from_the_same_one_again(
+    phase: float, frequency: float, low: float
+) -> None:
+    """At any frequency, for rate-independent memory knows none. The twin never goes below."""
+    decay = np.exp(-0.1 * TIME)
+    posterior = fitted(75 * decay * np.sin(4 * np.pi * TIME), 0.005)
+    again = 75 * decay * np.sin(2 * np.pi * frequency * TIME + phase)
+    elsewhere = low + (70 - low) * (1 + np.sin(2 * np.pi * frequency * TIME + phase)) / 2
+    assert "reversals" not in kinds(posterior, again, 0.005)
+    assert "reversals" in kinds(posterior, elsewhere, 0.005)

@@ -237,6 +237,46 @@ def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     assert verdict.cause is None
 
 
+def test_a_band_that_misses_most_of_a_short_record_fails() -> None:
+    """However few independent readings it is worth: 3 s of a discrepancy that forgets in 1 s.
+
+    The twin is the same record with its bands.
+    """
+    for number in range(20):
+        record = made(np.random.default_rng([10, number]), length=3.0, memory=1.0)
+        background = Background(record.memory, 0.0, FITTED)
+        bands = bands_of(record, 3.5 * float(record.sds["sensor"].mean()))
+        assert bands.measured is not None
+        covered = np.mean(bands.covers("sensor", 95, bands.measured))
+        if covered < 0.28:
+            assert judged(bands, background).holds is False
+        assert judged(bands_of(record), background).holds is None
+
+
+def test_a_band_wider_than_the_motion_decides_nothing() -> None:
+    """Held out, a rest passes whatever the model does; what was fitted may rest."""
+    record = made(np.random.default_rng(2), length=30)
+    still = replace(record, mean=0.01 * record.mean)
+    background = Background(record.memory, 0.0, FITTED)
+    verdict = judged(bands_of(still), background)
+    assert verdict.holds is None
+    assert "is wider than the motion of" in verdict.reasons[0]
+    assert judged(bands_of(record), background).holds is True
+
+
+@pytest.mark.parametrize(("discrepancy", "noted"), [(0.1, False), (3.0, True)])
+def test_a_band_many_times_wider_than_the_noise_is_noted(discrepancy: float, noted: bool) -> None:
+    """Once, of what was fitted; it decides nothing."""
+    record = made(
+        np.random.default_rng(2), length=30, memory=0.1, discrepancy=discrepancy, parameters=0.01
+    )
+    background = Background(record.memory, 0.0, FITTED)
+    verdict = judged(bands_of(record, training=True), background)
+    assert verdict.holds is True
+    assert noted == any("as wide as the sensor's noise alone" in note for note in verdict.notes)
+    assert () == judged(bands_of(record), background).notes
+
+
 def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
     """It is the likely cause where the bands fail after it."""
     record = made(np.random.default_rng(3), length=30)

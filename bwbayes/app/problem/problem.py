@@ -46,7 +46,7 @@ from bwbayes.app.problem.records import (
     windows_of,
 )
 from bwbayes.arrays import IntArray
-from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
@@ -165,7 +165,8 @@ class Problem:
                 for w in self.posterior.alone(name).only.training
             )
         model = self.config.model
-        return facts | {"model": in_words(model), "noise": model.noise}
+        drive = str(Drive.of(self.posterior))
+        return facts | {"drive": drive, "model": in_words(model), "noise": model.noise}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -186,7 +187,10 @@ class Problem:
             record, windows = validation.record or self.records[validation.of], validation.windows
             window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
             voltage = record.path.voltage
-            found[name] = beyond_training(self.posterior, voltage, record.interval, window)
+            beyond = beyond_training(self.posterior, voltage, record.interval, window)
+            # A held-out part goes on with the loops of the rest, and its readings test them.
+            part = validation.record is None
+            found[name] = [each for each in beyond if not (part and each.kind == "reversals")]
         return found
 
     def reconfigured(
