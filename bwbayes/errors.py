@@ -7,11 +7,14 @@ line and ends with status 2. Anything else is a defect of bwbayes and keeps its 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from enum import IntEnum
+from pathlib import PurePath
 from shlex import quote
+from typing import Any
 
 # Of a longer text, as a stranger's file may cause, the beginning and the end are shown.
 LONGEST = 600
@@ -58,13 +61,13 @@ class ColumnsError(InputError):
     def __init__(
         self,
         problem: str,
-        columns: Mapping[str, str],
+        columns: Mapping[str, str | int],
         units: Mapping[str, str],
         place: str = "record",
         fs: float | None = None,
     ) -> None:
         self.problem, self.place, self.fs = problem, place, fs
-        self.guess = {"columns": dict(columns), "units": dict(units)}
+        self.guess: dict[str, dict[str, Any]] = {"columns": dict(columns), "units": dict(units)}
         said = [f"{key}={table!r}" for key, table in self.guess.items() if table]
         said += [] if fs is None else [f"fs={fs:g}"]
         super().__init__(f"{problem}; say {', '.join(said)}")
@@ -89,10 +92,10 @@ class ColumnsError(InputError):
         return InputError(f"{self.problem}; copy and correct: {typed}")
 
 
-def with_naming(command: str, tables: Mapping[str, Mapping[str, str]], fs: float | None) -> str:
+def with_naming(command: str, tables: Mapping[str, Mapping[str, Any]], fs: float | None) -> str:
     """Return a command with the options that say columns and units by quantity, and the rate."""
     options = [
-        f"--{key.removesuffix('s')} {quantity}={quote(text)}"
+        f"--{key.removesuffix('s')} {quantity}={quote(str(text))}"
         for key, table in tables.items()
         for quantity, text in table.items()
     ]
@@ -119,6 +122,11 @@ def suggestion(word: str, known: Collection[str], meanings: Mapping[str, str] | 
         return f"did you mean {meant}?"
     near = get_close_matches(word, known, 1)
     return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+
+
+def path_text(path: str | PurePath) -> str:
+    r"""Return a path as text in which bytes that are not UTF-8 are written as ``\xe4``."""
+    return os.fsencode(path).decode("utf-8", errors="backslashreplace")
 
 
 def one_line(text: str) -> str:

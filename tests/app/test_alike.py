@@ -44,7 +44,7 @@ def kinds(draw: st.DrawFn) -> tuple[list[str], list[str], RecordConfig]:
     names = draw(st.lists(st.sampled_from(NAMES), min_size=count, max_size=count, unique=True))
     by_number = draw(st.booleans())
     where = {q: quantities.index(q) for q in QUANTITIES}
-    columns = {q: str(i + 1) if by_number else names[i] for q, i in where.items()}
+    columns: dict[str, str | int] = {q: i + 1 if by_number else names[i] for q, i in where.items()}
     keys: dict[str, Any] = {
         "units": {
             "time": "ms",

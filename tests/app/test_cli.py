@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -296,3 +297,24 @@ def test_a_files_own_columns_are_recognized(
     result = json.loads((tmp_path / "bands.json").read_text())
     assert record.samples == result["samples"]
     assert result["holds"] in (True, None)
+
+
+def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_path: Path) -> None:
+    """All but those of the columns, which it settles; the rate too."""
+    path = tmp_path / "bench 3.csv"
+    path.write_text(lines("amp,laser", *(row.partition(",")[2] for row in ROWS)))
+    given = ("--fs", "200", "--out", "my results", "--seed", "3", "--improve")
+    said = bwbayes("run", str(path), "--column", "voltage=amp", *given).err
+    begin = f"copy and correct: bwbayes run '{path}' --out 'my results' --seed 3 --improve "
+    assert begin in said
+    assert "--column voltage=amp" in said
+    assert said.rstrip().endswith("--fs 200")
+
+
+def test_a_files_name_need_not_be_utf_8(bwbayes: Type, tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/messung_\xe4.csv"))
+    path.write_text(lines(HEADER, *ROWS))
+    config = tmp_path / "a.toml"
+    assert bwbayes("init", str(path), "--out", str(config)).status == 0
+    assert r"messung_\\xe4.csv" in config.read_text(encoding="utf-8")
+    assert bwbayes("check", str(config), "--out", str(tmp_path / "check")).status == 0

@@ -57,7 +57,11 @@ def assert_same(record: Record, sign: float = 1.0) -> None:
             "no column 'poss' for the displacement; choose another.",
         ),
         ({}, {}, r"which unit has 'pos' \(displacement\)\? .* 'pos' \(-3.*; say .*units={'disp"),
-        ({}, {"displacement": "in"}, "units: displacement in 'in' is unknown; write um, nm, mm, m"),
+        (
+            {},
+            {"displacement": "ell"},
+            "units: displacement in 'ell' is unknown; write um, nm, mm, m",
+        ),
         ({}, UNIT | {"displacement": "s"}, "units: displacement in 's' is unknown"),
         ({"position": "pos"}, UNIT, "columns: no quantity 'position'; write time, voltage, disp"),
         ({"voltage": "pos"}, UNIT, "columns: two quantities have the same column"),
@@ -135,7 +139,7 @@ def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> Non
     """Asked for where no column rises: a thermometer's is not guessed to be the time."""
     values = {"voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT, "temp_C": np.cos(TIME)}
     path = write(tmp_path / "a.h5", values)
-    line = r"what is the sampling rate, Hz \(no column can be the time\)\?.*; say fs=1000"
+    line = r"what is the sampling rate, Hz \(no column can be .* mean nothing\)\?.*; say fs=1000"
     with pytest.raises(ColumnsError, match=line) as caught:
         read_record(path)
     assert {"columns": {}, "units": {}} == caught.value.guess
@@ -222,6 +226,55 @@ def test_times_from_1970_need_no_unit(name: str, unit: tuple[str, int], start: i
     assert_same(Record.from_pandas(frame))
     with pytest.raises(ColumnsError, match="which unit has"):
         Record.from_pandas(frame.assign(**{name: frame[name] / 1e11}))
+
+
+def test_a_position_that_was_read_is_proposed_before_one_that_was_asked_for(tmp_path: Path) -> None:
+    for demand in ("Target Position", "Set Point", "Commanded Position", "Reference"):
+        values = {"time_s": TIME, "voltage_V": VOLTAGE, demand: VOLTAGE, "Actual Position": TIME**2}
+        with pytest.raises(ColumnsError) as caught:
+            read_record(write(tmp_path / "a.csv", values))
+        assert caught.value.guess["columns"] == {"displacement": "Actual Position"}
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("Å", 1e-4), ("mil", 25.4), ("in", 25_400.0), ("um", 1.0)]
+)
+@pytest.mark.parametrize(("clock", "seconds"), [("min", 60.0), ("h", 3600.0), ("ms", 1e-3)])
+def test_units_beside_those_of_the_si_are_known(
+    unit: str, factor: float, clock: str, seconds: float
+) -> None:
+    """In brackets; an ending alone may mean something else, and is only guessed."""
+    values = (TIME / seconds, VOLTAGE, DISPLACEMENT / factor)
+    names = [f"t [{clock}]", "U [V]", f"pos ({unit})"]
+    assert_same(Record.from_pandas(pd.DataFrame(dict(zip(names, values, strict=True)))))
+    frame = pd.DataFrame({"t_min": TIME, "voltage_V": VOLTAGE, "stroke_in": DISPLACEMENT})
+    with pytest.raises(ColumnsError) as caught:
+        select(frame_source(frame, "a"), Naming())
+    assert caught.value.guess["units"] == {"time": "min", "displacement": "in"}
+
+
+def test_a_unit_that_is_none_of_the_quantity_is_said(tmp_path: Path) -> None:
+    values = {"time_s": TIME, "Spannung (%)": VOLTAGE, "Weg (Inkr)": DISPLACEMENT}
+    line = r"how many V is 1 % of 'Spannung \(%\)', and how many um is 1 Inkr of 'Weg \(Inkr\)'\?"
+    with pytest.raises(ColumnsError, match=line):
+        read_record(write(tmp_path / "a.csv", values))
+
+
+@given(st.permutations(["time", "voltage", "displacement"]))
+def test_a_number_is_that_of_a_column_whatever_the_names_are(order: list[str]) -> None:
+    """Also where a column's name is another's number."""
+    values = dict(
+        zip(["time", "voltage", "displacement"], (TIME, VOLTAGE, DISPLACEMENT), strict=True)
+    )
+    frame = pd.DataFrame({str(3 - i): values[quantity] for i, quantity in enumerate(order)})
+    columns: Any = {quantity: np.int64(order.index(quantity) + 1) for quantity in order}
+    table = select(
+        frame_source(frame, "a"),
+        Naming(columns, {"time": "s", "voltage": "V", "displacement": "um"}),
+    )
+    np.testing.assert_array_equal(table.columns["voltage"].values, VOLTAGE)
+    with pytest.raises(InputError, match=r"columns: displacement: 1.5 is no name and no number"):
+        Naming({"displacement": 1.5})  # type: ignore[dict-item]
 
 
 # Names and units

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -189,6 +190,79 @@ def test_thousands_are_read_whatever_marks_them(
     assert 0.005 == record.interval
     np.testing.assert_allclose(record.voltage, expected[0], rtol=1e-12)
     np.testing.assert_allclose(np.asarray(record.displacement), expected[1], rtol=1e-12)
+
+
+@given(
+    start=st.integers(0, 1),
+    form=st.sampled_from([".6f", ".18e", ".1f", "g", "d"]),
+    separator=st.sampled_from([",", ";", "\t", " "]),
+    seed=st.integers(0, 2**32),
+)
+def test_numbers_for_names_are_no_reading_and_a_first_sample_of_such_is_one(
+    tmp_path_factory: pytest.TempPathFactory, start: int, form: str, separator: str, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    columns = [5.0 * np.arange(60), *np.rint(rng.uniform(-300, 300, (2, 60)))]
+    rows = [
+        separator.join(f"{int(x) if form == 'd' else x:{form}}" for x in row)
+        for row in zip(*columns, strict=True)
+    ]
+    path = tmp_path_factory.getbasetemp() / "numbered.csv"
+    units = {"time": "ms", "voltage": "V", "displacement": "um"}
+    options: dict[str, Any] = {
+        "columns": {"time": 1, "voltage": 2, "displacement": 3},
+        "units": units,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        path.write_text(lines(separator.join(str(start + i) for i in range(3)), *rows))
+        record = read_record(path, **options)
+        assert (60, 0.005) == (record.samples, record.interval)
+        np.testing.assert_array_equal(record.voltage, columns[1])
+        ramp = [separator.join(f"{x + i:g}" for x in range(3)) for i in range(60)]
+        path.write_text(lines(*ramp))
+        assert 60 == read_record(path, **options).samples
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "# time (s) voltage (V) displacement (um)",
+        "# elapsed time (s) drive voltage [V] sensor displacement (um)",
+        "time(s) voltage(V) displacement(um)",
+        "time / s voltage / V displacement / um",
+        "elapsed time [s]  drive voltage [V]  displacement [um]",
+    ],
+)
+def test_names_of_several_words_stand_above_numbers_between_blanks(
+    tmp_path: Path, header: str
+) -> None:
+    text = lines(header, *(row.replace(",", " ") for row in ROWS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        assert read(tmp_path, text).sha256 == read(tmp_path, GOOD).sha256
+
+
+@pytest.mark.parametrize(
+    "end", [[",,"], [",,", '"","",""', ""], ["0.150,,"], ["0.150,,", "0.155,,"]]
+)
+def test_rows_without_a_voltage_and_a_displacement_at_the_end_are_none(
+    tmp_path: Path, end: list[str]
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        assert read(tmp_path, lines(*LINES, *end)).sha256 == read(tmp_path, GOOD).sha256
+
+
+def test_of_equal_columns_of_one_name_one_is_taken_and_of_others_none(tmp_path: Path) -> None:
+    twice = [f"{line},{line.split(',')[1]}" for line in LINES]
+    with (
+        pytest.warns(InputWarning, match=r"columns 2, 4 are all 'voltage_V' with equal numbers"),
+        pytest.warns(InputWarning, match="ignored columns"),
+    ):
+        assert read(tmp_path, lines(*twice)).sha256 == read(tmp_path, GOOD).sha256
+    twice[5] += "1"
+    assert "which column is the voltage" in fault(tmp_path, lines(*twice))
 
 
 def test_decimals_of_three_digits_are_no_thousands(tmp_path: Path) -> None:
@@ -386,7 +460,7 @@ FAULTS: dict[str, tuple[str | bytes, str]] = {
     "no unit": (GOOD.replace("voltage_V", "voltage"), ":1: which unit has 'voltage' "),
     "no times": (
         lines(*(line.partition(",")[2] for line in LINES)),
-        ":1: what is the sampling rate, Hz (no column can be the time)? There",
+        ":1: what is the sampling rate, Hz (no column can be the time; with any other rate dyn",
     ),
     "empty file": ("", ": the file is empty"),
     "one long line": ('{"time": [' + "0.125, " * 30_000 + "0]}", ": a line of 210013 characters;"),

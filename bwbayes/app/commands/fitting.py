@@ -11,6 +11,7 @@ from rich.console import Console
 
 from bwbayes.app.commands.shared import (
     FILE,
+    command_as_typed,
     finish,
     folder_argument,
     naming_options,
@@ -26,6 +27,7 @@ from bwbayes.errors import (
     ColumnsError,
     InputError,
     NoNumbersError,
+    path_text,
     refuse_unwritable,
     with_naming,
 )
@@ -47,7 +49,7 @@ def init(record: Path, out: Path | None, **naming: Any) -> int:
     out = out or record.with_suffix(".toml")
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    proposal = _proposed(record, out.parent, naming, "init")
+    proposal = _proposed(record, out.parent, naming)
     with refuse_unwritable(out, "choose another place with --out"):
         out.write_text(proposal.text, encoding="utf-8")
     _show(proposal, f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`")
@@ -111,7 +113,7 @@ def run(
             from bwbayes.report.tables import priors_table
 
         chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
-        chosen = chosen.renamed(config.stem, seed)
+        chosen = chosen.renamed(path_text(config.stem), seed)
         path = out or Path("results") / config.stem
         if improve:
             RunFolder.require_free(path, overwrite)
@@ -182,7 +184,7 @@ def _config_or_proposal(
             )
         return config if record is None else config.with_record(record), False
     try:
-        proposal = _proposed(path, path.parent, naming, command)
+        proposal = _proposed(path, path.parent, naming)
     except NoNumbersError:
         raise InputError(
             f"{path}: is no config, and no record; a config has a table [record], a record columns "
@@ -206,7 +208,7 @@ def _config_or_proposal(
     return config if record is None else config.with_record(record), True
 
 
-def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> ConfigProposal:
+def _proposed(path: Path, where: Path, naming: dict[str, Any]) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
     try:
         with working():
@@ -215,7 +217,7 @@ def _proposed(path: Path, where: Path, naming: dict[str, Any], command: str) -> 
 
             return propose(path, where, Naming(**naming))
     except ColumnsError as error:
-        raise error.in_command(f"bwbayes {command} {shlex.quote(str(path))}") from None
+        raise error.in_command(command_as_typed()) from None
 
 
 def _show(proposal: ConfigProposal, conclusion: str) -> None:

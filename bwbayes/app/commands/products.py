@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import click
 
 from bwbayes.app.commands.shared import (
     FILE,
+    command_as_typed,
     folder_argument,
     naming_options,
     options_of,
@@ -102,8 +102,7 @@ def predict(
             options |= {"name": name, "own_offset": not same_offset, "watch": watch}
             bands = predict_record(fit, other, **options)
         except ColumnsError as error:
-            line = f"bwbayes predict {quote(str(folder))} --record {quote(str(record))}"
-            raise error.in_command(line) from None
+            raise error.in_command(command_as_typed()) from None
         write_prediction(bands, files, fit.standing)
     unmeasured, remarks = bands.measured is None, list[str]()
     if unmeasured and record is not None:

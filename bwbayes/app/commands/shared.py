@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 
 from bwbayes.app.config import LARGEST_SEED
@@ -172,6 +174,29 @@ def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) ->
             raise InputError(f"{flag} {text}: write {flag} displacement=..., with a value")
     pairs = (text.partition("=") for text in texts)
     return {quantity.strip(): value.strip() for quantity, _, value in pairs}
+
+
+def command_as_typed() -> str:
+    """Return the command as it was typed, but for the options that say which columns are meant."""
+    context = click.get_current_context()
+    words = ["bwbayes", str(context.info_name)]
+    for parameter in context.command.params:
+        key = str(parameter.name)
+        if (
+            key in ("columns", "units", "fs")
+            or context.get_parameter_source(key) != ParameterSource.COMMANDLINE
+        ):
+            continue
+        value = context.params[key]
+        is_option = isinstance(parameter, click.Option)
+        for given in value if is_option and parameter.multiple else [value]:
+            if isinstance(parameter, click.Option) and parameter.is_flag:
+                words += [parameter.opts[0] if given else parameter.secondary_opts[0]]
+            else:
+                values = given if isinstance(given, tuple) else [given]
+                words += [parameter.opts[0]] * is_option
+                words += [f"{item:g}" if isinstance(item, float) else str(item) for item in values]
+    return shlex.join(words)
 
 
 def show_report(report: Report) -> None:

@@ -24,7 +24,7 @@ import scipy
 from bwbayes.app.config.config import Config, parse
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
-from bwbayes.errors import InputWarning
+from bwbayes.errors import InputWarning, path_text
 from bwbayes.model.registry import DYNAMICS
 from bwbayes.model.reversals import rate
 from bwbayes.record import Record
@@ -121,10 +121,13 @@ def _text(
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     # A JSON string is a TOML string too, except for DEL, which no column's name has.
     quoted = partial(json.dumps, ensure_ascii=False)
-    source = f"file = {quoted(Path(os.path.relpath(path.absolute(), where.absolute())).as_posix())}"
+    relative = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
+    source = f"file = {quoted(path_text(relative))}"
     for key, table in (("columns", naming.columns), ("units", naming.units)):
         if table:
-            pairs = ", ".join(f"{quantity} = {quoted(name)}" for quantity, name in table.items())
+            pairs = ", ".join(
+                f"{quantity} = {quoted(column)}" for quantity, column in table.items()
+            )
             source += f"\n{key} = {{ {pairs} }}"
     source += "" if naming.fs is None else f"\nfs = {naming.fs!r}"
     command = ""

@@ -81,7 +81,7 @@ class _Source(ConfigTable):
     """Whether the voltage is the command that a DAC held, or the amplifier's measured output; by
     default what the file says, else the output.
     """
-    columns: dict[str, str] | None = key(
+    columns: dict[str, str | int] | None = key(
         None, example='{ time = "t [ms]", voltage = "U_mV", displacement = "3" }'
     )
     """The file's columns by quantity, where their names are not like voltage_V: names, the ends of

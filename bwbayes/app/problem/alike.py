@@ -12,8 +12,9 @@ from typing import Any
 
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.errors import InputWarning
+from bwbayes.record.io.columns import series_named
 from bwbayes.record.io.formats import read_source
-from bwbayes.record.io.series import Series
+from bwbayes.record.io.series import Source
 
 
 def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
@@ -28,14 +29,9 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     }
     if not stated or source.file is None:
         return None
-    series = _series(folder / source.file)
-    names = [item.name for item in series]
-    labels = {item.label: item.name for item in series}
-    columns = {}
-    for quantity, column in (source.columns or {}).items():
-        word = column.strip()
-        by_number = word not in (*names, *labels) and word.isdecimal()
-        columns[quantity] = names[int(word) - 1] if by_number else labels.get(word, word)
+    content = _content(folder / source.file)
+    columns = {q: series_named(content, c, q).name for q, c in (source.columns or {}).items()}
+    names = [item.name for item in content.series]
     return {**stated, "columns": columns, "all_columns": names}
 
 
@@ -49,7 +45,7 @@ def options_alike(path: str | Path, noted: dict[str, Any] | None) -> dict[str, A
     """
     if noted is None:
         return {}
-    names = {item.name for item in _series(Path(path))}
+    names = {item.name for item in _content(Path(path)).series}
     if not names <= {*noted.get("all_columns", ())}:
         return {}
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
@@ -57,7 +53,7 @@ def options_alike(path: str | Path, noted: dict[str, Any] | None) -> dict[str, A
     return options | {"columns": columns}
 
 
-def _series(path: Path) -> tuple[Series, ...]:
+def _content(path: Path) -> Source:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # said where the record is read
-        return read_source(path).series
+        return read_source(path)

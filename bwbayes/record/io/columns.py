@@ -8,6 +8,7 @@ the series that there are and a guess.
 
 from __future__ import annotations
 
+import operator
 import re
 import warnings
 from collections import Counter
@@ -25,12 +26,15 @@ from bwbayes.record.io.units import (
     COMMON_UNITS,
     QUANTITIES,
     epoch_unit,
-    power_of,
     rates_by_unit,
     scale_of,
     unit_in,
+    unit_in_brackets,
+    unit_scale,
 )
 
+# In the names of displacements that are asked for, not measured.
+_DEMANDS = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
 # What other people call the quantities, in lower case and without a unit.
 _WORDS = {
     "time": (
@@ -73,7 +77,7 @@ class Naming:
         or a rate that is none.
     """
 
-    columns: Mapping[str, str] = field(default_factory=dict)
+    columns: Mapping[str, str | int] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     fs: float | None = None
 
@@ -92,6 +96,15 @@ class Naming:
                 )
             if quantity == "time" and scale[0] < 0:
                 raise InputError("units: time does not run backwards; remove the minus")
+        for quantity, column in self.columns.items():
+            if not isinstance(column, str) and (
+                isinstance(column, bool) or not hasattr(column, "__index__")
+            ):
+                raise InputError(f"columns: {quantity}: {column!r} is no name and no number")
+        columns = {
+            q: c if isinstance(c, str) else operator.index(c) for q, c in self.columns.items()
+        }
+        object.__setattr__(self, "columns", columns)
         if len(set(self.columns.values())) < len(self.columns):
             raise InputError("columns: two quantities have the same column; give each its own")
         if self.fs is not None and not 0 < self.fs < np.inf:
@@ -163,7 +176,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     InputWarning
         If a column is recognized by nothing but its unit, or columns of a text are ignored.
     """
-    chosen = {q: _named(source, name, q) for q, name in naming.columns.items()}
+    chosen = {q: series_named(source, name, q) for q, name in naming.columns.items()}
     by_unit = _recognize(source, chosen, naming)
     timed = [series for quantity, series in chosen.items() if quantity != "time"] or source.series
     has_rate = naming.fs is not None or all(series.clock for series in timed)
@@ -210,14 +223,21 @@ def _warn(remark: str) -> None:
     warnings.warn(one_line(remark), InputWarning, stacklevel=5)
 
 
-def _named(source: Source, name: str, quantity: str) -> Series:
-    """Return the series that a naming means: by its path, the end of its path, or its number."""
-    exact = [s for s in source.series if s.name == name.strip()]
-    matches = exact or [s for s in source.series if s.label == name.strip()]
+def series_named(source: Source, name: str | int, quantity: str) -> Series:
+    """Return the series that a naming means: by its path, the end of its path, or its number.
+
+    Raises
+    ------
+    InputError
+        There is none, or several.
+    """
+    word = str(name).strip()
+    exact = [s for s in source.series if s.name == word and name == str(name)]
+    matches = exact or [s for s in source.series if s.label == word and name == str(name)]
     if not matches:  # without its unit, which a reader may have appended
-        matches = [s for s in source.series if name.strip() == _bare(s.label, quantity)]
-    if not matches and name.strip().isdecimal():
-        matches = list(source.series[int(name) - 1 : int(name)]) if int(name) else []
+        matches = [s for s in source.series if name == _bare(s.label, quantity)]
+    if not matches and word.isdecimal():
+        matches = list(source.series[int(word) - 1 : int(word)]) if int(word) else []
     if len(matches) == 1:
         return matches[0]
     problem = "several columns" if matches else "no column"
@@ -238,7 +258,12 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
             candidates = [
                 s
                 for s in long
-                if s.name not in names and _likeness(s.label, s.unit, quantity) == likeness
+                if s.name not in names
+                and _likeness(s.label, s.unit, quantity) == likeness
+                # Neither what counts the samples, nor what is asked for, nor an empty column.
+                and not (likeness and quantity != "time" and _counts_samples(s))
+                and not (likeness == 2 and quantity == "displacement" and _is_demand(s))
+                and not (quantity == "time" and s.clock and not _finite(s).size)
             ]
             if quantity in settled or not candidates:
                 continue
@@ -254,7 +279,7 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
 def _likeness(label: str, unit: str, quantity: str) -> int | None:
     """Tell if a name means a quantity: 0 as the package's own, 1 by its word, 2 by its unit."""
     word, _, ending = label.strip(" _").rpartition("_")
-    if word.lower() == quantity and power_of(ending, quantity) is not None:
+    if word.lower() == quantity and unit_scale(ending, quantity):
         return 0
     if quantity == "truth" or _likeness(label, "", "truth") == 0:
         return None
@@ -274,6 +299,24 @@ def _bare(label: str, quantity: str) -> str:
     )
 
 
+def _is_demand(series: Series) -> bool:
+    """Tell whether a name is that of a displacement that is asked for, not measured."""
+    return re.search(_DEMANDS, series.label.lower()) is not None
+
+
+def _counts_samples(series: Series) -> bool:
+    """Tell whether a series only numbers the samples."""
+    steps = np.diff(_finite(series))
+    return bool(steps.size) and bool((steps == 1).all())
+
+
+def _foreign_unit(series: Series, quantity: str) -> str:
+    """Return the unit that a file states for a series, if it is none of the quantity."""
+    stated = series.unit or unit_in_brackets(series.label) or ""
+    others = [unit for q in QUANTITIES if (unit := _unit_of(series.label, series.unit, q))]
+    return "" if _unit_of(series.label, series.unit, quantity) else next(iter(others), stated)
+
+
 def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
     """Keep the series that stand beside those that are chosen, and are as long, if any do."""
     first = next(iter(chosen.values()), None)
@@ -285,12 +328,12 @@ def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Seri
 
 def _unit_of(label: str, unit: str, quantity: str) -> str | None:
     """Return the unit that a file states for a series, if it is one of the quantity."""
-    return unit if power_of(unit, quantity) is not None else unit_in(label, quantity)
+    return unit if unit_scale(unit, quantity) else unit_in(label, quantity)
 
 
 def _guess(label: str, quantity: str) -> str:
     """Return the unit that stands anywhere in a name, as in ``ms_since_midnight``, or the usual."""
-    words = (word for word in re.split(r"[\W_]+", label) if power_of(word, quantity) is not None)
+    words = (word for word in re.split(r"[\W_]+", label) if unit_scale(word, quantity))
     return next(words, COMMON_UNITS[quantity][0])
 
 
@@ -321,9 +364,7 @@ def _columns_error(
     steps = {s.name: np.diff(_finite(s)) for s in candidates if s.name in ranges}
     # But for those that number the samples.
     candidates = [
-        s
-        for s in candidates
-        if _unit_of(s.label, s.unit, "time") or s.name not in steps or (steps[s.name] != 1).any()
+        s for s in candidates if _unit_of(s.label, s.unit, "time") or not _counts_samples(s)
     ]
     clocks = [
         s
@@ -332,10 +373,12 @@ def _columns_error(
     ]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
-    columns, sensitivities = dict(naming.columns), []
-    units = {q: _guess(chosen[q].label, q) for q in unknown} | dict(naming.units)
+    columns, units = dict(naming.columns), dict(naming.units)
+    proposed = {q: chosen[q] for q in unknown}  # those whose unit is open
     for quantity in missing:
         pool = clocks if quantity == "time" else candidates
+        if quantity == "displacement":
+            pool = sorted(pool, key=_is_demand)
         words = [word for word in _WORDS[quantity] if len(word) > 3]
         alike = [s for s in pool if any(word in s.label.lower() for word in words)]
         pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or alike or pool
@@ -343,14 +386,11 @@ def _columns_error(
             continue
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
         candidates = [s for s in candidates if s is not pool[0]]
-        stated = [unit for q in QUANTITIES if (unit := _unit_of(pool[0].label, pool[0].unit, q))]
         if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
             clock = pool[0] if quantity == "time" else clock
-            guess = _guess(pool[0].label, quantity)
-            if stated and quantity not in units:  # as of a sensor's volts
-                sensitivities.append(f"how many {guess} is 1 {stated[0]} of {pool[0].name!r}")
-                guess = f"1 {guess}"
-            units.setdefault(quantity, guess)
+            proposed[quantity] = pool[0]
+    sensitivities = _guess_units(proposed, units)
+    unknown = [q for q in unknown if units[q] == _guess(chosen[q].label, q)]
     listing = _listed(source.series, ranges)
     lost = [q for q in missing if q not in columns]
     if lost:
@@ -361,12 +401,28 @@ def _columns_error(
         questions.append(f"which unit has {names}")
     questions += sensitivities
     if timeless:
-        questions.append("what is the sampling rate, Hz (no column can be the time)")
+        questions.append(
+            "what is the sampling rate, Hz (no column can be the time; with any other rate "
+            "dynamics, creep and correlation times mean nothing)"
+        )
     extent = float(np.ptp(ranges[clock.name])) if clock and clock.name in ranges else 0.0
     rates = f"{clock.name!r} is {rates_by_unit(clock.size, extent)}. " if clock and extent else ""
     problem = f"{where}: {', and '.join(questions)}? {rates}{listing}"
-    fs = source.stated_rate(1000.0) if timeless else None
+    fs = source.stated_rate(1000.0) if timeless else naming.fs
     return ColumnsError(problem, columns, units, fs=fs)
+
+
+def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[str]:
+    """Add a guess of the units that are open; return questions for those that a file states."""
+    questions = []
+    for quantity, series in proposed.items():
+        guess = _guess(series.label, quantity)
+        foreign = _foreign_unit(series, quantity)
+        if foreign and quantity not in units:  # as of a sensor's volts
+            questions.append(f"how many {guess} is 1 {foreign} of {series.name!r}")
+            guess = f"1 {guess}"
+        units.setdefault(quantity, guess)
+    return questions
 
 
 def _finite(series: Series) -> FloatArray:

@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError, InputWarning, path_text
 from bwbayes.record.io.clocks import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
@@ -56,6 +56,7 @@ def record_fields(
     """
     table = align_clocks(table)
     _check_lengths(table)
+    table = _without_empty_ends(table)
     try:
         kind = voltage_is or require_voltage_is(table.notes.get("voltage_is", "output"))
     except InputError as error:
@@ -90,7 +91,7 @@ def record_fields(
         "interval": grid.interval,
         "start": grid.start,
         "voltage_is": kind,
-        "origin": table.notes.get("origin") or table.source.path.name,
+        "origin": table.notes.get("origin") or path_text(table.source.path.name),
         "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
     }
 
@@ -104,7 +105,7 @@ def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
         For the first problem, in one line.
     """
     _check_lengths(table)
-    table, grid = _grid(table)
+    table, grid = _grid(_without_empty_ends(table))
     values = _converted(table, "displacement")
     if np.isnan(values).any():
         sample = int(np.argmax(np.isnan(values)))
@@ -121,6 +122,19 @@ def _check_lengths(table: ColumnTable) -> None:
             raise table.error(f"{problem}; store one per sample", quantity)
     if samples < 2:
         raise table.error(f"too short, samples: {samples}; give at least {_MINIMUM_SAMPLES}")
+
+
+def _without_empty_ends(table: ColumnTable) -> ColumnTable:
+    """Return the table without rows at its ends that have nothing but a time."""
+    columns = [column.values for name, column in table.columns.items() if name != "time"]
+    filled = np.flatnonzero(np.any([~np.isnan(values) for values in columns], axis=0))
+    if not filled.size or filled[-1] + 1 - filled[0] == columns[0].size:
+        return table
+    rows = np.arange(filled[0], filled[-1] + 1)
+    count = columns[0].size - rows.size
+    remark = f"{count} row{'s' * (count > 1)} without a voltage or displacement at an end left out"
+    warnings.warn(str(table.error(remark)), InputWarning, stacklevel=4)
+    return table.only(rows)
 
 
 def _without_marks(table: ColumnTable) -> ColumnTable:

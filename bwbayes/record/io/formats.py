@@ -9,6 +9,7 @@ binary formats.
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -42,7 +43,7 @@ def read_record(
     *,
     voltage_is: VoltageIs | None = None,
     need_displacement: bool = True,
-    columns: Mapping[str, str] | None = None,
+    columns: Mapping[str, str | int] | None = None,
     units: Mapping[str, str] | None = None,
     fs: float | None = None,
 ) -> Record:
@@ -63,7 +64,7 @@ def read_record(
     columns : dict
         The columns by quantity, where they are not to be recognized: their names, the ends of
         their paths in the file, or their numbers, counted from 1:
-        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": "3"}``.
+        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": 3}``.
     units : dict
         Units by quantity, ``{"displacement": "nm"}``, where the file does not state them; ``"-nm"``
         turns the sign, and ``"0.35 um"`` is a sensor's sensitivity, that of 1 in the column.
@@ -134,6 +135,7 @@ def read_source(path: Path) -> Source:
     InputError
         The file cannot be read.
     """
+    path = _existing(path)
     if path.is_dir():
         raise InputError(f"{path}: is a directory; give the file in it")
     if not path.exists():
@@ -169,6 +171,15 @@ def read_source(path: Path) -> Source:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
+
+
+def _existing(path: Path) -> Path:
+    """Return a path, or the one that `path_text` wrote so as its name is not UTF-8."""
+    if path.exists():
+        return path
+    whole = os.fsencode(path)
+    name = re.sub(rb"\\x([0-9a-f]{2})", lambda code: bytes.fromhex(code[1].decode()), whole)
+    return Path(os.fsdecode(name))
 
 
 def _is_npz(path: Path) -> bool:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.errors import InputError, NoNumbersError
-from bwbayes.record.io.units import QUANTITIES, power_of
+from bwbayes.record.io.units import QUANTITIES, is_other_unit, is_time_form, scale_of
 
 _NUMBER = re.compile(
     r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+(,\d*)?|\d{1,3}(,\d{3})+(\.\d*)?)"
@@ -30,11 +30,15 @@ EXAMPLE = "time_s,voltage_V,displacement_um"
 
 
 class Layout(NamedTuple):
-    """How the numbers stand in a text: separator, fields of a line, and the first line's index."""
+    """How the numbers stand in a text: separator, fields of a line, and the first line's index.
+
+    ``empty`` are the fields of the first line without a value.
+    """
 
     separator: str
     fields: int
     first: int
+    empty: frozenset[int] = frozenset()
 
 
 def cells_of(line: str, separator: str) -> list[str]:
@@ -78,7 +82,37 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
             break
     if not in_a_row:
         raise NoNumbersError(f"{path}: no columns of numbers in it; write {EXAMPLE} above such")
-    return Layout(separator, fields, in_a_row[0])
+    below = [cells_of(line, separator) for line in lines[in_a_row[0] : in_a_row[0] + sample]]
+    if _is_numbering(below):
+        del in_a_row[0], below[0]
+    empty = frozenset(i for i in range(fields) if not "".join(below[0][i : i + 1]))
+    return Layout(separator, fields, in_a_row[0], empty)
+
+
+def _is_numbering(rows: Sequence[list[str]]) -> bool:
+    """Tell whether the first of some rows numbers the columns, as pandas does without names.
+
+    That is if it counts from 0 or 1, and cannot be a sample: it has no decimals where all others
+    have as many, or its step to the next row is none that a column has further down.
+    """
+    first, *others = rows
+    width = len(first)
+    counts = [[str(i) for i in range(start, start + width)] for start in (0, 1)]
+    others = [row for row in others if len(row) == width]
+    if first not in counts or len(others) < 3:
+        return False
+    columns = [[cell.replace(",", ".") for cell in column] for column in zip(*others, strict=True)]
+    decimals = [{len(cell.partition(".")[2]) for cell in column} for column in columns]
+    if any(len(lengths) == 1 and lengths != {0} for lengths in decimals):
+        return True
+    for number, column in zip(first, columns, strict=True):
+        if all(_NUMBER.fullmatch(cell) for cell in column):
+            values = [float(number), *map(float, column)]
+            step, *steps = np.diff(values).tolist()
+            slack = 1e-9 * max(map(abs, values))
+            if not min(steps) - slack <= step <= max(steps) + slack:
+                return True
+    return False
 
 
 def find_header(
@@ -101,13 +135,12 @@ def find_header(
             continue
         bare = [cell.strip("[]() ") for cell in cells]
         # Times of day have their form in place of a unit.
+        stated = [cell for cell, value in zip_longest(bare, values, fillvalue="") if cell and value]
         is_unit = [
-            re.fullmatch("h+:m+(:s+)?([.,]f+)?", cell.lower())
-            or any(power_of(cell, q) is not None for q in QUANTITIES)
-            for cell, value in zip_longest(bare, values, fillvalue="")
-            if cell and value
+            is_time_form(cell) or any(scale_of(cell, q) for q in QUANTITIES) for cell in stated
         ]
-        if unit_row is None and is_unit and all(is_unit):
+        others = [cell for cell, known in zip(stated, is_unit, strict=True) if not known]
+        if unit_row is None and any(is_unit) and all(map(is_other_unit, others)):
             unit_row = len(rows)
             cells = bare
         rows.append((index, cells))
@@ -121,20 +154,24 @@ def find_header(
     fields = max(layout.fields, len(names))
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
-    named = [name or f"column {i}" for i, name in enumerate(names, start=1)]
-    count = Counter(named)
-    named = [f"{n} (column {i})" if count[n] > 1 else n for i, n in enumerate(named, start=1)]
-    return named, units, first
+    return [name or f"column {i}" for i, name in enumerate(names, start=1)], units, first
 
 
 def split_header(line: str, layout: Layout) -> list[str]:
-    """Return the cells of a line, by any separator that gives as many as the numbers have."""
+    """Return the cells of a line, by any separator that gives as many as the numbers have.
+
+    Where blanks separate them, names may have several words before a unit in parentheses. Settings
+    may stand above fields without numbers.
+    """
     bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
     ways = [cells_of(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
-    for number, fields in enumerate([*ways, re.split(r"\s{2,}|\t", bare.strip())]):
+    between_names = (r"\s{2,}|\t", r"(?<=[\])])\s+", r"\s+(?![\[(/])(?<!/ )")
+    ways += [re.split(pattern, bare.strip()) for pattern in between_names]
+    for number, fields in enumerate(ways):
         cells = [cell.strip().strip('"') for cell in fields]
-        more = any(cells[layout.fields :]) and number > 0
-        is_name = any(cells) and not any(_NUMBER.fullmatch(cell) for cell in cells)
+        more = any(cells[layout.fields :]) and (number > 0 or layout.separator == " ")
+        filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
+        is_name = any(filled) and not any(_NUMBER.fullmatch(cell) for cell in filled)
         if len(cells) >= layout.fields and not more and is_name:
             return cells
     return []

@@ -28,6 +28,7 @@ NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
 RATES = {
     **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
     **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time", "sample_interval"), -1),
+    **dict.fromkeys(("increment", "x_increment", "xincrement", "xinc", "tinc"), -1),
 }
 
 

@@ -75,7 +75,7 @@ def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
         text, clocks = plain_lvm(path, text)
     lines = text.split("\n")
     # What programs write below the numbers is no sample, and shows that the last one is whole.
-    while len(lines) > 1 and (not lines[-1].strip() or lines[-1].startswith(("#", "%"))):
+    while len(lines) > 1 and (not lines[-1].strip(' \t,;|"') or lines[-1].startswith(("#", "%"))):
         lines.pop()
         is_whole = True
     if (longest := max(map(len, lines))) > csv.field_size_limit():
@@ -89,6 +89,8 @@ def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
         key = re.sub(r"\W+", "_", re.sub(r"\(.*", "", key)).strip("_").lower()
         if (line.startswith("#") and sign in ("=", ":")) or key in RATES:
             notes["voltage_is" if key == "voltage" else key] = value.strip()
+    scope_clock, settings = _settings(names, units)
+    notes |= settings
     # As data recorders of PI write them.
     names = [notes.get(f"name{i}", name) for i, name in enumerate(names)]
     skipped = sum(bool(line.strip()) and not line.startswith("#") for line in above)
@@ -111,6 +113,7 @@ def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
         remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
     frame, marks = _parsed(path, body, layout)
+    names = _different(path, names, frame)
     series = []
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
         if column >= layout.fields:
@@ -124,10 +127,47 @@ def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
             Series(
                 *(name, len(body), load, stated),
                 load_readings=partial(load, words=True),
-                clock=clocks.get(column),
+                clock=clocks.get(column, scope_clock),
             )
         )
     return Source(path, tuple(series), {"": notes}, numbers)
+
+
+def _settings(names: Sequence[str], units: Sequence[str]) -> tuple[Clock | None, dict[str, str]]:
+    """Return the clock that oscilloscopes write into the header, if they do, and such numbers.
+
+    As a number below its name, ``Increment``, or behind it, ``tInc = 1e-6``.
+    """
+    settings = {}
+    for name, unit in zip(names, units, strict=True):
+        key, _, value = name.partition("=")
+        with suppress(ValueError):
+            text = (value or unit).strip().removesuffix("s")
+            settings[key.strip().lower()] = repr(float(text))
+    rate = Source(Path(), (), {"": settings}).stated_rate()
+    start = float(settings.get("start", settings.get("t0", "0")))
+    return Clock(1 / rate, start) if rate else None, settings
+
+
+def _different(path: Path, names: Sequence[str], frame: pd.DataFrame) -> list[str]:
+    """Return names of which none stands twice; of columns with equal numbers the first keeps its.
+
+    Warns
+    -----
+    InputWarning
+        If there are such columns.
+    """
+    different = []
+    for column, name in enumerate(names):
+        others = [i for i, other in enumerate(names) if other == name and i in frame]
+        is_copy = column in frame and all(frame[i].equals(frame[others[0]]) for i in others)
+        if len(others) > 1 and is_copy and column == others[0]:
+            listed = ", ".join(str(i + 1) for i in others)
+            remark = f"{path}: columns {listed} are all {name!r} with equal numbers; the first is"
+            warnings.warn(one_line(f"{remark} taken"), InputWarning, stacklevel=5)
+        is_unique = names.count(name) == 1 or (is_copy and column == others[0])
+        different.append(name if is_unique else f"{name} (column {column + 1})")
+    return different
 
 
 def write_text(record: Record, path: Path) -> None:

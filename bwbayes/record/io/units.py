@@ -1,4 +1,7 @@
-"""Units of columns: those of the SI with any prefix, and numbers of them, as sensitivities are."""
+"""Units of columns: those of the SI with any prefix, some others, and numbers of them.
+
+Such a number is a sensor's sensitivity.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,46 @@ COMMON_UNITS = {
 }
 # The powers of ten of units' prefixes.
 _PREFIXES = {"": 0, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "c": -2, "k": 3, "M": 6}
+# Other units, in lower case, in s or um.
+_OTHERS = {
+    "time": {
+        **dict.fromkeys(("min", "mins", "minute", "minutes"), 60.0),
+        **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), 3600.0),
+        **dict.fromkeys(("d", "day", "days"), 86_400.0),
+    },
+    "displacement": {
+        **dict.fromkeys(("\u00e5", "angstrom", "angstroms"), 1e-4),
+        **dict.fromkeys(("mil", "mils", "thou"), 25.4),
+        **dict.fromkeys(("in", "inch", "inches"), 25_400.0),
+    },
+}
+# What else stands where units do, in lower case.
+_FOREIGN = (
+    *("%", "-", "1", "#", "a.u.", "count", "counts", "digit", "digits", "lsb", "bit", "bits"),
+    *("sequence", "sample", "samples", "index", "no", "no.", "n/a", "hz", "khz", "db", "g"),
+    *("a", "ma", "ua", "µa", "w", "mw", "ohm", "ω", "c", "nc", "uc", "µc", "nf", "uf", "µf"),
+    *("°c", "degc", "k", "°f", "n", "mn", "un", "µn", "kn", "pa", "kpa", "mpa", "bar", "mbar"),
+    *("°", "deg", "rad", "mrad", "urad", "µrad", "m/s", "mm/s", "um/s", "µm/s", "um/v", "nm/v"),
+)
+
+
+def unit_scale(unit: str, quantity: str) -> tuple[float, int] | None:
+    """Return the factor and the power of ten from a unit to s, V or um; None if it is none."""
+    if (power := power_of(unit, quantity)) is not None:
+        return 1.0, power
+    # The sign of the unit Angstrom is the letter, lowered.
+    factor = _OTHERS.get(quantity, {}).get(unit.lower())
+    return None if factor is None else (factor, 0)
+
+
+def is_other_unit(text: str) -> bool:
+    """Tell whether a text is a unit of none of the quantities, or stands for having none."""
+    return text.lower().replace("\u03bc", "\u00b5") in _FOREIGN
+
+
+def is_time_form(text: str) -> bool:
+    """Tell whether a text is the form of times of day, in place of a unit."""
+    return re.fullmatch("h+:m+(:s+)?([.,]f+)?", text.lower()) is not None
 
 
 def power_of(unit: str, quantity: str) -> int | None:
@@ -43,27 +86,36 @@ def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
     written = re.fullmatch(
         rf"(-?)({number}|)\s*(?:({reading})\s*/\s*(\S+)|(\S*?)(?:\s*/\s*{reading})?)", unit.strip()
     )
-    power = power_of(written[4] or written[5], quantity) if written else None
-    if written is None or power is None:
+    scale = unit_scale(written[4] or written[5], quantity) if written else None
+    if written is None or scale is None:
         return None
     factor = float(f"{written[1]}{written[2] or 1}")
     if not 0 < abs(factor) < math.inf:
         return None
-    factor = 1 / factor if written[3] else factor
-    return (factor, power) if abs(factor) < math.inf else None
+    factor = scale[0] * (1 / factor if written[3] else factor)
+    return (factor, scale[1]) if abs(factor) < math.inf else None
 
 
 def unit_in(name: str, quantity: str) -> str | None:
     """Return the unit at the end of a column's name, if it is one of the quantity.
 
     In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``;
-    also ``pos_nm_``, as MATLAB writes brackets.
+    also ``pos_nm_``, as MATLAB writes brackets. Others than those of the SI stand in brackets or
+    after a slash, as ``U_in`` is an input and ``x_min`` a minimum.
     """
-    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\)|[\s_/.-]([^][()\s_/.-]+)_?)\s*$", name)
-    if ending is None:
-        return None
-    unit = next(group for group in ending.groups() if group is not None).strip()
-    return unit if power_of(unit, quantity) is not None else None
+    if (unit := unit_in_brackets(name)) is None:
+        ending = re.search(r"([\s_/.-])([^][()\s_/.-]+)_?\s*$", name)
+        unit = ending[2] if ending else ""
+        is_marked = ending is not None and name[: ending.start(2)].rstrip().endswith("/")
+        if power_of(unit, quantity) is None and not is_marked:
+            return None
+    return unit if unit_scale(unit, quantity) else None
+
+
+def unit_in_brackets(name: str) -> str | None:
+    """Return what stands in brackets at the end of a column's name, if anything does."""
+    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\))\s*$", name)
+    return next(group for group in ending.groups() if group is not None).strip() if ending else None
 
 
 def epoch_unit(name: str, times: FloatArray) -> str | None:
