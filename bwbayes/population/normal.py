@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,10 @@ class NormalLikelihoods:
         precision = self.precision[:, np.newaxis]
         weight: FloatArray = precision / (1 + precision * spread**2)
         return weight
+
+    def only(self, chosen: BoolArray) -> NormalLikelihoods:
+        """Return those of the chosen specimens (specimens,)."""
+        return NormalLikelihoods(self.mean[chosen], self.precision[chosen])
 
     def shrunk(
         self, specimen: int, mean: FloatArray, spread: FloatArray, generator: np.random.Generator
@@ -135,18 +139,21 @@ def spreads(likelihoods: NormalLikelihoods, prior: Hyperprior) -> Spreads:
     return Spreads(spread, edges, probability, mean, variance)
 
 
-def left_out(likelihoods: NormalLikelihoods, prior: Hyperprior) -> FloatArray:
-    """Two-sided p (specimens,) of each record, given the population that all others show.
+def left_out(
+    likelihoods: NormalLikelihoods, prior: Hyperprior, inside: BoolArray | None = None
+) -> FloatArray:
+    """Two-sided p (specimens,) of each record, given the population that the others show.
 
-    Under the model each is uniform from 0 to 1, whatever the population. One for a record that
-    tells nothing.
+    Of these, only those ``inside`` (specimens,), by default all. Under the model each is uniform
+    from 0 to 1, whatever the population. One for a record that tells nothing.
     """
     count = likelihoods.mean.size
     p = np.ones(count)
     for specimen in np.flatnonzero(likelihoods.precision > 0):
         others = np.arange(count) != specimen
-        shown = NormalLikelihoods(likelihoods.mean[others], likelihoods.precision[others])
-        posterior = spreads(shown, prior)
+        if inside is not None:
+            others &= inside
+        posterior = spreads(likelihoods.only(others), prior)
         sd = np.sqrt(1 / likelihoods.precision[specimen] + posterior.spread**2 + posterior.variance)
         z = (likelihoods.mean[specimen] - posterior.mean) / sd
         # From the nearer tail, which keeps its digits.

@@ -36,6 +36,9 @@ from bwbayes.shown import brief
 # Specimens below which nothing is said of a spread.
 FEWEST = 3
 
+# Chance of a sound campaign to have an outlier among all specimens and parameters.
+OFF = 0.05
+
 # Populations that are drawn, and draws of each shrunk specimen.
 DRAWS = 1000
 
@@ -44,12 +47,14 @@ DRAWS = 1000
 class SpecimenEstimate:
     """One specimen's parameter among the others.
 
-    ``lower``, ``median`` and ``upper`` are the 95% interval with the population for a prior, and
+    ``lower``, ``median`` and ``upper`` are the 95% interval with the population for a prior (of an
+    outlier, which no population is a prior for, that of the record alone), and
     ``own_lower``, ``own_median``, ``own_upper`` that of the record alone, both in the parameter's
     unit. ``p`` is how likely the record would be as far off, either way, from the population that
     all others show; ``outlier`` whether that is so unlikely that a sound campaign has one such
-    among all specimens and parameters once in twenty. ``pareto_k`` judges the reweighting, and
-    ``normal`` tells whether the specimen's likelihood was taken for normal because of it.
+    among all specimens and parameters once in twenty; it is left out of the population.
+    ``pareto_k`` judges the reweighting, and ``normal`` tells whether the specimen's likelihood was
+    taken for normal because of it.
     """
 
     __repr__ = brief
@@ -216,12 +221,20 @@ def _population_of(
     prior = Hyperprior(center, width, width)
     normal = likelihoods(specimens, name)
     draws = [(specimen.draws[:, i], specimen.log_prior[:, i]) for specimen, i in pairs]
-    mean, spread, is_normal, shapes, k = _populations(draws, normal, prior, generator)
-    p = left_out(normal, prior)
+    p, inside = _inside(normal, prior, tests)
+    outlier = ~inside | (p * tests < OFF)
+    kept = np.flatnonzero(inside)
+    mean, spread, kept_normal, kept_shapes, k = _populations(
+        [draws[i] for i in kept.tolist()], normal.only(inside), prior, generator
+    )
+    is_normal, shapes = np.zeros(len(draws), dtype=np.bool_), np.zeros(len(draws))
+    is_normal[kept], shapes[kept] = kept_normal, kept_shapes
     scale = np.exp if logarithmic else np.positive
     among = {}
     for i, (specimen, (y, log_prior)) in enumerate(zip(specimens, draws, strict=True)):
-        if is_normal[i]:
+        if outlier[i]:
+            shrunk = y
+        elif is_normal[i]:
             shrunk = normal.shrunk(i, mean, spread, generator)
         else:
             # From its own draws; a quarter of the populations are enough for a prior.
@@ -238,13 +251,33 @@ def _population_of(
             own_median=own_median,
             own_upper=own_upper,
             p=float(p[i]),
-            outlier=bool(p[i] * tests < 0.05),
+            outlier=bool(outlier[i]),
             pareto_k=float(shapes[i]),
             normal=bool(is_normal[i]),
         )
     new = scale(mean + spread * generator.standard_normal(DRAWS))
     unit = specimens[0].units[columns[0]]
     return PopulationParameter(name, unit, logarithmic, scale(mean), spread, new, among, k)
+
+
+def _inside(
+    normal: NormalLikelihoods, prior: Hyperprior, tests: int
+) -> tuple[FloatArray, BoolArray]:
+    """Leave outliers out, the farthest first, each judged by the population of those that stay.
+
+    Returns p (specimens,) and which specimens make the population (specimens,): ``FEWEST`` at
+    least, and more than half of them.
+    """
+    count = normal.mean.size
+    inside = np.ones(count, dtype=np.bool_)
+    p = left_out(normal, prior)
+    while np.sum(inside) > max(FEWEST, count // 2 + 1):
+        farthest = int(np.argmin(np.where(inside, p, np.inf)))
+        if p[farthest] * tests >= OFF:
+            break
+        inside[farthest] = False
+        p = left_out(normal, prior, inside)
+    return p, inside
 
 
 def _populations(

@@ -142,17 +142,50 @@ def test_reweighted_draws_are_the_closed_form_where_likelihoods_are_normal() -> 
     assert stats.ks_2samp(result.spread, spread).pvalue > 1e-4
 
 
-def test_a_specimen_off_the_population_is_an_outlier_and_taken_for_normal() -> None:
+def test_an_outlier_is_itself_and_leaves_the_others_population_as_it_is() -> None:
     generator = np.random.default_rng(7)
     # Twelve that are alike, and one whose draws do not reach where the population has it.
     every = [normal_specimen(f"s{i}", 0.01 * i, 0.02, generator) for i in range(12)]
-    every.append(normal_specimen("odd", 0.9, 0.02, generator))
-    result = of(every)
-    assert ["odd"] == result.outliers
-    vague = [*every[:-1], normal_specimen("vague", 0.9, 0.2, generator)]
-    shrunk = of(vague).specimens["vague"]
-    assert shrunk.normal or shrunk.pareto_k <= 0.7
-    assert shrunk.upper < shrunk.own_upper
+    odd = normal_specimen("odd", 0.9, 0.02, generator)
+    result, sound = of([*every, odd]), of(every)
+    assert (["odd"], []) == (result.outliers, sound.outliers)
+    among = result.specimens["odd"]
+    assert (among.own_lower, among.own_upper) == (among.lower, among.upper)
+    np.testing.assert_allclose(np.median(result.spread), np.median(sound.spread), rtol=0.1)
+    vague = of([*every, normal_specimen("vague", 0.5, 0.2, generator)]).specimens["vague"]
+    assert not vague.outlier
+    assert vague.upper < vague.own_upper
+
+
+def with_an_outlier(count: int, seed: int) -> tuple[float, float, float]:
+    """Twelve specimens of a spread of 0.03, one of them moved by 0.4, in so many campaigns.
+
+    Returns the median spread, and the coverage of the outliers' and of the others' intervals.
+    """
+    generator = np.random.default_rng(seed)
+    spread, inside = [], []
+    for _ in range(count):
+        truths = generator.standard_normal() + 0.03 * generator.standard_normal(12)
+        truths[0] += 0.4
+        errors = generator.uniform(0.01, 0.05, 12)
+        measured = truths + errors * generator.standard_normal(12)
+        each = zip(measured, errors, strict=True)
+        result = of([normal_specimen(f"s{i}", m, s, generator) for i, (m, s) in enumerate(each)])
+        spread.append(np.median(result.spread))
+        among = zip(result.specimens.values(), truths, strict=True)
+        inside.append([one.lower < truth < one.upper for one, truth in among])
+    covers = np.mean(inside, axis=0)
+    return float(np.median(spread)), float(covers[0]), float(np.mean(covers[1:]))
+
+
+def test_with_an_outlier_spread_and_intervals_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty campaigns: at most three standard errors low. Kept in, it triples the spread."""
+    spread, outlier, others = with_an_outlier(40, 11)
+    assert 0.02 < spread < 0.04
+    assert outlier > 0.95 - misses(0.95, 40)
+    assert abs(others - 0.95) < misses(0.95, 40 * 11) + 0.01  # the draws' own quantiles
+    monkeypatch.setattr(module, "OFF", 0.0)
+    assert with_an_outlier(10, 11)[0] > 0.08
 
 
 def test_few_specimens_or_none_in_common_are_refused() -> None:

@@ -272,7 +272,8 @@ class Campaign(Product):
             heading=f"Campaign: {name}",
             banners=[
                 Banner(worst, f"{len(self.rows)} records", [counts]),
-                *[Banner("note", "Off the population", items=outliers)] * bool(outliers),
+                *[Banner("note", "Off the population and left out of it", items=outliers)]
+                * bool(outliers),
             ],
             blocks=[
                 *[Table("short", "Records to look at", columns, attention, on="both")]
