@@ -17,8 +17,10 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.validation import Standing
+from bwbayes.errors import ExitStatus
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
+from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
     Banner,
@@ -33,9 +35,19 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
+from bwbayes.report.report import (
+    Kind as BannerKind,
+)
 from bwbayes.shown import brief
 
 Choice = Literal["mean", "expected"]
+
+# How a command ends whose limit is kept, is not, or may be.
+ENDINGS = {
+    True: ExitStatus.SUCCESS,
+    False: ExitStatus.VALIDATION_FAILED,
+    None: ExitStatus.VALIDATION_INCONCLUSIVE,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +141,34 @@ class Compensation(Product):
         return self.compensated.voltage
 
     @property
+    def limit_kept(self) -> bool | None:
+        """Whether the limit of the error is kept: at 95%; False below even odds, else None."""
+        if self.limit is None:
+            return True
+        within = float(np.mean(self.compensated.largest <= self.limit))
+        return True if within >= 0.95 else None if within >= 0.5 else False
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """Not a success unless the limit is kept."""
+        return ENDINGS[self.limit_kept]
+
+    @property
+    def shortfall(self) -> str:
+        """What to say of a limit that is not kept: how probably, where, and what to do."""
+        if self.limit_kept:
+            return ""
+        after = self.compensated.numbers(self.limit)
+        farthest = int(np.argmax(np.abs(self.compensated.bands.mean - self.asked)))
+        return (
+            f"the limit of {self.limit:g} um is kept with a probability of "
+            f"{after['probability_below_limit']:.2f} only: the largest error is "
+            f"{after['largest_um']['mean']:.3g} um, in the mean at "
+            f"{clock(float(self.reference.time[farthest]), self.reference.interval)} s; ask for "
+            "less, smooth corners (`smoothed=0.02`), or choose a larger limit"
+        )
+
+    @property
     def record(self) -> Record:
         """The command as a record that a signal generator can play."""
         return planned(
@@ -159,6 +199,7 @@ class Compensation(Product):
             "between_samples_um": self.between,
             "command": self.command,
             "limit_um": self.limit,
+            "limit_kept": self.limit_kept,
             "compensated": self.compensated.numbers(self.limit),
             "uncompensated": self.linear.numbers(self.limit),
             "remarks": list(self.remarks),
@@ -202,7 +243,11 @@ class Compensation(Product):
 
         name, shown = self.reference.name, (self.asked, self._commands)
         validation = "" if self.standing.holds else f", validation {self.standing.status}"
-        promise = Banner(kind_of(self.standing), f"Predicted error{validation}", [self._promise()])
+        kind: BannerKind = kind_of(self.standing)
+        if self.limit_kept is not True:
+            validation += f", limit {'NOT KEPT' if self.limit_kept is False else 'uncertain'}"
+            kind = "bad" if self.limit_kept is False else "note"
+        promise = Banner(kind, f"Predicted error{validation}", [self._promise()])
         return Report(
             title=f"{name}, compensation",
             heading=f"Compensation: {name}",

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
+from bwbayes.errors import ExitStatus
 from bwbayes.shown import head
 
 if TYPE_CHECKING:
@@ -349,6 +350,16 @@ class Product(Shown):
     """A product with a report; its files are called by its ``NAME``."""
 
     NAME: ClassVar[str]
+
+    @property
+    def shortfall(self) -> str:
+        """Why it is not what was asked for, the run's validation apart; empty if it is."""
+        return ""
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """What a command ends with for it, unless the run's validation is worse."""
+        return ExitStatus.SUCCESS
 
     def records(self) -> dict[str, Record]:
         """Return what is saved beside the report, as CSV, by name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,23 @@ def test_a_shape_is_that_of_the_command_line(
     np.testing.assert_array_equal(made.asked, same.given)
     with pytest.warns(bw.InputWarning):
         assert numbers == fit.compensate(same, from_rest=True, limit=5).summary
+
+
+@pytest.mark.parametrize(("limit", "status", "kept"), [(1e-3, 3, False), (1e3, 0, True)])
+def test_a_limit_that_is_not_kept_is_no_success(
+    bwbayes: Type, run: Path, fit: bw.Fit, limit: float, status: int, kept: bool
+) -> None:
+    """The run's validation passed: it ends as a failure alone for the limit, and says why."""
+    shape = "triangle", "--amplitude", 30, "--frequency", 1, "--from-rest"
+    said = bwbayes("compensate", run, *shape, "--limit", limit, "--out", f"out{limit}")
+    assert said.status == status
+    assert ("NOT KEPT" in said.out) is not kept
+    assert (f"the limit of {limit:g} um is kept with a probability of 0.00" in said.out) is not kept
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        made = fit.compensate("triangle", amplitude=30, frequency=1, from_rest=True, limit=limit)
+    assert any("is kept with a probability" in str(one.message) for one in warned) is not kept
+    assert made.summary["limit_kept"] is kept
 
 
 @pytest.mark.parametrize(

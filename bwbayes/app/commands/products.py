@@ -20,7 +20,7 @@ from bwbayes.app.commands.shared import (
     show_report,
     working,
 )
-from bwbayes.errors import ColumnsError, InputError
+from bwbayes.errors import ColumnsError, ExitStatus, InputError
 
 
 def _saved(
@@ -45,7 +45,12 @@ def _saved(
         watch("figures and files", 0.0)
         files = product.save(out, overwrite=overwrite)
         report = product.report()
-    return present(report, files, product.standing, quiet=quiet)
+    status = present(report, files, product.standing, quiet=quiet)
+    if quiet and product.shortfall:
+        click.echo(product.shortfall, err=True)
+    # The worse of the two: a failure, then what is uncertain.
+    endings = (ExitStatus.VALIDATION_FAILED, ExitStatus.VALIDATION_INCONCLUSIVE)
+    return next((end for end in endings if end in (status, product.exit_status)), status)
 
 
 @click.command()
@@ -145,6 +150,7 @@ def compensate(
     The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
     zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
     voltage will do is predicted with its error; beside it stands what a linear command would do.
+    Exit status 3: a --limit is exceeded more probably than not; 5: it is kept at less than 95%.
 
     Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """

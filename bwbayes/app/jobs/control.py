@@ -102,7 +102,7 @@ def compensate(
         Voltage between samples: held, as a DAC does (zoh), or straight lines (foh). It need not be
         that of the record.
     limit
-        Limit of the error, um; says how probably it is kept.
+        Limit of the error, um; says how probably it is kept, and fails if it is not.
     from_rest
         The actuator starts demagnetized. Otherwise it has waited at zero volts, in a state of its
         hysteresis that nothing tells.
@@ -154,8 +154,10 @@ def compensate(
         watch=partial(watch, "predicted error"),
     )
     extrapolations = beyond_training(alone.posterior, compensation.voltage, desired.interval)
-    remarks = (*compensation.remarks, *(finding.note for finding in extrapolations))
-    return replace(compensation, remarks=remarks, standing=fit.standing)
+    remarks = [*compensation.remarks, *(finding.note for finding in extrapolations)]
+    if compensation.shortfall:
+        remarks.insert(0, compensation.shortfall)
+    return replace(compensation, remarks=tuple(remarks), standing=fit.standing)
 
 
 def _reference(
