@@ -49,6 +49,7 @@ _NOISE = np.random.default_rng(1).normal(scale=0.02, size=SAMPLES)
 DISPLACEMENT = np.round(0.3 * VOLTAGE + 0.2 * play(VOLTAGE, 6.0) + _NOISE, 5)  # um
 COLUMNS = [TIME, VOLTAGE, DISPLACEMENT]
 UNITS = {"time": "s", "voltage": "V", "displacement": "um"}
+_MICRONS = {"displacement": "um"}
 
 
 def _named(*names: str) -> dict[str, str]:
@@ -406,3 +407,91 @@ def _(folder: Path) -> Written:
     head = ["Interferometer", "Sample Rate (Hz): 200", "", "Sample;Voltage(V);Position(nm)"]
     rows = _rows([np.arange(SAMPLES), VOLTAGE, 1e3 * DISPLACEMENT], ";")
     return _text(folder / "a.txt", [*head, *rows], fs=200)
+
+
+@_instrument("Rigol, settings in the header")
+def _(folder: Path) -> Written:
+    """Count samples; start and increment stand above empty columns."""
+    rows = _rows([VOLTAGE, DISPLACEMENT], ",", end=",,")
+    lines = ["X,CH1,CH2,Start,Increment", f"Sequence,Volt,Volt,0.000000e+00,{INTERVAL:e}"]
+    lines += [f"{i},{row}" for i, row in enumerate(rows)]
+    return _text(
+        folder / "a.csv", lines, columns={"voltage": "CH1", "displacement": "CH2"}, units=_MICRONS
+    )
+
+
+@_instrument("Rigol, increment behind the names")
+def _(folder: Path) -> Written:
+    rows = _rows([VOLTAGE, DISPLACEMENT], ",", end=",,")
+    header = f"CH1(V),CH2(V),t0 = 0.000000e+00s, tInc = {INTERVAL:e}s,"
+    columns = {"voltage": "CH1(V)", "displacement": "CH2(V)"}
+    return _text(folder / "a.csv", [header, *rows], columns=columns, units=_MICRONS)
+
+
+@_instrument("Siglent")
+def _(folder: Path) -> Written:
+    head = ["Record Length,Analog:600", f"Sample Interval,Analog:{INTERVAL:.9f}"]
+    head += ["Vertical Units,CH1:V,CH2:V", "Vertical Scale,CH1:20.00,CH2:5.00"]
+    head += ["Horizontal Units,s", "Source,CH1,CH2"]
+    lines = [*head, "Second,Volt,Volt", *_rows(COLUMNS, ",", ".7E")]
+    columns = {"voltage": "CH1", "displacement": "CH2"}
+    return _text(folder / "a.csv", lines, columns=columns, units={"voltage": "V"} | _MICRONS)
+
+
+@_instrument("PicoScope, times in ms")
+def _(folder: Path) -> Written:
+    rows = _rows([1e3 * TIME, VOLTAGE, DISPLACEMENT], ",", ".8f")
+    lines = ["Time,Channel A,Channel B", "(ms),(V),(V)", "", *rows]
+    columns = {"voltage": "Channel A", "displacement": "Channel B"}
+    return _text(folder / "a.csv", lines, columns=columns, units=_MICRONS)
+
+
+@_instrument("Polytec")
+def _(folder: Path) -> Written:
+    head = ["Source File Name:\tbench.pvd", "Signal:\tTime Vib Displacement", "Frame Data"]
+    lines = [*head, "", "Time\tVib Displacement\tRef1 Voltage", "[ s ]\t[ m ]\t[ V ]"]
+    rows = _rows([TIME, 1e-6 * DISPLACEMENT, VOLTAGE], "\t", ".14e")
+    return _text(folder / "a.txt", [*lines, *rows])
+
+
+@_instrument("Keyence, quoted thousands")
+def _(folder: Path) -> Written:
+    rows = _rows([TIME, 1e3 * VOLTAGE, 1e3 * DISPLACEMENT], '","', ",.3f")
+    lines = ['"Time [s]","Monitor [mV]","OUT1 displacement [nm]"', *(f'"{row}"' for row in rows)]
+    return _text(folder / "a.csv", lines)
+
+
+@_instrument("Attocube, picometers counted")
+def _(folder: Path) -> Written:
+    lines = ["# time (ms) drive voltage (V) displacement axis (pm)"]
+    lines += _rows([1e3 * TIME, VOLTAGE, 1e6 * DISPLACEMENT], " ", ".6f")
+    return _text(folder / "a.dat", lines)
+
+
+@_instrument("wave table of PI, target and actual")
+def _(folder: Path) -> Written:
+    lines = ["Time [s];Target Position [µm];Actual Position [µm];Control Voltage [V]"]
+    rows = _rows([TIME, np.round(DISPLACEMENT), DISPLACEMENT, VOLTAGE], ";")
+    columns = {"displacement": "Actual Position [µm]"}
+    return _text(folder / "a.csv", [*lines, *_commas(rows)], "cp1252", columns=columns)
+
+
+@_instrument("pandas without names")
+def _(folder: Path) -> Written:
+    pd.DataFrame(np.transpose(COLUMNS)).to_csv(folder / "a.csv", index=False)
+    return Written(folder / "a.csv", _named("1", "2", "3"), UNITS)
+
+
+@_instrument("writematrix of MATLAB")
+def _(folder: Path) -> Written:
+    """Shortest digits, no names."""
+    rows = [f"{t:.15g},{v:.15g},{d:.15g}" for t, v, d in zip(*COLUMNS, strict=True)]
+    return _text(folder / "a.txt", rows, columns=_named("1", "2", "3"), units=UNITS)
+
+
+@_instrument("thermologger, minutes and a temperature")
+def _(folder: Path) -> Written:
+    lines = ["No.,Time,U,Pos,Temp", "-,min,V,um,°C"]
+    rows = _rows([TIME / 60, VOLTAGE, DISPLACEMENT, 21.5 + 0 * TIME], ",", ".9g", end=",,")
+    lines += [f"{i},{row}" for i, row in enumerate(rows, start=1)]
+    return _text(folder / "a.csv", [*lines, ",,,,,,", ",,,,,,"])

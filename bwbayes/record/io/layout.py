@@ -167,11 +167,12 @@ def split_header(line: str, layout: Layout) -> list[str]:
     ways = [cells_of(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
     between_names = (r"\s{2,}|\t", r"(?<=[\])])\s+", r"\s+(?![\[(/])(?<!/ )")
     ways += [re.split(pattern, bare.strip()) for pattern in between_names]
+    needed = 1 + max(set(range(layout.fields)) - layout.empty, default=0)
     for number, fields in enumerate(ways):
         cells = [cell.strip().strip('"') for cell in fields]
         more = any(cells[layout.fields :]) and (number > 0 or layout.separator == " ")
         filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
         is_name = any(filled) and not any(_NUMBER.fullmatch(cell) for cell in filled)
-        if len(cells) >= layout.fields and not more and is_name:
+        if len(cells) >= needed and not more and is_name:
             return cells
     return []
