@@ -34,6 +34,26 @@ def command(*words):
     except SystemExit as ended:
         assert ended.code in (0, 3, 4, 5), ended.code
 
+def silence(*words):
+    # Seconds for which a command shows nothing new on a terminal, at most.
+    import pty, time
+    child, screen = pty.fork()
+    if not child:
+        os.execv(sys.executable, [sys.executable, "-m", "bwbayes", *words])
+    longest, before = 0.0, time.monotonic()
+    shown = b""
+    while True:
+        try:
+            piece = os.read(screen, 65536)
+        except OSError:  # it has ended
+            piece = b""
+        now = time.monotonic()
+        if piece.strip() != shown.strip():
+            longest, before, shown = max(longest, now - before), now, piece
+        if not piece:
+            os.waitpid(child, 0)
+            return longest
+
 def few(readings, seeds):
     import numpy as np
     import bwbayes
@@ -55,6 +75,19 @@ def stand(samples, dynamics="none", **keys):
     x = 0.7 * u - bwbayes.hysteresis(u, alpha=0.36, beta=0.027, gamma=0.017).ravel() + noise
     record = bwbayes.Record.from_arrays(u, x, interval=float(t[1]))
     return bwbayes.fit(record, dynamics=dynamics, progress=False, **keys)
+
+def chirp(samples, seconds, fastest):
+    import numpy as np
+    import bwbayes
+    import scipy.signal
+    t = np.linspace(0, seconds, samples)
+    u = 50 - 50 * np.cos(2 * np.pi * (t + (fastest - 1) * t**2 / (2 * seconds)))
+    x = 0.7 * u - bwbayes.hysteresis(u, alpha=0.36, beta=0.027, gamma=0.017).ravel()
+    kept = np.exp(-t[1] / 2e-3)
+    x = x[0] + scipy.signal.lfilter([0, 1 - kept], [1, -kept], x - x[0])
+    x += np.random.default_rng(1).normal(0, 0.05, samples)
+    record = bwbayes.Record.from_arrays(u, x, interval=float(t[1]))
+    return bwbayes.fit(record, progress=False)
 
 def plan():
     import numpy as np
@@ -99,6 +132,16 @@ WAITS: dict[str, tuple[str, str]] = {
     "20 replicates of a calibration": (
         "",
         'command("calibrate", "runs/calibration.toml", "--replicates=20", "--out", out + "/c")',
+    ),
+    "chirp of 30,001 samples": ("", "chirp(30_001, 10, 100)"),
+    "chirp of a million samples": ("", "chirp(1_000_000, 100, 10)"),
+    "longest silence of a run on a terminal, s": (
+        "",
+        'result = silence("run", "runs/ring_bender.toml", "--out", out + "/silent")',
+    ),
+    "longest silence of track on a terminal, s": (
+        "",
+        'result = silence("track", out + "/warm", "--out", out + "/track")',
     ),
     "memory of a fit of a million samples, GiB": (
         "",
