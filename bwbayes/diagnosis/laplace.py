@@ -213,10 +213,13 @@ class _Target:
         """Put the evidence at a mode together."""
         log_evidence, covariance = state.density, np.eye(state.coordinates.size)
         # What the record does not tell keeps its prior; the noise's bend is a finite difference.
-        for rows, curvature, flattest in (
-            (self.physical, self._physical_bend(state)[1], 1.0),
-            (self.noise, self._noise_bend(state)[1], 1e-2),
-        ):
+        parts = (
+            (self.physical, self._physical_bend, 1.0),
+            (self.noise, self._noise_bend, 1e-2),
+        )
+        # A model that is possible at none of its starts has no evidence, and no curvature.
+        for rows, bend, flattest in parts if np.isfinite(state.density) else ():
+            curvature = bend(state)[1]
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
             covariance[np.ix_(rows, rows)] = (vectors / values) @ vectors.T
