@@ -34,9 +34,10 @@ from bwbayes.shown import brief
 # about an extreme may lie from the outermost of them.
 WITHIN, ABOUT = 1.5, 3.0
 
-# Parts of the range: what seems noise beyond the first is a voltage that changes too fast for its
-# sampling; from the second on the path is not known well enough for parameters.
-LARGEST, REPAIRABLE = 0.03, 0.005
+# Parts of the range. Beyond the first, what the path leaves unsure shows in the parameters' sds
+# (tests/README.md); from the second on, in the parameters; what seems noise beyond the third is a
+# voltage that changes too fast for its sampling.
+SURE, REPAIRABLE, LARGEST = 0.002, 0.005, 0.03
 
 # The same of a step to which the voltage is rounded: a hold's level is known to half of it.
 COARSE = 0.003
@@ -126,6 +127,8 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
             f"voltage has {shown}, too much to repair: do not trust the parameters; measure the "
             'voltage with less noise, or give the command (voltage_is = "command")'
         )
+    elif sd > SURE * extent:
+        remark += "; parameters' SDs may be too small by a factor of 2"
     return VoltagePath(path + center, sd, fitted.reversals, remark)
 
 
