@@ -1,0 +1,135 @@
+"""Noise on the recorded voltage: parameters and the next record's bands are those of a clean one.
+
+Simulated Bouc-Wen actuators, each driven from rest by a record to fit and by a multisine to
+predict, whose voltages are read with white noise of 0.003 to 0.3% of their range, at 200 Hz to
+4 kHz. The twin drives the model by the voltage as measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.actuator import Actuator
+from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.prediction import predict_record
+from bwbayes.record import Record, write_record
+from tests.measured import keep
+from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.record.drives import DRIVES, drive
+
+TRUTH = {"d": 0.12, "alpha": 0.04, "beta": 0.028, "gamma": 0.009, "exponent": 1.0, "lag": 0.003}
+SHAPE = ("d", "alpha", "beta", "gamma")
+SENSOR, RANGE = 0.01, 90.0
+CONFIG = (
+    '[record]\nfile = "record.h5"\nfrom_rest = true\n[model]\ndynamics = "lag"\nhold = "first"\n'
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Errors of :data:`SHAPE` as parts of the truth and in sds; of the next record what it is."""
+
+    error: FloatArray
+    z: FloatArray
+    coverage: float
+    width: float
+
+    @property
+    def right(self) -> bool:
+        """Whether it is what is asked for: d, alpha, beta within 2%, gamma 10%, or three sds."""
+        near = np.abs(self.error) < np.array([0.02, 0.02, 0.02, 0.1])
+        return bool(np.all(near | (np.abs(self.z) < 3)) and 0.88 <= self.coverage <= 0.99)
+
+
+def records(kind: str, rate: float, seed: int) -> tuple[Record, Record]:
+    """Return a record to fit, and another to predict, with clean voltages."""
+    rng = np.random.default_rng([91, seed])
+    actuator = Actuator("lag", "first", 1 / rate)
+    model = np.array([[TRUTH.get(name, 0.0) for name in actuator.parameters]])
+    made = []
+    for shape, extent in ((kind, RANGE), ("multisine", 0.95 * RANGE)):
+        driven = 5 + extent * drive(shape, rate, rng)
+        voltage = np.concatenate([np.linspace(0, driven[0], round(rate / 2)), driven])
+        reading = actuator.displacement(model, voltage)[0]
+        reading = reading + SENSOR * rng.standard_normal(voltage.size)
+        made.append(Record(voltage, reading, 1 / rate))
+    return made[0], made[1]
+
+
+def noisy(record: Record, part: float, seed: int) -> Record:
+    """Return a record whose voltage has noise of a part of the range."""
+    noise = part * RANGE * np.random.default_rng([92, seed]).standard_normal(record.samples)
+    return replace(record, voltage=record.voltage + noise)
+
+
+def answer(fitted: Record, other: Record, folder: Path) -> Answer:
+    """Fit a record as a run does it, and predict the other one."""
+    write_record(fitted, folder / "record.h5")
+    problem = problem_of(CONFIG, folder)
+    source = np.random.default_rng(5)
+    draws, weights = weighted_draws(problem.posterior, source)
+    columns = [problem.posterior.names.index(name) for name in SHAPE]
+    truth = np.array([TRUTH[name] for name in SHAPE])
+    off = weights @ draws[:, columns] - truth
+    sd = np.sqrt(weights @ (draws[:, columns] - off - truth) ** 2)
+    chosen = draws[source.choice(len(draws), KEPT, p=weights)]
+    bands = predict_record(
+        problem.posterior, chosen, other, Start(from_rest=True, hold="first"), source
+    )
+    width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
+    return Answer(off / truth, off / sd, covered(bands), width)
+
+
+def summary(answers: Mapping[str, Answer], clean: Mapping[str, Answer]) -> dict[str, object]:
+    """Return the figures of one size of noise, of answers by their cells."""
+    widths = [answers[cell].width / clean[cell].width for cell in answers]
+    error = np.array([found.error for found in answers.values()])
+    z = np.array([found.z for found in answers.values()])
+    coverage = [found.coverage for found in answers.values()]
+    return {
+        "cells": len(answers),
+        "wrong": sorted(cell for cell, found in answers.items() if not found.right),
+        "largest error": dict(zip(SHAPE, np.abs(error).max(axis=0).tolist(), strict=True)),
+        "rms z": dict(zip(SHAPE, np.sqrt(np.mean(z**2, axis=0)).tolist(), strict=True)),
+        "coverage": [min(coverage), float(np.mean(coverage)), max(coverage)],
+        "width": [float(np.median(widths)), max(widths)],
+    }
+
+
+@pytest.mark.slow
+def test_noise_on_the_voltage_changes_no_answer(tmp_path: Path) -> None:
+    """Asked: every cell right, next records covered 88 to 99%, bands at most 1.5 times as wide."""
+    parts = (3e-5, 3e-4, 1e-3, 3e-3)
+    clean: dict[str, Answer] = {}
+    found: dict[float, dict[str, Answer]] = {part: {} for part in parts}
+    for number, kind in enumerate(DRIVES):
+        for rate in (200.0, 1000.0, 4000.0):
+            seed = 110 + number
+            fitted, other = records(kind, rate, seed)
+            cell = f"{kind} at {rate:g} Hz"
+            clean[cell] = answer(fitted, other, tmp_path)
+            for part in parts:
+                measured = noisy(fitted, part, seed), noisy(other, part, seed + 500)
+                found[part][cell] = answer(*measured, tmp_path)
+    figures = {f"{100 * part:g}%": summary(answers, clean) for part, answers in found.items()}
+    keep("noise on the voltage", {"clean": summary(clean, clean), **figures})
+    wrong = [cell for answers in found.values() for cell, one in answers.items() if not one.right]
+    assert len(wrong) <= 0.05 * len(parts) * len(clean), wrong
+    for part, answers in found.items():
+        widths = [answers[cell].width / clean[cell].width for cell in answers]
+        assert np.median(widths) < 1.2, part
+        assert max(widths) < 1.7, part
+
+
+def test_one_noisy_record_is_right_and_as_measured_it_is_not(tmp_path: Path) -> None:
+    """The twin says that a command, which has no noise, was measured: its gamma is far off."""
+    fitted, other = (noisy(record, 1e-3, 1) for record in records("decaying sine", 1000.0, 1))
+    assert answer(fitted, other, tmp_path).right
+    raw = [replace(record, voltage_is="command") for record in (fitted, other)]
+    assert not answer(raw[0], raw[1], tmp_path).right
