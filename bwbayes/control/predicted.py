@@ -165,7 +165,7 @@ class Compensation(Product):
             f"{after['probability_below_limit']:.2f} only: the largest error is "
             f"{after['largest_um']['mean']:.3g} um, in the mean at "
             f"{clock(float(self.reference.time[farthest]), self.reference.interval)} s; ask for "
-            "less, smooth corners (`smoothed=0.02`), or choose a larger limit"
+            "less, smooth corners (smoothed, --smooth), or choose a larger limit"
         )
 
     @property

@@ -115,7 +115,8 @@ def predict(
             f"{record}: has no displacement that is recognized, so the bands are not validated; if "
             "a column is one, say --column displacement=NAME"
         )
-    if unmeasured and not (options["from_rest"] or options["after"]):
+    known = options["from_rest"] or options["after"]
+    if unmeasured and not (known or any("--from-rest" in remark for remark in bands.remarks)):
         width = bands.upper["sensor", 95] - bands.lower["sensor", 95]
         remarks.append(
             "the state that the actuator starts from is unknown: the 95% sensor band is "

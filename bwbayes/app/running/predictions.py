@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -144,8 +145,42 @@ def predict_another(
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
-    remarks = (*[path.remark] * bool(path.remark), *(finding.note for finding in beyond))
+    rest = _from_rest_remark(problem, subset, other, bands, beyond)
+    remarks = (
+        *[path.remark] * bool(path.remark),
+        *[rest] * bool(rest),
+        *(finding.note for finding in beyond),
+    )
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
+
+
+def _from_rest_remark(
+    problem: Problem, draws: FloatArray, other: Validation, bands: Bands, beyond: Iterable[Finding]
+) -> str:
+    """Say what it would change to declare a record from rest; nothing unless it may start so.
+
+    It may where the first voltage is zero, to a hundredth of the range. Of every fourth draw.
+    """
+    record, start = other.record, other.start
+    assert record is not None
+    first, extent = float(record.voltage[0]), float(np.ptp(record.voltage))
+    if start.from_rest or start.after or abs(first) > 0.01 * extent:
+        return ""
+    rested = replace(other, start=replace(start, from_rest=True))
+    declared = _of_another(problem, draws[::4], rested, bands.name, beyond)
+    scored = slice(max(bands.scored_from, declared.scored_from), None)
+    widths, shares = [], []
+    for predicted in (bands, declared):
+        lower, upper = predicted.lower["sensor", 95], predicted.upper["sensor", 95]
+        widths.append(float(np.mean((upper - lower)[scored])))
+        if bands.measured is not None:
+            inside = predicted.covers("sensor", 95, bands.measured)[scored]
+            shares.append(f" and covers {np.mean(inside[np.isfinite(bands.measured[scored])]):.1%}")
+    unknown, known = (f"{w:.3g} um wide{c}" for w, c in zip_longest(widths, shares, fillvalue=""))
+    return (
+        f"the record starts at 0 V, perhaps from rest: the 95% sensor band is {unknown}; "
+        f"{known} if the actuator was demagnetized and nothing moved, which --from-rest declares"
+    )
 
 
 def predict_after(
