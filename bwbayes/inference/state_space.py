@@ -254,9 +254,16 @@ class Noise(ABC):
         if self.states == 1:
             for model, (a,) in enumerate(kept[:, 0]):
                 states[model, :, 0] = scipy.signal.lfilter((1.0,), (1.0, -a), states[model, :, 0])
-        else:
-            for t in range(1, samples):
-                states[:, t] += (kept @ states[:, t - 1, :, np.newaxis])[..., 0]
+            return states @ self.observe, theta[:, :1] * scores[:, -1]
+        for model, matrix in enumerate(kept):
+            # F = U T U* with T triangular: from the last one on, each is a recursion by itself.
+            triangle, basis = scipy.linalg.schur(matrix, output="complex")
+            parts = states[model] @ basis.conj()
+            for row in reversed(range(self.states)):
+                parts[1:, row] += parts[:-1, row + 1 :] @ triangle[row, row + 1 :]
+                taps = (1.0, -triangle[row, row])
+                parts[:, row] = scipy.signal.lfilter((1.0,), taps, parts[:, row])
+            states[model] = (parts @ basis.T).real
         return states @ self.observe, theta[:, :1] * scores[:, -1]
 
 
