@@ -7,17 +7,20 @@ moves or a mount with backlash. An amplifier may be late, saturate, or be slow.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.diagnosis.laplace import Effect, Simulate, climb
-from bwbayes.diagnosis.record_checks import settle_fix
+from bwbayes.diagnosis.laplace import Effect, LocalFit, Simulate, climb
+from bwbayes.diagnosis.loopfit import find_delay
+from bwbayes.diagnosis.record_checks import late_fix, settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate
+from bwbayes.record.record import Record
 
 # Prior sd of an addition to the displacement, as a fraction of its range.
 SIZE = 0.1
@@ -156,17 +159,43 @@ def backlash(scene: Scene) -> Iterator[Explanation]:
 
 
 def delay(scene: Scene) -> Iterator[Explanation]:
-    """Try u(t − δ); δ is a fiftieth of the time between reversals, give or take."""
+    """Try u(t − δ), of either sign; δ is a fiftieth of the time between reversals, give or take.
+
+    Up to a quarter of a period it is told by loops: the model is fitted anew to readings that are
+    moved by whole samples, and compared with a fit of the same readings where they are.
+    """
     scale = max(scene.turn_time / 50, scene.interval / scene.stride)
 
     def shifted(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
         clock = scene.interval * np.arange(voltage.size)
         return np.asarray(np.interp(clock - scale * sizes[0], clock, voltage))
 
-    fit = scene.extended(_replace_voltage(shifted, np.array([[0.0], [1.0]])))
-    text = f"delay of {1000 * scale * fit.sizes[0]:.2g} ms between voltage and displacement"
-    fix = "align the channels in the file, or set hold in [model] if the voltage is a command"
-    yield scene.explained("delay", text, fix, fit)
+    fit = scene.extended(_replace_voltage(shifted, np.array([[-1.0], [0.0], [1.0]])))
+    yield _late(scene, scale * float(fit.sizes[0]), fit)
+    record, limit = scene.posterior.only, min(0.55 * scene.turn_time, 0.2 * scene.duration)
+    kept = np.full(record.displacement.size, np.nan)
+    for window in record.training:
+        kept[window] = record.displacement[window]
+    late, _ = find_delay(Record(record.voltage, kept, scene.interval), limit)
+    rows = round(late / scene.interval)
+    if abs(late) < scale or not rows:
+        return
+    kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
+    whole = (slice(0, kept.size),)
+    unmoved = scene.posterior.altered(displacement=kept, training=whole)
+    moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=whole)
+    before = replace(scene, fit=climb(unmoved, scene.places), before=None, held_out=())
+    fit = climb(moved, map_estimate.valleys(moved, scene.generator))
+    cost = scene.lead + float(np.log(2 * limit / scene.interval))
+    yield _late(before, rows * scene.interval, fit, cost)
+
+
+def _late(scene: Scene, late: float, fit: LocalFit, cost: float = 0.0) -> Explanation:
+    text = f"{'displacement' if late > 0 else 'voltage'} that is late by {1000 * abs(late):.3g} ms"
+    fix = late_fix(late, scene.interval / scene.stride)
+    if late > 0:
+        fix += ", or set hold in [model] if the voltage is a command"
+    return scene.explained("delay", text, fix, fit, cost)
 
 
 def saturation(scene: Scene) -> Iterator[Explanation]:

@@ -257,9 +257,14 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
         return None
     name = "displacement" if delay > 0 else "voltage"
     text = f"the {name} is late by {1e3 * abs(delay):.3g} ms"
-    samples = max(round(abs(delay) / record.interval), 1)
-    fix = f"move the {name}'s column up by {samples} rows in the file"
-    return _whole(record, f"late {name}", text, fix)
+    return _whole(record, f"late {name}", text, late_fix(delay, record.interval))
+
+
+def late_fix(delay: float, interval: float) -> str:
+    """Return what to do where the displacement comes ``delay`` s after what the voltage does."""
+    rows = max(round(abs(delay) / interval), 1)
+    name = "displacement" if delay > 0 else "voltage"
+    return f"move the {name}'s column up by {rows} row{'s' * (rows > 1)} in the file"
 
 
 def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:

@@ -16,8 +16,8 @@ from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, like
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.record import write_record
-from tests.diagnosis.plants import CAUSES, plant
+from bwbayes.record import Record, write_record
+from tests.diagnosis.plants import CAUSES, FINE, RATE, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import problem_of
 from tests.stand import Stand
 
@@ -99,6 +99,31 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     assert best.kind in CAUSES[kind]
     assert best.nats > LIMIT
     assert bool(followed_causes([best])) is (kind in {"transient", "drift", "step", "outliers"})
+
+
+@pytest.mark.parametrize("late", [-0.2, -0.04, 0.1, 0.24])
+def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
+    late: float, tmp_path: Path
+) -> None:
+    """Of either sign, to 3% of a period, also where a lag has grown to take its place."""
+    rng = np.random.default_rng(round(100 * late + 50))
+    time, part = np.arange(8 * RATE * FINE) / RATE / FINE, drawn(rng)
+    fine = 50 + 45 * np.exp(-0.15 * time) * np.sin(2 * np.pi * 0.8 * time)
+    moved = lagged(hysteresis(part, fine), part.lag)[::FINE]
+    readings = moved + 0.001 * np.ptp(moved) * rng.standard_normal(moved.size) - 12.0
+    count = round(late / 0.8 * RATE)
+    rows = slice(max(-count, 0), readings.size - max(count, 0))
+    other = slice(rows.start + count, rows.stop + count)
+    record = Record(fine[::FINE][other], readings[rows], 1 / RATE)
+    write_record(record, tmp_path / "record.h5")
+    problem = problem_of('[record]\nfile = "record.h5"\n', tmp_path)
+    rng = np.random.default_rng(1)
+    optima = pointfit.fit(problem.posterior, rng).optima
+    found = max(effects.delay(Scene.of(problem.posterior, optima, rng)), key=lambda e: e.nats)
+    assert found.nats > LIMIT
+    assert found.text.startswith("displacement" if late > 0 else "voltage")
+    assert abs(0.8 * float(found.text.split()[-2]) / 1000 - abs(late)) < 0.03
+    assert found.rmse[1] < found.rmse[0] / 2
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:

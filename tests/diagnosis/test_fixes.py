@@ -92,8 +92,9 @@ def followed(
         return config.model_copy(update={"record": changed, "validation": {"next": later}})
     if cause.kind == "sign":
         records = [replace(each, displacement=-np.array(each.displacement)) for each in records]
-    elif found := re.match(r"delay of (\S+) ms", cause.text):
-        records = [shifted(each, float(found[1]) / 1000) for each in records]
+    elif found := re.match(r"(\w+) that is late by (\S+) ms", cause.text):
+        late = float(found[2]) / 1000 * (1 if found[1] == "displacement" else -1)
+        records = [shifted(each, late) for each in records]
     elif cause.kind in ("saturation", "slew limit"):
         driven = zip(records, made.driven, strict=True)
         records = [replace(each, voltage=voltage) for each, voltage in driven]
