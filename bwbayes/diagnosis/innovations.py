@@ -24,6 +24,9 @@ from bwbayes.shown import brief
 # Probability of a false alarm of each of the tests, of which there are about ten.
 ALARM = 1e-4
 
+# What to do about a departure.
+EXPLAIN = "give the model what explains it better, if anything is named; else expect wider errors"
+
 
 @dataclass(frozen=True)
 class Innovations:
@@ -166,7 +169,7 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
             f"between {low:.3g} and {high:.3g} Hz the innovations have {power[octave]:.2g} times "
             "the power that white ones have"
         )
-        fix = "check whether the sensor filters; else try what explains it: bwbayes run --improve"
+        fix = f"check whether the sensor filters; else {EXPLAIN}"
         findings.append(Finding("noise model", text, fix))
     for quantity, subject in (("rate", "drive"), ("voltage", "voltage"), ("direction", "voltage")):
         groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
@@ -180,6 +183,5 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
         if scores[surest] > scipy.stats.norm.isf(ALARM / 6) and abs(means[surest]) > 0.15:
             where = f"where the {subject} is {groups[surest][0]}"
             text = f"the innovations average {means[surest]:+.2f} SD {where}"
-            fix = "try what explains it: bwbayes run --improve"
-            findings.append(Finding("noise model", text, fix))
+            findings.append(Finding("noise model", text, EXPLAIN))
     return tuple(findings)
