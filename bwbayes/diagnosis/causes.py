@@ -3,7 +3,8 @@
 Given the bands, residuals are jointly normal: the parameters' error, the discrepancy, the sensor's
 noise. Each cause adds shapes of unknown size (a constant, a trend, a decay at the start, the mean
 itself, ...) with a normal prior, so that its evidence is exact and costs one pass of the noise's
-filter. What was fitted has :mod:`bwbayes.diagnosis.explanations` instead.
+filter. Where residuals are too large, a cause has to bring most of that back. What was fitted has
+:mod:`bwbayes.diagnosis.explanations` instead.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.diagnosis.departures import ODDS
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.model import tail_nats
-from bwbayes.diagnosis.series_patterns import Line, strongest_line
+from bwbayes.diagnosis.series_patterns import Line, scatter, strongest_line
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
@@ -118,7 +120,9 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
     return likely
 
 
-def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
+def _explanations(  # noqa: PLR0915  # a cause after the other
+    bands: Bands, rows: IntArray, memory: float
+) -> list[Finding]:
     """Weigh all causes by the readings at ``rows`` (readings,), with nats against none."""
     assert bands.measured is not None
     mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
@@ -134,11 +138,12 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
 
     def weigh(
         added: FloatArray, residual: FloatArray = residual
-    ) -> tuple[float, FloatArray, FloatArray]:
+    ) -> tuple[float, FloatArray, FloatArray, float]:
         """Explain a residual by shapes (shapes, readings) of standard normal sizes.
 
         Returns its log density, up to what is the same for all shapes, the innovations (readings,)
-        less what the shapes explain, in sds, and the sizes (shapes,).
+        less what the shapes explain, in sds, the sizes (shapes,), and the mean square of what
+        shapes and parameters leave, um².
         """
         series = np.concatenate([[residual], errors, added])
         white = DiscrepancyNoise(interval).whiten(noise, series[np.newaxis], skipped)[0][0]
@@ -147,17 +152,26 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
         sizes = np.linalg.solve(precision, pull)
         squares = float(white[0] @ white[0] - pull @ sizes)
         log_volume = float(np.linalg.slogdet(precision)[1])
-        return -0.5 * (squares + log_volume), white[0] - sizes @ white[1:], sizes[len(errors) :]
+        log_density = -0.5 * (squares + log_volume)
+        left = float(np.mean((residual - sizes @ series[1:]) ** 2))
+        return log_density, white[0] - sizes @ white[1:], sizes[len(errors) :], left
 
-    plain, white, _ = weigh(np.empty((0, rows.size)))
+    plain, white, _, missed = weigh(np.empty((0, rows.size)))
     along = (time - time[0]) / max(float(np.ptp(time)), interval)
     shapes = _shapes(bands, rows, along)
-    nats = {kind: weigh(added)[0] - plain for kind, added in shapes.items()}
+    weighed = {kind: weigh(added) for kind, added in shapes.items()}
+    nats = {kind: each[0] - plain for kind, each in weighed.items()}
+    left = {kind: each[-1] for kind, each in weighed.items()}
     # Twice the mean to the readings: then they are its opposite.
-    nats["sign"] = weigh(shapes["offset"], residual + 2 * mean)[0] - plain
-    starts = [weigh(3 * shapes["offset"] * np.exp(-along / decay))[0] for decay in DECAYS]
+    log_density, _, _, left["sign"] = weigh(shapes["offset"], residual + 2 * mean)
+    nats["sign"] = log_density - plain
+    decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in DECAYS]
+    starts = [each[0] for each in decays]
+    left["start"] = decays[int(np.argmax(starts))][-1]
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
+    far = np.abs(white) > 5 * max(scatter(white), 1.0)
+    left["outliers"] = float(np.mean(np.where(far, 0.0, residual) ** 2))
     size = float(shapes["offset"][0, 0])
     # At the largest innovation or, where nothing is remembered, where the means before and from
     # there on are farthest apart.
@@ -167,16 +181,18 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     steps = []
     for later in (int(np.argmax(np.abs(white) * (order > 0))), int(np.argmax(apart))):
         after = np.where(order >= later, size, 0.0)[np.newaxis]
-        log_density, _, sizes = weigh(after)
-        steps.append((log_density, later, size * float(sizes[0])))
-    log_density, later, jump = max(steps)
+        log_density, _, sizes, rest = weigh(after)
+        steps.append((log_density, later, size * float(sizes[0]), rest))
+    log_density, later, jump, left["step"] = max(steps)
     nats["step"] = log_density - plain - np.log(rows.size)
     line = strongest_line(white, bands.voltage[rows], rows - rows[0], interval) or Line(0.0, "")
     phase = 2 * np.pi * line.frequency * time
-    log_density, _, swing = weigh(size / 10 * np.stack([np.sin(phase), np.cos(phase)]))
+    waves = size / 10 * np.stack([np.sin(phase), np.cos(phase)])
+    log_density, _, swing, left["oscillation"] = weigh(waves)
     nats["oscillation"] = log_density - plain - np.log(rows.size / 2)
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
+    left["noise"] = missed / square
     settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
     words = {
         "name": bands.name,
@@ -194,6 +210,9 @@ def _explanations(bands: Bands, rows: IntArray, memory: float) -> list[Finding]:
     return [
         Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
         for kind, (text, fix) in WORDS.items()
+        # What is named takes away most of what the bands do not allow, if that is much. Of a model
+        # that is too simple these loops are a sign, and no full account.
+        if kind == "loop" or missed < ODDS * whole or left[kind] - whole < 0.5 * (missed - whole)
     ]
 
 

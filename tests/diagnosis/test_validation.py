@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from bwbayes.diagnosis.validation import Background, Verdict, assess
 from bwbayes.prediction.bands import KINDS, Bands, LeadIn
 from bwbayes.record.io.grid import clock
 from tests.prediction.records import Made, bands_of, made, normal_bands
+from tests.stand import process
 
 FITTED = (-100.0, 100.0)
 
@@ -355,3 +357,19 @@ def test_no_fit_passes_while_a_better_model_is_known(
 
 def test_no_fix_is_a_command_line_which_python_has_not() -> None:
     assert not [fix for _, fix in WORDS.values() if "bwbayes " in fix]
+
+
+@pytest.mark.parametrize("size", [5.0, 15.0])
+def test_a_few_outliers_are_no_cause_of_an_error_everywhere(size: float) -> None:
+    """Without them as much is left. The twin: alone they are the cause."""
+    named = {0.0: 0, size: 0}
+    for number, scale in product(range(10), named):
+        rng = np.random.default_rng([9, number])
+        record = made(rng, 20.0, 0.01, 0.1, 0.3, 0.1, 0.1)
+        sd = float(record.sds["sensor"].mean())
+        spoilt = scale * sd * process(record.time.size, 0.01 / 1.5, rng)
+        spoilt[rng.choice(record.time.size, 6, replace=False)] += 8 * max(scale, 5.0) * sd
+        cause = judged(bands_of(record, spoilt), Background(0.1, 0.0, FITTED)).cause
+        assert cause is not None
+        named[scale] += "outliers" in cause.kind.split(" or ")
+    assert named == {0.0: 10, size: 0}
