@@ -176,14 +176,10 @@ class _Target:
         """Log density (models,), less a constant, where the displacement (readings,) is known."""
         possible, density = np.isfinite(log_prior), log_prior.copy()
         if possible.any():
-            theta, likelihood = theta[possible], self.posterior.likelihood
-            most = 2 * likelihood.readings.rows.size > likelihood.readings.samples
-            if self.effect is NONE and likelihood.engine == "numba" and most:
-                # To simulate again is faster than to pass whitened series through the memory.
-                density[possible] += likelihood.log_density(theta)
-            else:
-                moved = np.tile(displacement, (len(theta), 1))
-                density[possible] += likelihood.score(theta, moved[:0], moved).log_density
+            theta = theta[possible]
+            moved = np.tile(displacement, (len(theta), 1))
+            score = self.posterior.likelihood.score(theta, moved[:0], moved)
+            density[possible] += score.log_density
         return np.where(np.isfinite(density), density, -np.inf)
 
     def at(self, coordinates: FloatArray) -> _State:
