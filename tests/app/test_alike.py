@@ -171,6 +171,16 @@ def test_predict_validates_on_a_second_file_of_the_same_kind(
     own = "--column", "time=a", "--column", "voltage=b", "--column", "displacement=c"
     said = bwbayes("predict", copy.path, "--record", renamed, *own, "--out", "own.csv")
     said.assert_refused("which unit has", "--unit displacement=um")
+    # One of several tables is read alike.
+    two = renamed.with_name("two.csv")
+    two.write_text(2 * f"title\n{renamed.read_text()}\n")
+    said = bwbayes("predict", copy.path, "--record", two)
+    said.assert_refused("2 tables with numbers", "`--table 1`")
+    with pytest.warns(bw.InputWarning, match="above the header"):
+        said = bwbayes("predict", copy.path, "--record", two, "--table", "2")
+    assert 0 == said.status
+    second = json.loads((copy.path / "predictions/two.json").read_text())["scores"]
+    assert second["max_error_um"] == pytest.approx(first["max_error_um"], rel=1e-9)
 
 
 def test_predict_says_that_a_record_without_a_displacement_validates_nothing(

@@ -17,10 +17,11 @@ from bwbayes.app.config.proposal import ConfigProposal, propose
 from bwbayes.app.problem.problem import resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.record import Record
+from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Waveform
+from tests.app.conftest import Type
 
 OWN = "time_s,voltage_V,displacement_um"
 
@@ -145,6 +146,26 @@ def test_the_command_that_writes_the_config_has_the_options_that_were_given(writ
     assert ["init", str(path), *given] == shlex.split(typed)
     assert 0 == command(*shlex.split(typed)).return_value
     assert path.with_suffix(".toml").exists()
+
+
+@pytest.mark.filterwarnings("ignore:.*1 line above the header:bwbayes.errors.InputWarning")
+def test_the_config_names_the_table_that_was_chosen(bwbayes: Type, write: Write) -> None:
+    """Of several, which ``init`` and ``run`` list with the option that chooses one."""
+    path = write()
+    alone = read_record(path)
+    turned = write(change=_turned).read_text()
+    path.write_text(f"first\n{turned}\nsecond\n{write().read_text()}")
+    for name in ("init", "run", "check"):
+        said = bwbayes(name, path)
+        said.assert_refused("2 tables with numbers: 1 'first', 2 'second'", "`--table 1`")
+    assert 0 == bwbayes("init", path, "--table", "second").status
+    record = load(path.with_suffix(".toml")).records["record"]
+    assert "second" == record.table
+    assert record.file is not None
+    read = read_record(path.with_name(record.file), table=record.table)
+    np.testing.assert_array_equal(read.displacement, alone.displacement)
+    said = bwbayes("check", path.with_suffix(".toml"), "--table", "1")
+    said.assert_refused("--table are for a record")
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1e3, 1.0), (1.0, 1e-4, 1.0), (1.0, 1.0, 1e4)])

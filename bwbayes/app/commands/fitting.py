@@ -179,8 +179,8 @@ def _config_or_proposal(
         config = load(path)
         if any(value not in (None, {}) for value in naming.values()):
             raise InputError(
-                f"{path}: --column, --unit and --fs are for a record; in a config say columns, "
-                "units and fs under [record]"
+                f"{path}: --column, --unit, --fs and --table are for a record; in a config say "
+                "columns, units, fs and table under [record]"
             )
         return config if record is None else config.with_record(record), False
     try:
@@ -192,7 +192,9 @@ def _config_or_proposal(
         ) from None
     config = proposal.config
     tables = {key: naming[key] for key in ("columns", "units")}
-    init = with_naming(f"bwbayes init {shlex.quote(str(path))}", tables, naming["fs"])
+    init = f"bwbayes init {shlex.quote(str(path))}"
+    init += "" if naming["table"] is None else f" --table {shlex.quote(naming['table'])}"
+    init = with_naming(init, tables, naming["fs"])
     if command != "check" and proposal.pointless is not None:
         raise InputError(
             f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "

@@ -57,7 +57,7 @@ def _saved(
 @folder_argument
 @click.option("--record", type=FILE, help="Record to predict (measured, or voltage only).")
 @naming_options
-@options_of("bwbayes.app.jobs.predict:predict", "name", "own_offset", "watch")
+@options_of("bwbayes.app.jobs.predict:predict", "name", "table", "own_offset", "watch")
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
@@ -70,6 +70,7 @@ def predict(
     columns: dict[str, str],
     units: dict[str, str],
     fs: float | None,
+    table: str | None,
     **options: Any,
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
@@ -82,10 +83,10 @@ def predict(
     if (record is None) == (options["signal"] is None):
         raise InputError("predict: give either a record or a signal")
     name = options["signal"] if record is None else record.stem
-    table = out or folder / "predictions" / f"{name}.csv"
-    files = [table, table.with_suffix(".json"), table.with_suffix(".png")]
-    if table in files[1:]:
-        raise InputError(f"{table}: the bands are a table; give a name that ends in .csv")
+    bands_file = out or folder / "predictions" / f"{name}.csv"
+    files = [bands_file, bands_file.with_suffix(".json"), bands_file.with_suffix(".png")]
+    if bands_file in files[1:]:
+        raise InputError(f"{bands_file}: the bands are a table; give a name that ends in .csv")
     with working() as watch:
         import numpy as np
 
@@ -101,10 +102,10 @@ def predict(
         other: Record | Path | None = record
         try:
             if record and (columns or units or fs is not None):
-                other = read_record(
-                    record, need_displacement=False, columns=columns, units=units, fs=fs
-                )
-            options |= {"name": name, "own_offset": not same_offset, "watch": watch}
+                naming: dict[str, Any] = {"columns": columns, "units": units}
+                naming |= {"fs": fs, "table": table}
+                other = read_record(record, need_displacement=False, **naming)
+            options |= {"name": name, "table": table, "own_offset": not same_offset, "watch": watch}
             bands = predict_record(fit, other, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None

@@ -144,7 +144,8 @@ class WithParts(click.Command):
 
 
 def naming_options(command: AnyCommand) -> AnyCommand:
-    """Add the options that say which columns of a record are meant: columns, units and fs."""
+    """Add the options that say what of a record's file is meant: columns, units, fs and table."""
+    table = click.option("--table", metavar="N", help="One of several tables: number or sheet.")
     fs = click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column.")
     units = click.option(
         "--unit",
@@ -163,7 +164,7 @@ def naming_options(command: AnyCommand) -> AnyCommand:
         callback=_pairs,
         help="The column of time, voltage or displacement: a name, or a number from 1 on.",
     )
-    return columns(units(fs(command)))
+    return columns(units(fs(table(command))))
 
 
 def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:

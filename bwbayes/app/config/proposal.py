@@ -130,6 +130,7 @@ def _text(
             )
             source += f"\n{key} = {{ {pairs} }}"
     source += "" if naming.fs is None else f"\nfs = {naming.fs!r}"
+    source += "" if naming.table is None else f"\ntable = {quoted(naming.table)}"
     command = ""
     if naming.units.get("voltage") is None and record.voltage_is == "output":
         command = (

@@ -93,6 +93,10 @@ class _Source(ConfigTable):
     """
     fs: Positive | None = key(None, unit="Hz", example="1e3")
     """The file's sampling rate, in place of a time column."""
+    table: int | str | None = key(None, example="2", called="sheet")
+    """Of a workbook or text with several tables the one that counts: its number, from 1 on, or the
+    sheet's name.
+    """
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
     """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
     that is predicted by default those of the training record.

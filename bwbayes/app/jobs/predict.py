@@ -27,6 +27,7 @@ def predict(
     *,
     signal: str | None = None,
     name: str | None = None,
+    table: int | str | None = None,
     window: tuple[float, float] | None = None,
     from_rest: bool = False,
     own_offset: bool = True,
@@ -49,6 +50,8 @@ def predict(
         A signal to predict instead, by its name.
     name
         Name of the bands; by default the file's or the signal's, or "prediction".
+    table
+        Of a file with several tables the one that counts: its number, from 1 on, or its title.
     window
         Judge and write this part of the record alone: start and stop, s.
     from_rest
@@ -109,7 +112,7 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or Path(str(record)).stem
-        alike = options_alike(record or "", problem.config.records[of].read_as)
+        alike = options_alike(record or "", problem.config.records[of].read_as, table)
         record = read_record(record or "", need_displacement=False, **alike)
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold

@@ -29,31 +29,34 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     }
     if not stated or source.file is None:
         return None
-    content = _content(folder / source.file)
+    content = _content(folder / source.file, source.table)
     columns = {q: series_named(content, c, q).name for q, c in (source.columns or {}).items()}
     names = [item.name for item in content.series]
     return {**stated, "columns": columns, "all_columns": names}
 
 
-def options_alike(path: str | Path, noted: dict[str, Any] | None) -> dict[str, Any]:
+def options_alike(
+    path: str | Path, noted: dict[str, Any] | None, table: int | str | None = None
+) -> dict[str, Any]:
     """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.
 
     None of one that has other columns than the record had. It may lack some, as a planned voltage
-    lacks the displacement.
+    lacks the displacement. Of a file with several tables the ``table`` says which one.
 
     Raises InputError: the file cannot be read.
     """
+    chosen = {} if table is None else {"table": table}
     if noted is None:
-        return {}
-    names = {item.name for item in _content(Path(path)).series}
+        return chosen
+    names = {item.name for item in _content(Path(path), table).series}
     if not names <= {*noted.get("all_columns", ())}:
-        return {}
+        return chosen
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
     options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
-    return options | {"columns": columns}
+    return options | chosen | {"columns": columns}
 
 
-def _content(path: Path) -> Source:
+def _content(path: Path, table: int | str | None) -> Source:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # said where the record is read
-        return read_source(path)
+        return read_source(path, table)

@@ -386,7 +386,7 @@ def _explicit(
         )
         for name, source in config.records.items()
     }
-    as_read = dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs"))
+    as_read = dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs", "table"))
     validation = {
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()

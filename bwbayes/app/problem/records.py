@@ -220,6 +220,7 @@ def _read(
             columns=source.columns,
             units=source.units,
             fs=source.fs,
+            table=source.table,
         )
     except ColumnsError as error:
         raise error.within(table) from None

@@ -69,6 +69,8 @@ class Naming:
         of 0.35 um each. A minus turns the sign: ``"-um"`` is a displacement counted backwards.
     fs
         The sampling rate, Hz, in place of a time column.
+    table
+        Of a file with several tables the one that counts: its number, from 1 on, or its title.
 
     Raises
     ------
@@ -80,6 +82,7 @@ class Naming:
     columns: Mapping[str, str | int] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     fs: float | None = None
+    table: int | str | None = None
 
     def __post_init__(self) -> None:
         for key, table in (("columns", self.columns), ("units", self.units)):
@@ -213,7 +216,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     foreign = {
         q: name for q, name in names.items() if q in QUANTITIES and _likeness(name, "", q) != 0
     }
-    used = Naming({**foreign, **naming.columns}, naming.units, naming.fs)
+    used = Naming({**foreign, **naming.columns}, naming.units, naming.fs, naming.table)
     group = next(iter(chosen.values())).group
     notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
     return ColumnTable(source, columns, notes, used)

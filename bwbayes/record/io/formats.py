@@ -46,6 +46,7 @@ def read_record(
     columns: Mapping[str, str | int] | None = None,
     units: Mapping[str, str] | None = None,
     fs: float | None = None,
+    table: int | str | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -70,6 +71,9 @@ def read_record(
         turns the sign, and ``"0.35 um"`` is a sensor's sensitivity, that of 1 in the column.
     fs : float, Hz
         The sampling rate, in place of a time column.
+    table : int or str
+        Of a workbook or text with several tables the one that counts: its number, from 1 on, or
+        the sheet's name.
 
     Raises
     ------
@@ -87,8 +91,8 @@ def read_record(
     if voltage_is is not None:
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
-    table = read_table(path, Naming(columns or {}, units or {}, fs), needed)
-    record = Record(**record_fields(table, voltage_is, need_displacement))
+    content = read_table(path, Naming(columns or {}, units or {}, fs, table), needed)
+    record = Record(**record_fields(content, voltage_is, need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() not in _TEXT or not truth_path.exists():
         return record
@@ -124,11 +128,11 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
     InputError
         The file cannot be read, or a column that is needed is not known.
     """
-    return select(read_source(path), naming, needed)
+    return select(read_source(path, naming.table), naming, needed)
 
 
-def read_source(path: Path) -> Source:
-    """Return what a file holds, whatever it is.
+def read_source(path: Path, table: int | str | None = None) -> Source:
+    """Return what a file holds, whatever it is, or a ``table`` of it.
 
     Raises
     ------
@@ -159,15 +163,15 @@ def read_source(path: Path) -> Source:
         if is_workbook:
             from bwbayes.record.io.workbook import read_workbook  # noqa: PLC0415  # as of text
 
-            return read_workbook(path)
+            return read_workbook(path, table)
         if begin.startswith(b"TDSm"):
             return read_tdms(path)
         if path.suffix.lower() in _BINARY:
             raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
         from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
 
-        return read_text(path)
-    except InputError:
+        return read_text(path, table)
+    except (InputError, Warning):
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error

@@ -25,7 +25,7 @@ _NUMBER = re.compile(
     r"|[+-]?nan|[+-]?inf",
     re.IGNORECASE,
 )
-_SEPARATORS = ("\t", ";", ",", "|", " ")
+SEPARATORS = ("\t", ";", ",", "|", " ")
 EXAMPLE = "time_s,voltage_V,displacement_um"
 
 
@@ -56,7 +56,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     best, separator, fields = 0.0, "", 0
     columns: list[int] = []
     whole_columns: list[int] = []
-    for candidate in _SEPARATORS if rows else ():
+    for candidate in SEPARATORS if rows else ():
         split = [cells_of(line, candidate) for line in rows]
         width = Counter(map(len, split)).most_common(1)[0][0]
         if width < 2:
@@ -164,7 +164,7 @@ def split_header(line: str, layout: Layout) -> list[str]:
     may stand above fields without numbers.
     """
     bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
-    ways = [cells_of(bare, separator) for separator in (layout.separator, *_SEPARATORS)]
+    ways = [cells_of(bare, separator) for separator in (layout.separator, *SEPARATORS)]
     between_names = (r"\s{2,}|\t", r"(?<=[\])])\s+", r"\s+(?![\[(/])(?<!/ )")
     ways += [re.split(pattern, bare.strip()) for pattern in between_names]
     needed = 1 + max(set(range(layout.fields)) - layout.empty, default=0)

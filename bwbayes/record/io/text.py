@@ -40,6 +40,7 @@ from bwbayes.record.io.layout import (
     split_header,
 )
 from bwbayes.record.io.series import RATES, Clock, Series, Source, in_seconds
+from bwbayes.record.io.tables import index_of, tables_of
 from bwbayes.record.record import Record
 
 type Marks = tuple[str, str | None]
@@ -48,24 +49,26 @@ type Marks = tuple[str, str | None]
 _OTHER_MARKS = "['\u2019\u00a0\u2009\u202f]"
 
 
-def read_text(path: Path) -> Source:
-    """Return the columns of a text file.
+def read_text(path: Path, table: int | str | None = None) -> Source:
+    """Return the columns of a text file, of one ``table`` if there are several.
 
     Raises
     ------
     InputError
-        It is not text, holds no numbers, or a line has another number of fields; the text names
-        the line.
+        It is not text, holds no numbers, or several tables of which none is chosen; or a line has
+        another number of fields, and the text names the line.
 
     Warns
     -----
     InputWarning
         If lines above the header are skipped.
     """
-    return text_source(path, _decoded(path))
+    return text_source(path, _decoded(path), table)
 
 
-def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
+def text_source(
+    path: Path, text: str, table: int | str | None = None, *, is_whole: bool = False
+) -> Source:
     """Return the columns of a text that was read from a file; one that ``is_whole`` was not cut.
 
     Raises and warns as :func:`read_text` does.
@@ -80,6 +83,13 @@ def text_source(path: Path, text: str, *, is_whole: bool = False) -> Source:
         is_whole = True
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
+    tables = tables_of(lines)
+    chosen = tables[index_of(path, [title for _, title in tables], table)][0]
+    is_whole |= chosen.stop < len(lines)
+    # Empty lines in place of the tables above, so that the others keep their numbers.
+    lines = [""] * chosen.start + lines[chosen.start : chosen.stop]
+    while not lines[-1].strip():
+        lines.pop()
     layout = find_layout(path, lines)
     names, units, header = find_header(path, lines, layout)
     above = lines[: layout.first if header is None else header]

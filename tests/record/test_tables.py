@@ -1,0 +1,118 @@
+"""Of several tables in one file one is read, the one that is chosen, and as if it stood alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.errors import InputError
+from bwbayes.record import read_record
+from tests.record.instruments import DISPLACEMENT, TIME, VOLTAGE
+
+pytestmark = pytest.mark.filterwarnings("ignore::bwbayes.errors.InputWarning")
+
+HEADERS = ("time_s,voltage_V,displacement_um", "t [s],U [V],x [um]", "Time,Drive,Pos\ns,V,um")
+Cells = list[tuple[float, float, float]]
+
+
+def tables(lengths: list[int]) -> list[Cells]:
+    """Return so many rows of the record, from its start on in each table but other voltages."""
+    return [
+        [
+            (float(t), float(scale * v), float(d))
+            for t, v, d in zip(TIME[:n], VOLTAGE, DISPLACEMENT, strict=False)
+        ]
+        for scale, n in enumerate(lengths, start=1)
+    ]
+
+
+def written(path: Path, headers: list[str], titles: list[str], content: list[Cells]) -> None:
+    lines = []
+    for header, title, rows in zip(headers, titles, content, strict=True):
+        lines += [title, header, *(",".join(map(repr, row)) for row in rows), ""]
+    path.write_text("\n".join(lines))
+
+
+def assert_holds(path: Path, table: Any, rows: Cells) -> None:
+    record = read_record(path, table=table)
+    assert record.displacement is not None
+    _, voltage, displacement = np.array(rows).T
+    np.testing.assert_allclose(record.voltage, voltage, rtol=1e-15)
+    np.testing.assert_allclose(record.displacement, displacement, rtol=1e-15)
+
+
+@settings(max_examples=25)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(HEADERS),
+            st.sampled_from(["", "Run 7", "3.3.2026 12:00", "Sample Interval,0.005", "# new run"]),
+            st.integers(12, 40),
+        ),
+        min_size=2,
+        max_size=4,
+    ),
+    st.data(),
+)
+def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
+    tmp_path_factory: pytest.TempPathFactory,
+    blocks: list[tuple[str, str, int]],
+    data: st.DataObject,
+) -> None:
+    """Also where the header, title and times of the next one are the same."""
+    headers, titles, lengths = ([block[i] for block in blocks] for i in range(3))
+    path = tmp_path_factory.getbasetemp() / "tables.csv"
+    content = tables(lengths)  # type: ignore[arg-type]
+    written(path, headers, titles, content)  # type: ignore[arg-type]
+    number = data.draw(st.integers(1, len(blocks)))
+    assert_holds(path, data.draw(st.sampled_from([number, str(number)])), content[number - 1])
+    with pytest.raises(InputError, match=rf"{len(blocks)} tables with numbers: 1 .*, as `table=1`"):
+        read_record(path)
+    for wrong in (0, len(blocks) + 1, "Run 8"):
+        with pytest.raises(InputError, match=f"no table {wrong!r}; choose from 1 "):
+            read_record(path, table=wrong)
+
+
+@pytest.mark.parametrize("between", ["", "# paused", HEADERS[0], "\n\n"])
+def test_a_table_goes_on_after_a_pause(tmp_path: Path, between: str) -> None:
+    """With the header once more, an empty line or a comment, and alone it has number 1."""
+    (rows,) = tables([60])
+    lines = [",".join(map(repr, row)) for row in rows]
+    text = "\n".join([HEADERS[0], *lines[:30], between, *lines[30:], ""])
+    (tmp_path / "a.csv").write_text(text)
+    for table in (None, 1, "1"):
+        assert_holds(tmp_path / "a.csv", table, rows)
+
+
+def test_an_error_in_a_table_names_the_line_of_the_file(tmp_path: Path) -> None:
+    written(tmp_path / "a.csv", [HEADERS[0]] * 2, ["one", "two"], tables([20, 20]))
+    lines = (tmp_path / "a.csv").read_text().split("\n")
+    lines[30] = "0.03,what,1.0"
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"a\.csv:31: voltage_V: 'what'"):
+        read_record(tmp_path / "a.csv", table="two")
+
+
+def test_a_sheet_is_chosen_by_number_or_name_among_those_with_numbers(tmp_path: Path) -> None:
+    from openpyxl import Workbook  # noqa: PLC0415  # an extra
+
+    book, content = Workbook(), tables([20, 30, 40])
+    book.active.title = "Notes"
+    book.active.append(["bench", 3])
+    for title, rows in zip(("up", "2", "down"), content, strict=True):
+        sheet = book.create_sheet(title)
+        for row in (["t [s]", "U [V]", "x [um]"], *rows):
+            sheet.append(row)
+    path = tmp_path / "a.xlsx"
+    book.save(path)
+    for table, rows in zip((1, "2", "down", 3), [*content, content[2]], strict=True):
+        assert_holds(path, table, rows)
+    with pytest.raises(InputError, match=r"3 tables with numbers: 1 'up', 2 '2', 3 'down'; choose"):
+        read_record(path)
+    with pytest.raises(InputError, match="no table 'Note'; choose from 1 'up'"):
+        read_record(path, table="Note")
