@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bwbayes.app.problem.parameters import every_declaration
 from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.study import every_declaration
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen

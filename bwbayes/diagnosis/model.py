@@ -18,13 +18,17 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.study import Stated
+from bwbayes.model.declaration import lognormal
+from bwbayes.model.registry import HYSTERESIS
+from bwbayes.model.spec import ModelSpec
 
 
 def nonlinearity(scene: Scene) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
     gain = scene.posterior.only.actuator.gain
     present = set(gain.terms) if gain else set()
-    for terms in (["quadratic"], ["cubic"], ["quadratic", "cubic"]):
+    for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
             yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", {"gain": terms})
 
@@ -40,16 +44,15 @@ def dynamics(scene: Scene) -> Iterator[Explanation]:
     if scene.posterior.only.actuator.dynamics == "second-order":
         return
     frequency = 10 / scene.turn_time
-    stiffness = {"distribution": "lognormal", "median": (2 * np.pi * frequency) ** 2, "sigma": 2.0}
-    damping = {"distribution": "lognormal", "median": 2 * np.pi * frequency, "sigma": 2.0}
+    stiffness, damping = ((2 * np.pi * frequency) ** power for power in (2, 1))
     yield from _changed(
         scene,
         "second-order dynamics",
         {"dynamics": "second-order"},
-        parameters={
-            "mass": {"fixed": 1.0},
-            "stiffness": {"prior": stiffness},
-            "damping": {"prior": damping},
+        stated={
+            "mass": Stated(fixed=1.0),
+            "stiffness": Stated(lognormal(stiffness, 2.0)),
+            "damping": Stated(lognormal(damping, 2.0)),
         },
         starts=[{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)],
     )
@@ -70,15 +73,16 @@ def operator(scene: Scene) -> Iterator[Explanation]:
     # Compiled ones, each of another family, and plays of any weights, which follow loops that no
     # formula has.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
-        changes = {"hysteresis": name}
-        posterior = scene.rebuilt(changes)
-        if posterior is None or type(posterior.only.actuator.hysteresis) is present:
+        if scene.study is None or HYSTERESIS[name] is present:
             continue
+        spec = scene.study.spec.with_parts(hysteresis=name)
+        posterior = scene.rebuilt(scene.study.with_model(spec))
         # One start finds the best place for nearly all records, in half of the time of five.
         places = map_estimate.valleys(posterior, scene.generator, 1)
         fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
-        yield scene.explained(f"operator {name}", text, _lines(changes), fit, changes=changes)
+        fix = _lines(scene.study.spec, spec)
+        yield scene.explained(f"operator {name}", text, fix, fit, spec=spec)
 
 
 def smooth(scene: Scene) -> Iterator[Explanation]:
@@ -92,7 +96,7 @@ def _changed(
     text: str,
     changes: Mapping[str, object],
     kind: str = "",
-    parameters: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    stated: Mapping[str, Stated] = MappingProxyType({}),
     starts: Sequence[Mapping[str, float]] = ({},),
     **facts: Any,
 ) -> Iterator[Explanation]:
@@ -100,9 +104,10 @@ def _changed(
 
     ``facts`` are other fields of the explanation.
     """
-    posterior = scene.rebuilt(changes, parameters)
-    if posterior is None:
+    if scene.study is None:
         return
+    spec = scene.study.spec.with_parts(**changes)
+    posterior = scene.rebuilt(scene.study.with_model(spec, stated))
     places = []
     for coordinates, start in product(scene.places, starts):
         values = {**dict(zip(scene.posterior.names, coordinates, strict=True)), **start}
@@ -110,17 +115,16 @@ def _changed(
     fit = scene.extended(posterior=posterior, places=np.array(places))
     if not fit.follows:
         return
-    fix = _lines(changes)
-    if parameters:
-        fix += f", with what is known of {', '.join(parameters)} in [parameters]"
-    facts |= {"changes": changes, "parameters": parameters}
-    yield scene.explained(kind or text, text, fix, fit, **facts)
+    fix = _lines(scene.study.spec, spec)
+    if stated:
+        fix += f", with what is known of {', '.join(stated)} in [parameters]"
+    yield scene.explained(kind or text, text, fix, fit, spec=spec, stated=stated, **facts)
 
 
-def _lines(changes: Mapping[str, object]) -> str:
+def _lines(before: ModelSpec, after: ModelSpec) -> str:
     """Return the lines of config that change a model."""
-    lines = ", ".join(f"{key} = {json.dumps(value)}" for key, value in changes.items())
-    return f"set {lines} in [model]"
+    changes = before.changes_to(after).items()
+    return f"set {', '.join(f'{key} = {json.dumps(value)}' for key, value in changes)} in [model]"
 
 
 def heavy_tails(scene: Scene) -> Iterator[Explanation]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,15 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Stated, Study
 from bwbayes.inference.thinning import readings_at, stride_of, thin, thinned, thinned_windows
 from bwbayes.model.reversals import rate, time_between_turns
+from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
 
 # Readings that are looked at: an explanation takes some hundred passes over them, and what a model
 # misses shows in fewer.
 READINGS = 4_000
-
-# Returns the posterior of the same record with other values of keys of [model], and what
-# [parameters] says of parameters that only the new model has.
-Reconfigure = Callable[[Mapping[str, object], Mapping[str, Mapping[str, Any]]], Posterior]
 
 
 @dataclass(frozen=True)
@@ -48,8 +45,8 @@ class Explanation(Finding):
     shift: float = 0.0
     foreign: bool = False
     noise: bool = False
-    changes: Mapping[str, object] = field(default_factory=dict)
-    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    spec: ModelSpec | None = None
+    stated: Mapping[str, Stated] = field(default_factory=dict)
 
     @property
     def worth(self) -> str:
@@ -96,8 +93,8 @@ class Scene:
         Windows of the record that were held out.
     begin
         Time of the record's first sample, s.
-    reconfigure
-        Builds other models of the same record, if these are asked.
+    study
+        The study of the record, which gives other models, if these are asked.
     before
         What explanations are compared with, if it is another fit.
     """
@@ -108,7 +105,7 @@ class Scene:
     generator: np.random.Generator
     held_out: tuple[slice, ...] = ()
     begin: float = 0.0
-    reconfigure: Reconfigure | None = None
+    study: Study | None = None
     before: LocalFit | None = None
 
     @classmethod
@@ -119,7 +116,7 @@ class Scene:
         generator: np.random.Generator,
         held_out: Sequence[slice] = (),
         begin: float = 0.0,
-        reconfigure: Reconfigure | None = None,
+        study: Study | None = None,
     ) -> Scene:
         """Fit a posterior of one record once more, from its optima (optima, free).
 
@@ -151,7 +148,7 @@ class Scene:
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
         held_out = thinned_windows(held_out, stride_of(posterior, whole))
-        return cls(best, whole, starts, generator, held_out, begin, reconfigure)
+        return cls(best, whole, starts, generator, held_out, begin, study)
 
     def with_rough_noise(self) -> Scene | None:
         """Return the same with a rough discrepancy, if it has a smooth one; else none.
@@ -159,21 +156,15 @@ class Scene:
         A smooth discrepancy takes up what an explanation is to explain, and no climb leads from
         there to where it leaves that to the explanation.
         """
-        rough: Mapping[str, object] = {"noise": "discrepancy"}
-        build, is_smooth = self.reconfigure, isinstance(self.posterior.only.noise, SmoothNoise)
-        posterior = self.rebuilt(rough) if is_smooth else None
-        if build is None or posterior is None:
+        if self.study is None or not isinstance(self.posterior.only.noise, SmoothNoise):
             return None
+        rough = self.study.spec.with_parts(noise="discrepancy")
+        study = self.study.with_model(rough)
+        posterior = self.rebuilt(study)
         rows = [self.posterior.names.index(name) for name in posterior.names]
         fit = climb(posterior, self.places[:, rows])
         places = map_estimate.distinct([fit.coordinates, *self.places[:, rows]], fit.covariance)
-        return replace(
-            self,
-            fit=fit,
-            places=places,
-            reconfigure=lambda changes, parameters: build({**rough, **changes}, parameters),
-            before=self.fit,
-        )
+        return replace(self, fit=fit, places=places, study=study, before=self.fit)
 
     @property
     def posterior(self) -> Posterior:
@@ -264,15 +255,9 @@ class Scene:
         first = self.begin + self.interval * float(self.posterior.only.readings.rows[0])
         return clock(first + time, self.interval)
 
-    def rebuilt(
-        self,
-        changes: Mapping[str, object],
-        parameters: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
-    ) -> Posterior | None:
-        """Return the posterior of another model and the same readings, if it can be built."""
-        if self.reconfigure is None:
-            return None
-        rebuilt, readings = self.reconfigure(changes, parameters), self.posterior.only.displacement
+    def rebuilt(self, study: Study) -> Posterior:
+        """Return the posterior of another model and the same readings."""
+        rebuilt, readings = study.posterior, self.posterior.only.displacement
         posterior = replace(rebuilt, datasets=(thin(rebuilt.only, self.stride),))
         if self.stride > 1 and rebuilt.only.actuator.hold != self.whole.only.actuator.hold:
             # Of a thinned record the hold is in the readings.

@@ -29,7 +29,7 @@ def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0) -> Scene:
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', folder)
     rng = np.random.default_rng(seed)
     point = pointfit.fit(problem.posterior, rng)
-    return Scene.of(problem.posterior, point.optima, rng, reconfigure=problem.reconfigured)
+    return Scene.of(problem.posterior, point.optima, rng, study=problem.study)
 
 
 LINEAR = """
@@ -168,7 +168,7 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(problem.posterior, rng).optima
-    small = Scene.of(problem.posterior, optima, rng, reconfigure=problem.reconfigured)
+    small = Scene.of(problem.posterior, optima, rng, study=problem.study)
     assert small.unexplained < LIMIT
     fitted: list[float] = []
     explain(small, fitted.append)

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import Config, parse
+from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.explaining import explained
 from bwbayes.diagnosis.explanations import likely_causes
@@ -76,10 +77,11 @@ def followed(
     made = bench(kind, (6, seed))
     (record,) = config.records.values()
     records: Sequence[Record] = made.records
-    if cause.changes:
-        return problem.changed(config, cause.changes, cause.parameters)
+    if cause.spec is not None:
+        return with_model(config, cause.spec, problem.records, cause.stated)
     if "set outliers = true" in cause.fix:
-        return problem.changed(config, {"outliers": True}, {})
+        model = config.model.model_copy(update={"outliers": True})
+        return config.model_copy(update={"model": model})
     if found := re.search(r"exclude = (\[\[.*?\]\])", cause.fix):
         changed = record.model_copy(update={"exclude": json.loads(found[1])})
         return config.model_copy(update={"record": changed})

@@ -19,6 +19,7 @@ from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.validation import Background, Verdict, assess
+from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.bands import KINDS, Bands, LeadIn
 from bwbayes.record.io.grid import clock
 from tests.prediction.records import Made, bands_of, made, normal_bands
@@ -334,7 +335,9 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
             "a better model is known (backlash, 517 nats), which no key of [model] adds",
         ),
         (
-            Explanation("creep", "creep", "set creep = true", nats=20.0, changes={"creep": True}),
+            Explanation(
+                "creep", "creep", "set creep = true", nats=20.0, spec=ModelSpec(creep=True)
+            ),
             "a better model is known (creep, 20 nats); --improve adds it",
         ),
         (Explanation("backlash", "backlash", "tighten it", nats=LIMIT - 0.1), None),

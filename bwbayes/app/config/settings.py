@@ -7,12 +7,15 @@ A key is a field here and nowhere else: its type is what is checked, its docstri
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from dataclasses import replace
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from bwbayes.app.config.keys import ConfigTable, Positive, Texts, key
 from bwbayes.inference.engine import EngineChoice
+from bwbayes.model.registry import OPTIONS
+from bwbayes.model.spec import ModelSpec
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
@@ -30,6 +33,11 @@ Windows = Annotated[
     ),
     Field(min_length=1),
 ]
+
+
+def _frozen(value: Any) -> Any:
+    """Return a list as a tuple, and all else as it is."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 class SignalConfig(ConfigTable):
@@ -182,6 +190,19 @@ class ActuatorConfig(ConfigTable):
     terms: Texts | None = key(None, example='["b4", "b5"]')
     """For bouc-wen-asymmetric: which of b2 to b6 are parameters (default: all)."""
 
+    @property
+    def spec(self) -> ModelSpec:
+        """The model that it describes."""
+        options = {name: _frozen(getattr(self, name)) for name in OPTIONS}
+        return ModelSpec(
+            self.hysteresis,
+            tuple(self.gain),
+            _frozen(self.creep),
+            self.creep_growth,
+            self.dynamics,
+            options={name: value for name, value in options.items() if value is not None},
+        )
+
 
 class ModelConfig(ActuatorConfig):
     """The model: an actuator, and what is read of it."""
@@ -200,9 +221,16 @@ class ModelConfig(ActuatorConfig):
     """Whether readings far from what their neighbors predict are set aside."""
 
     @property
-    def noise_until_chosen(self) -> str:
-        """Its noise; of what is to be chosen the one that claims least."""
-        return "discrepancy" if self.noise == "auto" else self.noise
+    def spec(self) -> ModelSpec:
+        """The model that it describes; where the noise is open, the one that claims least."""
+        noise = "discrepancy" if self.noise == "auto" else self.noise
+        return replace(super().spec, hold=self.hold, noise=noise)
+
+    def with_spec(self, spec: ModelSpec) -> Self:
+        """Return the config of another model; what both have in common is said as it was."""
+        before = self.spec
+        dropped = dict.fromkeys(name for name in before.options if name not in spec.options)
+        return self.model_copy(update=dropped | before.changes_to(spec))
 
 
 class StandModelConfig(ActuatorConfig):

@@ -23,7 +23,7 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Fit, finished
-from bwbayes.app.problem.parameters import in_words, with_model
+from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
@@ -134,8 +134,8 @@ def compare_models(
     with ProgressLine(console, f"reading records for {len(models)} models ...", announced=False):
         _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
         for name, model in models.items():
-            named = config.model_copy(update={"name": name})
-            problem = resolve(with_model(named, model, [*wholes.values()]), where, in_memory)
+            named = config.model_copy(update={"name": name, "model": model})
+            problem = resolve(with_model(named, model.spec, wholes), where, in_memory)
             folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
             folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
@@ -245,7 +245,7 @@ def _description(name: str, problem: Problem, stop_reason: str, *, converged: bo
     posterior = problem.posterior
     return Candidate(
         name,
-        f"{in_words(problem.config.model)}, {problem.config.model.noise} noise",
+        f"{problem.study.spec}, {problem.config.model.noise} noise",
         converged,
         stop_reason,
         posterior.prior.dimensions,

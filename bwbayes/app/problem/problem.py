@@ -20,19 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config
-from bwbayes.app.config.settings import ParameterConfig, RecordConfig
+from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.alike import record_naming
-from bwbayes.app.problem.parameters import (
-    actuator_of,
-    as_config,
-    contexts_of,
-    explicit_model,
-    in_words,
-    parameters_of,
-    readings_of,
-    recoverable,
-    with_model,
-)
+from bwbayes.app.problem.parameters import as_config, recoverable, study_of, with_model
 from bwbayes.app.problem.records import (
     Slices,
     Validation,
@@ -50,14 +40,11 @@ from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.inference.engine import choose
-from bwbayes.inference.noise import noise_model
 from bwbayes.inference.outliers import outliers
-from bwbayes.inference.parameter_table import ParameterTable
-from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study, require_known
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.registry import OPTIONS
 from bwbayes.record import Record
 from bwbayes.sampling.plan import (
     SamplingPlan,
@@ -80,6 +67,7 @@ class Problem:
 
     config: Config
     records: Mapping[str, Record]
+    study: Study
     posterior: Posterior
     plan: SamplingPlan
     validations: Mapping[str, Validation]
@@ -164,9 +152,9 @@ class Problem:
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.alone(name).only.training
             )
-        model = self.config.model
         drive = str(Drive.of(self.posterior))
-        return facts | {"drive": drive, "model": in_words(model), "noise": model.noise}
+        model, noise = str(self.study.spec), self.config.model.noise
+        return facts | {"drive": drive, "model": model, "noise": noise}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -193,31 +181,6 @@ class Problem:
             found[name] = [each for each in beyond if not (part and each.kind == "reversals")]
         return found
 
-    def reconfigured(
-        self, changes: Mapping[str, object], parameters: Mapping[str, Mapping[str, Any]]
-    ) -> Posterior:
-        """Return the posterior of the records with other values of keys of [model]."""
-        training = {dataset.name: dataset.training for dataset in self.posterior.datasets}
-        config = self.changed(self.config, changes, parameters)
-        return _posterior(config, self.records, training)[0]
-
-    def changed(
-        self,
-        config: Config,
-        changes: Mapping[str, object],
-        parameters: Mapping[str, Mapping[str, Any]],
-    ) -> Config:
-        """Return a config of these records with other values of keys of [model].
-
-        Parameters that both models have keep their priors; others have those of ``parameters``, or
-        the default ones.
-        """
-        options = dict.fromkeys(OPTIONS if "hysteresis" in changes else ())
-        model = config.model.model_copy(update={**options, **changes})
-        added = {name: ParameterConfig(**stated) for name, stated in parameters.items()}
-        stated = config.model_copy(update={"parameters": {**added, **config.parameters}})
-        return with_model(stated, model, list(self.records.values()))
-
     def with_noise(self, chosen: str) -> Problem:
         """Return the problem of a run whose noise, ``auto``, came to this one.
 
@@ -226,8 +189,11 @@ class Problem:
         model = self.config.model
         if model.noise != "auto" or chosen == "auto":
             return self
-        config = self.changed(self.config, {"noise": chosen}, {})
-        if chosen != model.noise_until_chosen:
+        spec = self.study.spec.with_parts(noise=chosen)
+        config = with_model(self.config, spec, self.records)
+        named = config.model.model_copy(update={"noise": chosen})
+        config = config.model_copy(update={"model": named})
+        if spec != self.study.spec:
             return resolve(config, Path(), {**self.records, **self.others})
         same = copy(self)  # with all that is known of it
         object.__setattr__(same, "config", config)
@@ -269,7 +235,9 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     aside = {name: source.outliers for name, source in config.records.items()}
     if config.model.outliers:
         aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
-    posterior, defaults = _posterior(config, fitted, training)
+    study = study_of(config, fitted, training)
+    posterior = study.posterior
+    require_known("truth", config.truth, posterior.table, elsewhere=True)
     plan = _plan(config, posterior)
     truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
     truth |= config.truth
@@ -277,8 +245,11 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
         name: source.read_as or (None if name in in_memory else record_naming(source, folder))
         for name, source in config.records.items()
     }
-    explicit = _explicit(config, posterior, plan, truth, aside, noted, list(dict.fromkeys(remarks)))
-    return Problem(explicit, fitted, posterior, plan, validations, defaults)
+    defaults = study.defaults
+    explicit = _explicit(config, study, plan, truth, aside, noted, list(dict.fromkeys(remarks)))
+    # As the config says it from now on, in explicit numbers.
+    study = study_of(explicit, fitted, training)
+    return Problem(explicit, fitted, study, posterior, plan, validations, defaults)
 
 
 def _outliers(
@@ -292,7 +263,7 @@ def _outliers(
 
     def posterior_without(rows: Mapping[str, IntArray]) -> Posterior:
         records.update({n: complete[n].without(rows[n]) for n in names if n in rows})
-        return _posterior(config, records, training)[0]
+        return study_of(config, records, training).posterior
 
     rows = outliers(
         posterior_without,
@@ -301,38 +272,6 @@ def _outliers(
     )
     records.update({name: complete[name].without(rows[name]) for name in names})
     return {name: complete[name].time[rows[name]].tolist() for name in names}
-
-
-def _posterior(
-    config: Config, records: Mapping[str, Record], training: Mapping[str, Slices]
-) -> tuple[Posterior, dict[str, Distribution]]:
-    """Put the posterior together; return it with the default priors by name."""
-    datasets = []
-    for name, record in records.items():
-        actuator = actuator_of(config.model, record, list(records.values()))
-        datasets.append(
-            Dataset(
-                record.path.voltage,
-                readings_of(record),
-                training[name],
-                actuator,
-                noise_model(config.model.noise_until_chosen, record.interval),
-                config.records[name].from_rest,
-                name,
-            )
-        )
-    chosen = tuple(config.model.per_record), tuple(config.model.shared)
-    table = ParameterTable(datasets[0].actuator, datasets[0].noise, tuple(records), *chosen)
-    contexts = contexts_of(config, records, training)
-    parameters = parameters_of(config, table, contexts)
-    prior = JointPrior(parameters, datasets[0].actuator.hysteresis.holds)
-    if not prior.dimensions:
-        raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
-    defaults = {c.name: c.declaration.default(contexts[c.record]) for c in table.layout}
-    default_priors = {
-        name: default for name, default in defaults.items() if isinstance(default, Distribution)
-    }
-    return Posterior(tuple(datasets), prior, choose(config.sampling.engine), table), default_priors
 
 
 def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
@@ -364,7 +303,7 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
 
 def _explicit(
     config: Config,
-    posterior: Posterior,
+    study: Study,
     plan: SamplingPlan,
     truth: Mapping[str, float],
     outliers: Mapping[str, list[float] | None],
@@ -372,6 +311,7 @@ def _explicit(
     remarks: list[str],
 ) -> Config:
     """Return the config in explicit numbers and words, with records as files beside it."""
+    posterior = study.posterior
     first, parameters = next(iter(config.records)), posterior.prior.parameters
     records = {
         name: RecordConfig(
@@ -396,7 +336,7 @@ def _explicit(
     return config.model_copy(
         update={
             "record": records[ALONE] if isinstance(config.record, RecordConfig) else records,
-            "model": explicit_model(config.model, posterior.datasets[0].actuator),
+            "model": config.model.with_spec(study.spec.explicit(posterior.datasets[0].actuator)),
             "sampling": config.sampling.model_copy(update=sampling),
             "parameters": {p.name: as_config(p) for p in parameters},
             "truth": {name: value for name, value in true.items() if value is not None},

@@ -18,10 +18,11 @@ import numpy as np
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationConfig
-from bwbayes.app.problem.parameters import place_of, stand_of
+from bwbayes.app.problem.parameters import stand_of
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError, suggestion
+from bwbayes.inference.study import place_of
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.formats import require_readable

@@ -21,6 +21,7 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import Config
+from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.progress import StepProgress
@@ -56,7 +57,7 @@ def explained(
         [window for windows in problem.held_out(name).values() for window in windows],
         record.start,
         # Of several records no other model is built: it would be one of all of them.
-        problem.reconfigured if len(problem.records) == 1 else None,
+        problem.study if len(problem.records) == 1 else None,
     )
     return explain(scene, watch)
 
@@ -93,7 +94,7 @@ def chosen_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) ->
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
     others = [n for n in NOISES if n not in evidence and (n == "white" or p < colored)]
     for noise in watched(others, part(watch, 1 / len(NOISES), 1.0)):
-        other = problem.reconfigured({"noise": noise}, {})
+        other = problem.study.with_model(problem.study.spec.with_parts(noise=noise)).posterior
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
@@ -158,13 +159,14 @@ def improve_model(
         with StepProgress(console, "searching for missing parts of the model ...") as watch:
             point = _fit_point(problem, partial(watch, "MAP estimate"))
             found = explained(problem, name, point.optima, partial(watch, "explanations"))
-        parts = likely_causes([cause for cause in found if cause.changes])
+        parts = likely_causes([cause for cause in found if cause.spec is not None])
         if followed_causes(found) or not parts:
             break
         explanation = parts[0]
         notes.append(f"model improved: {explanation.text} ({explanation.worth})")
         console.print(f"added: {explanation.text}", highlight=False, soft_wrap=True)
-        config = problem.changed(config, explanation.changes, explanation.parameters)
+        assert explanation.spec is not None
+        config = with_model(config, explanation.spec, problem.records, explanation.stated)
     record = config.records[name]
     noted = record.model_copy(update={"remarks": [*(record.remarks or []), *notes]})
     return config.model_copy(update={"record": noted}) if notes else config

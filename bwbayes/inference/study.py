@@ -1,0 +1,332 @@
+"""What is fitted to what: a model, the records, and what is stated of its parameters.
+
+A :class:`Study` makes the posterior. It puts what is stated of parameters (priors, values, bounds,
+names) before what the parts of the model declare, and gives the same study with another model, of
+which it keeps all that is stated of parameters that both have.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
+from typing import Self
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError, suggestion
+from bwbayes.inference.defaults import joined, ranges_of
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.noise import NOISES, noise_model
+from bwbayes.inference.parameter_table import Column, ParameterTable
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.inference.posterior import Dataset, Posterior
+from bwbayes.model.actuator import OFFSET, Actuator
+from bwbayes.model.creep import MOST_TIMES, Creep
+from bwbayes.model.declaration import Context, Declaration
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Span
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.model.spec import Extent, ModelSpec
+from bwbayes.record import Record
+from bwbayes.shown import brief
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What is stated of a parameter: its prior or value, bounds, and names for people.
+
+    All that is None is as the part declares it.
+    """
+
+    prior: Distribution | None = None
+    fixed: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    unit: str | None = None
+    label: str | None = None
+    description: str | None = None
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """A record that is fitted, the windows of it (slices), and whether it starts from rest."""
+
+    __repr__ = brief
+
+    record: Record
+    windows: tuple[slice, ...]
+    from_rest: bool = False
+
+    @property
+    def displacement(self) -> FloatArray:
+        """The displacement (samples,), um, of a record that has one."""
+        assert self.record.displacement is not None
+        return self.record.displacement
+
+
+@dataclass(frozen=True)
+class Study:
+    """A model, the records that it is fitted to, and what is stated of its parameters.
+
+    Parameters
+    ----------
+    spec
+        The model.
+    records
+        What is fitted, by name.
+    stated
+        What is stated of parameters, by name, or by name[record] of one record's own.
+    per_record, shared
+        Parameters that each record has of its own besides those that declare it, and of these
+        those that all records share.
+    engine
+        What computes the likelihood.
+    """
+
+    __repr__ = brief
+
+    spec: ModelSpec
+    records: Mapping[str, TrainingRecord]
+    stated: Mapping[str, Stated] = field(default_factory=dict)
+    per_record: tuple[str, ...] = ()
+    shared: tuple[str, ...] = ()
+    engine: Engine = "numpy"
+
+    def with_model(self, spec: ModelSpec, added: Mapping[str, Stated] | None = None) -> Self:
+        """Return the study of another model.
+
+        Of what is stated of parameters it keeps what the other model has too: a parameter of
+        another unit is another one, whatever its name. ``added`` is stated of others.
+        """
+        units = {declared.name: declared.unit for declared in declarations_of(spec, self.extent)}
+        stated = {
+            name: said
+            for name, said in {**(added or {}), **self.stated}.items()
+            if (plain := name.partition("[")[0]) in units and said.unit in (None, units[plain])
+        }
+        per_record, shared = (
+            tuple(name for name in names if name in units)
+            for names in (self.per_record, self.shared)
+        )
+        return replace(self, spec=spec, stated=stated, per_record=per_record, shared=shared)
+
+    @cached_property
+    def extent(self) -> Extent:
+        """What the model takes from all records."""
+        return extent_of([training.record for training in self.records.values()])
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """The posterior of all records.
+
+        Raises
+        ------
+        InputError
+            Something is stated of a parameter that the model does not have, or cannot have; or
+            nothing is free.
+        """
+        datasets = [
+            Dataset(
+                training.record.path.voltage,
+                training.displacement,
+                training.windows,
+                actuator_for(self.spec, training.record, self.extent),
+                noise_model(self.spec.noise, training.record.interval),
+                training.from_rest,
+                name,
+            )
+            for name, training in self.records.items()
+        ]
+        first = datasets[0]
+        table = ParameterTable(
+            first.actuator, first.noise, tuple(self.records), self.per_record, self.shared
+        )
+        require_known("parameters", self.stated, table)
+        parameters = [
+            _parameter(column, self._said_of(column), self.contexts[column.record])
+            for column in table.layout
+        ]
+        prior = JointPrior(parameters, first.actuator.hysteresis.holds)
+        if not prior.dimensions:
+            raise InputError("parameters: all are fixed, so there is nothing to fit; free some")
+        return Posterior(tuple(datasets), prior, self.engine, table)
+
+    @cached_property
+    def contexts(self) -> dict[str, Context]:
+        """What default priors may know of each record, by name, and ("") of all together.
+
+        From the windows that are fitted.
+
+        Raises
+        ------
+        InputError
+            Voltage or displacement does not vary there, in any of them.
+        """
+        ranges = {
+            name: ranges_of(
+                training.record.path.voltage,
+                training.displacement,
+                training.record.interval,
+                training.windows,
+            )
+            for name, training in self.records.items()
+        }
+        varied = [
+            extents
+            for extents in ranges.values()
+            if extents.voltage > 0 and extents.displacement > 0
+        ]
+        if not varied:
+            table = place_of(next(iter(self.records)))
+            raise InputError(f"{table}.train: voltage or displacement is constant there; widen it")
+        pooled = joined(varied)
+        contexts = {"": Context(pooled, self._values())}
+        for name, extents in ranges.items():
+            # A record whose voltage stands still says where its sensor is, and nothing else.
+            extent = extents if extents in varied else replace(pooled, middle=extents.middle)
+            contexts[name] = Context(extent, self._values(name))
+        return contexts
+
+    @cached_property
+    def defaults(self) -> dict[str, Distribution]:
+        """What the default priors of these records are, by the parameters' names."""
+        defaults = {
+            column.name: column.declaration.default(self.contexts[column.record])
+            for column in self.posterior.table.layout
+        }
+        return {
+            name: default for name, default in defaults.items() if isinstance(default, Distribution)
+        }
+
+    def _values(self, record: str = "") -> dict[str, float | Distribution]:
+        """Return what is stated of parameters, also of a record's own: values, and priors."""
+        values: dict[str, float | Distribution] = {}
+        for name, said in self.stated.items():
+            value = said.fixed if said.prior is None else said.prior
+            if value is not None:
+                values[name.removesuffix(f"[{record}]")] = value
+        return values
+
+    def _said_of(self, column: Column) -> Stated:
+        """Return what is stated of a column of θ: of it alone, or of all records' together."""
+        name = column.declaration.name
+        said = self.stated.get(column.name, self.stated.get(name))
+        if said is not None:
+            return said
+        if name == "initial":
+            names = [column.record] if column.record else [*self.records]
+            rested = [self.records[record].from_rest for record in names]
+            if all(rested):
+                return Stated(fixed=0.0)
+            if any(rested):
+                raise InputError(
+                    "model.shared: initial cannot be shared by records of which some start from "
+                    "rest and some do not; remove it"
+                )
+        return Stated()
+
+
+# The name of a record that is fitted alone.
+ALONE = "record"
+
+
+def place_of(name: str) -> str:
+    """Return where a config speaks of a training record of that name."""
+    return "record" if name == ALONE else f"record.{name}"
+
+
+def extent_of(records: Collection[Record]) -> Extent:
+    """Return what a model takes from all records of an actuator."""
+    paths = [record.path.voltage for record in records]
+    span = Span(float(min(map(np.min, paths))), float(max(map(np.max, paths))))
+    shortest = min(record.interval for record in records)
+    return Extent(span, shortest, max(record.duration for record in records))
+
+
+def actuator_for(spec: ModelSpec, record: Record, extent: Extent) -> Actuator:
+    """Put the actuator of a model together for a record, which is held if it is a command."""
+    hold: Hold = "zero" if record.voltage_is == "command" else "first"
+    return spec.actuator(record.interval, hold, extent)
+
+
+def declarations_of(spec: ModelSpec, extent: Extent) -> tuple[Declaration, ...]:
+    """Return what the parts of a model declare, actuator and noise."""
+    actuator = spec.actuator(extent.shortest, "first", extent)
+    return ParameterTable(actuator, noise_model(spec.noise, extent.shortest)).declarations
+
+
+def every_declaration() -> Iterator[Declaration]:
+    """Yield what all parts of the package declare, whatever the model."""
+    for operator in HYSTERESIS.values():
+        yield from operator().parameters
+    for dynamics in DYNAMICS.values():
+        yield from dynamics().parameters
+    for noise in NOISES.values():
+        yield from noise(interval=1.0).declarations
+    creep = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
+    yield from (*PolynomialGain().parameters, *creep.parameters, OFFSET)
+
+
+def require_known(
+    where: str, stated: Collection[str], table: ParameterTable, *, elsewhere: bool = False
+) -> None:
+    """Refuse what is said of a parameter that the model has not, nor any model if ``elsewhere``.
+
+    Raises
+    ------
+    InputError
+        For the first such parameter; ``where`` is the table of the config.
+    """
+    columns = [replace(column.declaration, name=column.name) for column in table.layout]
+    declarations = [*table.declarations, *columns]
+    names = list(dict.fromkeys(declared.name for declared in declarations))
+    for name in [name for name in stated if name not in names]:
+        if name not in {declared.name for declared in every_declaration()}:
+            aliases = {alias: d.name for d in declarations for alias in d.aliases}
+            hint = suggestion(name, names, aliases)
+            raise InputError(f"{where}.{name}: no such parameter here; {hint}")
+        if not elsewhere:
+            raise InputError(f"{where}.{name}: is not in this model; see [model], or remove it")
+
+
+def _parameter(column: Column, stated: Stated, context: Context) -> Parameter:
+    """Put what is stated of a parameter before what its part declares."""
+    name, declared, record = column
+    prior, fixed = stated.prior, stated.fixed
+    if prior is None and fixed is None:
+        default = declared.default(context)
+        if default is None:
+            why = f" ({declared.without_default})" if declared.without_default else ""
+            raise InputError(f"parameters.{name}: has no default prior; give prior or fixed{why}")
+        if isinstance(default, Distribution):
+            prior = default
+        else:
+            fixed = default
+    for value in chain([fixed or 0.0], prior.arguments.values() if prior else ()):
+        # The model's products and quotients could not hold it.
+        if value and not 1e-60 < abs(value) < 1e60:
+            raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
+    unit = declared.unit_in(context.stated)
+    if stated.unit is not None and re.sub("[µμ]", "u", stated.unit) != unit:
+        raise InputError(
+            f"parameters.{name}.unit: its numbers are in {unit}, not {stated.unit}; convert them"
+        )
+    above = record.replace("_", r"\_")
+    return Parameter(
+        name,
+        stated.unit or unit,
+        stated.label or declared.label + (rf"^{{\mathrm{{{above}}}}}" if record else ""),
+        stated.description or declared.description + (f" of {record}" if record else ""),
+        declared,
+        prior,
+        fixed,
+        -np.inf if stated.lower is None else stated.lower,
+        np.inf if stated.upper is None else stated.upper,
+        record,
+    )
