@@ -208,7 +208,10 @@ def test_compensate_and_design_read_a_file_alike(
     reference = renamed.with_name("path.csv")
     np.savetxt(reference, rows, delimiter=",", header="a,c", comments="")
     fit = bw.open_run(copy.path)
-    with pytest.warns(bw.InputWarning, match="between samples"):
+    with (
+        pytest.warns(bw.InputWarning, match="between samples"),
+        pytest.warns(bw.InputWarning, match="untested on these loops"),
+    ):
         compensation = fit.compensate(reference, from_rest=True)
     assert np.max(
         np.asarray(compensation.reference.displacement, dtype=np.float64)

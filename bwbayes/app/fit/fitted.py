@@ -332,6 +332,7 @@ class Fit(Shown):
         copied = RunFolder.create(Path(folder), self.problem, overwrite)
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
+            shutil.copyfile(self.folder.backend, copied.backend)
             run.write_files(self, copied, Artist())
         return copied.path
 
