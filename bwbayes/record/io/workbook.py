@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import csv
+import math
 import warnings
-from datetime import timedelta
+from collections.abc import Collection
+from datetime import datetime
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, NoNumbersError
 from bwbayes.record.io.series import Source
@@ -34,11 +38,14 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
         advice = "pip install 'bwbayes[xlsx]', or export it as CSV"
         raise InputError(f"{path}: reading a workbook needs openpyxl; {advice}") from None
     book = load_workbook(path, read_only=True, data_only=True)
+    # Its numbers in place of times, which openpyxl rounds to milliseconds.
+    times = _Times(book.epoch, book._date_formats, book._timedelta_formats)
+    book._date_formats = set()
     tables: dict[str, tuple[Source, list[str]]] = {}
     unread: dict[str, InputError] = {}
     for sheet in book.worksheets:
         sheet.reset_dimensions()  # what programs write of them may be wrong
-        text = _text(sheet.iter_rows(values_only=True))
+        text = _text(sheet, times)
         titles = [title for _, title in tables_of(text.split("\n"))]
         for number, title in enumerate(titles, start=1):
             name = sheet.title if len(titles) == 1 else f"{sheet.title}: {title}"
@@ -61,9 +68,17 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
     return source
 
 
-def _text(rows: Any) -> str:
+class _Times(NamedTuple):
+    """What days count from, and the styles of cells with dates, times of day and durations."""
+
+    epoch: datetime
+    styles: Collection[int]
+    durations: Collection[int]
+
+
+def _text(sheet: Any, times: _Times) -> str:
     """Return a sheet's rows as text, of as many cells each."""
-    cells = [[_cell(value) for value in row] for row in rows]
+    cells = [[_cell(cell, times) for cell in row] for row in sheet.iter_rows()]
     width = max(map(len, cells), default=0)
     text = StringIO()
     writer = csv.writer(text, delimiter="\t", lineterminator="\n")
@@ -71,10 +86,20 @@ def _text(rows: Any) -> str:
     return text.getvalue()
 
 
-def _cell(value: Any) -> str:
+def _cell(cell: Any, times: _Times) -> str:
+    """Return a cell's text; of a time a date, or hours, minutes and seconds.
+
+    Excel keeps 15 digits of days: of a date of today 10 us, of what is less than a day 1 ns.
+    """
+    value = cell.value
     if value is None:
         return ""
-    if isinstance(value, timedelta):
-        minutes, seconds = divmod(value.total_seconds(), 60)
-        return f"{int(minutes // 60)}:{int(minutes % 60):02}:{seconds:09.6f}"
-    return " ".join(str(value).split())
+    is_number = isinstance(value, int | float) and value >= 0
+    if not is_number or cell._style_id not in times.styles:
+        return " ".join(str(value).split())
+    digits = 9 if value < 1 else min(9, 9 - math.floor(math.log10(value)))
+    ns = round(value * 86400 * 10**digits) * 10 ** (9 - digits)
+    if value < 1 or cell._style_id in times.durations:
+        minutes, ns = divmod(ns, 60 * 10**9)
+        return f"{minutes // 60}:{minutes % 60:02}:{ns // 10**9:02}.{ns % 10**9:09}"
+    return str(np.datetime64(times.epoch, "ns") + np.timedelta64(ns, "ns")).replace("T", " ")
