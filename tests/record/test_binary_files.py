@@ -6,7 +6,9 @@ import os
 import struct
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,12 +16,13 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io import matlab
+from tests.record.makers import MAKERS
 
 SAMPLES = 24
 TIME = 0.5 + 1e-3 * np.arange(SAMPLES)
@@ -378,3 +381,94 @@ def test_a_matlab_object_is_named_with_how_to_save_it(tmp_path: Path) -> None:
         file["log"].attrs.update({"MATLAB_class": np.bytes_("table"), "MATLAB_object_decode": 3})
     with pytest.warns(InputWarning, match=r"log: a MATLAB table.*table2struct\(log"):
         assert SAMPLES == read_record(path).samples
+
+
+@settings(max_examples=20)
+@given(
+    st.sampled_from([1e-4, 0.5, -2e-3]),
+    st.sampled_from([0.0, 12.5]),
+    st.lists(st.integers(0, DISPLACEMENT.size - 1), max_size=9, unique=True),
+    st.sampled_from(["_FillValue", "missing_value"]),
+    st.sampled_from(["classic", "netCDF-4"]),
+)
+def test_packed_variables_are_read_alike_from_either_netcdf(
+    tmp_path_factory: pytest.TempPathFactory,
+    scale: float,
+    offset: float,
+    missing: list[int],
+    mark: str,
+    version: str,
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "a.nc"
+    packed = np.rint((DISPLACEMENT - offset) / scale).astype(np.int32)
+    expected = packed * scale + offset
+    packed[missing], expected[missing] = -(2**31), np.nan
+    attributes = {"scale_factor": scale, "add_offset": offset, mark: np.int32(-(2**31))}
+    columns = {"time_s": TIME, "voltage_V": VOLTAGE, "displacement_um": packed}
+    if version == "classic":
+        with scipy.io.netcdf_file(path, "w") as file:
+            file.createDimension("sample", TIME.size)
+            for name, values in columns.items():
+                variable = file.createVariable(name, values.dtype, ("sample",))
+                variable[:] = values
+            for key, value in attributes.items():
+                setattr(variable, key, np.asarray(value))
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+            file["displacement_um"].attrs.update(attributes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # of readings that are missing
+        record = read_record(path)
+    np.testing.assert_array_equal(record.voltage, VOLTAGE)
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.displacement, expected, rtol=1e-12, atol=1e-12)
+
+
+@settings(max_examples=60)
+@given(st.integers(4, 500), st.lists(st.integers(0, 255), max_size=6), st.booleans())
+def test_a_damaged_netcdf_file_is_read_or_refused_in_a_line(
+    tmp_path_factory: pytest.TempPathFactory, at: int, damage: list[int], is_cut: bool
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    content = bytearray(MAKERS["netCDF-3 of SciPy, packed"](folder).path.read_bytes())
+    content[at : at + len(damage)] = bytes(damage)
+    (folder / "b.nc").write_bytes(content[:at] if is_cut else content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        with suppress(InputError):
+            read_record(folder / "b.nc")
+
+
+def test_netcdf_of_64_bit_data_is_refused_with_what_to_write(tmp_path: Path) -> None:
+    (tmp_path / "a.nc").write_bytes(b"CDF\x05" + bytes(60))
+    with pytest.raises(InputError, match="64-bit data format; write it as netCDF-4"):
+        read_record(tmp_path / "a.nc")
+
+
+@pytest.mark.parametrize(("late", "units"), [(7, "seconds"), (0, "seconds"), (3, "milliseconds")])
+def test_time_series_of_a_matlab_struct_are_put_together_by_their_times(
+    tmp_path: Path, late: int, units: str
+) -> None:
+    """Each has its own."""
+    n, factor = TIME.size - late, 1e3 if units == "milliseconds" else 1.0
+    series = {
+        name: {"Time": times, "Data": values, "DataInfo": {"Units": unit}}
+        for name, times, values, unit in (
+            ("u", factor * TIME[:n], VOLTAGE[:n], "V"),
+            ("x", factor * TIME[late:], DISPLACEMENT[late:], "um"),
+        )
+    }
+    for one in series.values():
+        one["TimeInfo"] = {"Units": units}
+    scipy.io.savemat(tmp_path / "a.mat", series)
+    columns = {"voltage": "u.Data", "displacement": "x.Data"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        record = read_record(tmp_path / "a.mat", columns=columns)
+    assert record.interval == pytest.approx(1e-3, rel=1e-9)
+    assert record.start == pytest.approx(TIME[late])
+    np.testing.assert_array_equal(record.voltage, VOLTAGE[late:n])
+    assert record.displacement is not None
+    np.testing.assert_allclose(record.displacement, DISPLACEMENT[late:n])

@@ -23,6 +23,9 @@ from tests.record.instruments import (
     VOLTAGE,
     Written,
 )
+from tests.record.makers import MAKERS
+
+ALL = INSTRUMENTS | MAKERS
 
 
 def read(written: Written) -> Record:
@@ -32,9 +35,9 @@ def read(written: Written) -> Record:
         return read_record(path, columns=columns, units=units, fs=fs)
 
 
-@pytest.mark.parametrize("name", INSTRUMENTS)
+@pytest.mark.parametrize("name", ALL)
 def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
-    record = read(INSTRUMENTS[name](tmp_path))
+    record = read(ALL[name](tmp_path))
     assert record.interval == pytest.approx(INTERVAL, rel=1e-9)
     assert 0.0 == record.start
     np.testing.assert_allclose(record.voltage, VOLTAGE, rtol=1e-6, atol=1e-6)
@@ -42,10 +45,10 @@ def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(record.displacement, DISPLACEMENT, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", INSTRUMENTS)
+@pytest.mark.parametrize("name", ALL)
 def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
     """Without a word from the user a file is read, or one message has a guess that reads it."""
-    written = INSTRUMENTS[name](tmp_path)
+    written = ALL[name](tmp_path)
     alone, error = written._replace(columns={}, units={}, fs=None), None
     try:
         read(alone)

@@ -1,4 +1,4 @@
-"""Read and write records: text of any kind, HDF5, MATLAB, NumPy and LabVIEW files.
+"""Read and write records: text of any kind, HDF5, netCDF, MATLAB, NumPy and LabVIEW files.
 
 What a file is, its content says, not its suffix. Records are written by the suffix: ``.csv``,
 ``.txt``, ``.h5``, ``.hdf5``, ``.mat``. The noise-free displacement of a simulated record travels
@@ -28,6 +28,7 @@ from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields,
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
+from bwbayes.record.io.netcdf import read_netcdf
 from bwbayes.record.io.series import Source, array_source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
@@ -35,7 +36,9 @@ from bwbayes.record.record import Record
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
 # What a folder of records is searched for.
-SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".xlsx", ".gz")
+SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".xlsx", ".gz", ".nc")
+# What files of a format begin with.
+_MARKS = {b"\x93NUMPY": read_numpy, b"MATLAB": read_mat, b"TDSm": read_tdms, b"CDF": read_netcdf}
 
 
 def read_record(
@@ -151,26 +154,8 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
             begin = file.read(8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
-    has_arrays = begin.startswith(b"\x93NUMPY") or _is_npz(path)
-    is_workbook = begin.startswith(b"PK") and path.suffix.lower() in (".xlsx", ".xlsm")
-    if not has_arrays and not is_workbook and begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
-        raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
     try:
-        if has_arrays or h5py.is_hdf5(path):
-            return read_numpy(path) if has_arrays else read_hdf5(path)
-        if begin.startswith(b"MATLAB") or path.suffix.lower() == ".mat":
-            return read_mat(path)
-        if is_workbook:
-            from bwbayes.record.io.workbook import read_workbook  # noqa: PLC0415  # as of text
-
-            return read_workbook(path, table)
-        if begin.startswith(b"TDSm"):
-            return read_tdms(path)
-        if path.suffix.lower() in _BINARY:
-            raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
-        from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
-
-        return read_text(path, table)
+        return _reader(path, begin, table)(path)
     except (InputError, Warning):
         raise
     except Exception as error:  # whatever a library raises of a damaged file
@@ -184,6 +169,34 @@ def _existing(path: Path) -> Path:
     whole = os.fsencode(path)
     name = re.sub(rb"\\x([0-9a-f]{2})", lambda code: bytes.fromhex(code[1].decode()), whole)
     return Path(os.fsdecode(name))
+
+
+def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path], Source]:
+    """Return what reads a file that begins so.
+
+    Raises InputError: it is of no kind that is read.
+    """
+    if h5py.is_hdf5(path):  # MATLAB's of version 7.3 too
+        return read_hdf5
+    if begin.startswith(b"PK") and _is_npz(path):
+        return read_numpy
+    suffix = path.suffix.lower()
+    if begin.startswith(b"PK") and suffix in (".xlsx", ".xlsm"):
+        from bwbayes.record.io.workbook import read_workbook  # noqa: PLC0415  # as of text
+
+        return partial(read_workbook, table=table)
+    if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+        raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
+    for mark, read in _MARKS.items():
+        if begin.startswith(mark):
+            return read
+    if suffix == ".mat":
+        return read_mat
+    if suffix in _BINARY:
+        raise InputError(f"{path}: not an HDF5 file, or its beginning is lost; write it again")
+    from bwbayes.record.io.text import read_text  # noqa: PLC0415  # pandas is slow to load
+
+    return partial(read_text, table=table)
 
 
 def _is_npz(path: Path) -> bool:

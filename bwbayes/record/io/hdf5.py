@@ -11,9 +11,10 @@ files of version 7.3, as variables.
 from __future__ import annotations
 
 import mmap
+import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
@@ -30,10 +31,16 @@ from bwbayes.record.io.series import (
     Series,
     Source,
     note,
+    notes_of,
     pass_over_object,
     vectors,
 )
 from bwbayes.record.record import Record
+
+# Attributes with the names, or units, of a matrix's columns.
+_NAMES = re.compile("column|channel|field|header|^names?$|^labels?$|^unit")
+# What netCDF stores in a dimension that has no numbers, in its attribute NAME.
+_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def read_hdf5(path: Path) -> Source:
@@ -112,6 +119,8 @@ def _series(
         is_text = "MATLAB_class" in item.attrs and _note(item.attrs, "MATLAB_class") == "char"
         if "MATLAB_empty" in item.attrs or item.shape is None:
             continue
+        if "NAME" in item.attrs and _note(item.attrs, "NAME").startswith(_NO_VARIABLE):
+            continue
         if "MATLAB_object_decode" in item.attrs:
             pass_over_object(path, name, _note(item.attrs, "MATLAB_class"))
             continue
@@ -126,10 +135,50 @@ def _series(
             unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
             unit = unit.partition(" since ")[0]  # of dates: "seconds since 2026-03-03"
             load = partial(_loaded, path, item.name)
-            yield from vectors(prefix, name, item.shape, item.dtype, load, unit)
+            columns = _columns(item, items)
+            yield from vectors(prefix, name, item.shape, item.dtype, load, unit, columns)
     for item in items.values():
         if isinstance(item, h5py.Group) and h5py.h5o.get_info(item.id).addr not in passed:
             yield from _series(path, item, notes, passed)
+
+
+def _columns(
+    dataset: Any, beside: Mapping[str, Any]
+) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
+    """Return names and units of a matrix's columns, or of those in a table's fields, if stated.
+
+    As many words as columns are names: an attribute, or a dataset beside the matrix, as netCDF and
+    pandas have it. Units are the attribute that is called so.
+    """
+    leaf = dataset.name.rpartition("/")[2]
+    if dataset.dtype.names:  # PyTables' list of words, as a text
+        kinds = {name: f"{name}_kind" for name in dataset.dtype.names}
+        return {
+            name: (re.findall("^a?V(.*)$", _note(dataset.attrs, kind), re.MULTILINE), ())
+            for name, kind in kinds.items()
+            if kind in dataset.attrs
+        }
+    if dataset.ndim != 2 or dataset.dtype.kind not in "iuf":
+        return {}
+    stated = {
+        key: notes_of(dataset.attrs[key])
+        for key in dataset.attrs
+        if _is_text(dataset.attrs.get_id(key).dtype) and _NAMES.search(key.lower())
+    }
+    texts = [
+        notes_of(other.asstr()[()] if h5py.check_string_dtype(other.dtype) else other[()])
+        for other in beside.values()
+        if isinstance(other, h5py.Dataset)
+        and other.shape == (min(dataset.shape),)
+        and _is_text(other.dtype)
+    ]
+    unit = next((stated.pop(key) for key in [*stated] if key.lower()[:4] == "unit"), [])
+    names = [words for words in (*stated.values(), *texts) if len(words) == min(dataset.shape)]
+    return {leaf: (names[0] if names else (), unit)}
+
+
+def _is_text(kind: Any) -> bool:
+    return kind.kind == "S" or h5py.check_string_dtype(kind) is not None
 
 
 def _note(attributes: Any, name: str) -> str:

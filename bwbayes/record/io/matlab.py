@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -26,12 +27,14 @@ from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.series import (
     MAXIMUM_SAMPLES,
     NOTES,
+    Clock,
     Series,
     Source,
     note,
     pass_over_object,
     vectors,
 )
+from bwbayes.record.io.units import scale_of
 from bwbayes.record.record import Record
 
 MatVersion = Literal["5", "7.3"]
@@ -59,7 +62,7 @@ def read_mat(path: Path) -> Source:
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise InputError(f"{path}: not a MATLAB file of version 5 or 7.3; save it with -v7")
-    notes: dict[str, str] = {}
+    texts: dict[str, str] = {}
     series: list[Series] = []
     room = 16 * MAXIMUM_SAMPLES  # bytes that compressed elements may unpack to
     for kind, body in _elements(data[128:], order, padded=False):
@@ -75,8 +78,11 @@ def read_mat(path: Path) -> Source:
             name, _, class_name = (text.decode("latin-1") for _, text in inner[:3])
             pass_over_object(path, name, class_name)
         elif inner[1][1]:  # without a name is what MATLAB keeps of its objects
-            series += _series("", matrix, order, notes)
-    return Source(path, tuple(series), {"": notes})
+            series += _series("", matrix, order, texts)
+    arrays = {one.name: one for one in series}
+    described = tuple(_described(one, arrays, texts) for one in series)
+    notes = {name: text for name, text in texts.items() if name in NOTES}
+    return Source(path, described, {"": notes})
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
@@ -106,12 +112,33 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     path.write_bytes(content.getvalue())
 
 
-def _series(
-    path: str, matrix: bytes, order: str, notes: dict[str, str] | None = None
-) -> Iterator[Series]:
+def _described(series: Series, arrays: Mapping[str, Series], texts: Mapping[str, str]) -> Series:
+    """Return a series with the unit and the clock that the other fields of its struct state.
+
+    As a ``timeseries`` that is saved as a struct has them, Time, Data and DataInfo.Units, or the
+    channels of dSPACE, Data and Unit.
+    """
+    struct, leaf = series.group, series.label.partition("[")[0]
+    if not struct or leaf not in ("Time", "Data"):
+        return series
+    words = ("Unit", "Units", "DataInfo.Units") if leaf == "Data" else ("TimeInfo.Units",)
+    unit = next((texts[struct + word] for word in words if struct + word in texts), "")
+    times, clock = arrays.get(f"{struct}Time"), None
+    scale = scale_of(texts.get(f"{struct}TimeInfo.Units", "s"), "time")
+    if leaf == "Data" and scale and times and times.size == series.size > 1:
+        factor, power = scale
+        seconds = factor * times.numbers("").astype(np.float64) * 10.0**power
+        interval = float(seconds[-1] - seconds[0]) / (seconds.size - 1)
+        uniform = seconds[0] + interval * np.arange(seconds.size)
+        if interval > 0 and np.abs(seconds - uniform).max() <= 0.01 * interval:
+            clock = Clock(interval, float(seconds[0]))
+    return replace(series, unit=unit, clock=clock)
+
+
+def _series(path: str, matrix: bytes, order: str, texts: dict[str, str]) -> Iterator[Series]:
     """Yield the series in a variable, an element of a cell array, or a field of a struct.
 
-    Notes are collected where there are some. Objects and sparse matrices are passed over.
+    Texts are collected by their paths. Objects and sparse matrices are passed over.
     """
     flags, *inner = _elements(matrix, order)
     word = struct.unpack_from(f"{order}I", flags[1])[0]
@@ -122,11 +149,11 @@ def _series(
     path = path or inner[1][1].decode("latin-1")
     content = inner[2:]
     if kind == _CHAR:
-        if notes is not None and path in NOTES and content and content[0][1]:
+        if content and content[0][1]:
             codes = _values(content[0], order)
             encoding = "utf-8" if codes.itemsize == 1 else f"utf-{8 * codes.itemsize}-le"
             text = codes.astype(f"<u{codes.itemsize}").tobytes().decode(encoding, errors="replace")
-            notes[path] = text
+            texts[path] = text
     elif kind in _NUMERIC:
         is_complex = bool(word & _IS_COMPLEX)
         dtype = np.dtype("?" if word & _IS_LOGICAL else "c16" if is_complex else _NUMERIC[kind])
@@ -136,8 +163,8 @@ def _series(
         def load() -> Any:
             return _values(content[0], order).astype(dtype).reshape(shape, order="F")
 
-        if notes is not None and path in NOTES and math.prod(shape) > 0:
-            notes[path] = note(load())
+        if path in NOTES and math.prod(shape) > 0:
+            texts[path] = note(load())
         else:
             group, dot, leaf = path.rpartition(".")
             yield from vectors(group + dot, leaf, shape, dtype, load)
@@ -154,7 +181,7 @@ def _series(
             index, field = divmod(number, len(fields))
             index_text = f"({index + 1})" if math.prod(shape) > 1 else ""
             if body:  # else an empty array
-                yield from _series(f"{path}{index_text}{fields[field]}", body, order)
+                yield from _series(f"{path}{index_text}{fields[field]}", body, order, texts)
 
 
 def _values(element: tuple[int, bytes], order: str) -> Any:

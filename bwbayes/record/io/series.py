@@ -126,7 +126,13 @@ class Source:
 
 
 def vectors(
-    group: str, leaf: str, shape: Any, dtype: Any, load: Callable[[], Any], unit: str = ""
+    group: str,
+    leaf: str,
+    shape: Any,
+    dtype: Any,
+    load: Callable[[], Any],
+    unit: str = "",
+    columns: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
 ) -> Iterator[Series]:
     """Yield the series in an array: the array, its columns, or a table's fields.
 
@@ -139,6 +145,9 @@ def vectors(
         64 columns (a picture, or samples in another order) it is passed over.
     unit
         Of its numbers, if that is stated.
+    columns
+        Names and units of the columns, by the name of the array or the table's field, where as many
+        are stated; else columns are numbered.
     """
     sides = [n for n in shape or () if n != 1]
     if shape is None or max(sides, default=1) > MAXIMUM_SAMPLES:
@@ -146,12 +155,19 @@ def vectors(
     if dtype.names:
         for name in dtype.names:
             inner = partial(lambda name: load()[name], name)
-            yield from vectors(f"{group}{leaf}.", name, shape, dtype[name], inner, unit)
+            kind, inside = dtype[name].base, (*shape, *dtype[name].shape)
+            yield from vectors(f"{group}{leaf}.", name, inside, kind, inner, unit, columns)
     elif len(sides) == 2 and min(sides) <= 64 and dtype.kind in "iuf":
         across = int(sides[0] >= sides[1])
-        for i in range(min(sides)):
+        count, within = min(sides), f"{group}{leaf}."
+        names, units = (columns or {}).get(leaf, ((), ()))
+        for i in range(count):
             column = partial(lambda i: np.squeeze(load()).take(i, across), i)
-            yield Series(f"{group}{leaf}[{i + 1}]", max(sides), column, unit, group)
+            stated = units[i] if len(units) == count else unit
+            if len({*names}) == len(names) == count:
+                yield Series(f"{within}{names[i]}", max(sides), column, stated, within)
+            else:
+                yield Series(f"{group}{leaf}[{i + 1}]", max(sides), column, stated, group)
     elif len(sides) <= 1 or dtype.kind not in "iuf":
         size = int(np.prod(sides, dtype=np.int64))
         yield Series(f"{group}{leaf}", size, lambda: np.ravel(load()), unit, group)
@@ -162,7 +178,14 @@ def note(value: Any) -> str:
     first = np.ravel(value)[0] if np.size(value) else ""
     if isinstance(first, bytes):
         return first.decode("utf-8", errors="replace")
-    return repr(float(first)) if np.asarray(first).dtype.kind in "iuf" else str(first)
+    # By its own digits: those of a number of 32 bits are fewer.
+    return repr(float(str(first))) if np.asarray(first).dtype.kind in "iuf" else str(first)
+
+
+def notes_of(value: Any) -> list[str]:
+    """Return each of several notes as text, those in one text by the commas between them."""
+    texts = [note(item).strip() for item in np.ravel(value)]
+    return [text.strip() for text in texts[0].split(",")] if len(texts) == 1 else texts
 
 
 def pass_over_object(path: Path, name: str, kind: str) -> None:

@@ -113,8 +113,8 @@ def unit_in(name: str, quantity: str) -> str | None:
 
 
 def unit_in_brackets(name: str) -> str | None:
-    """Return what stands in brackets at the end of a column's name, if anything does."""
-    ending = re.search(r"(?:\[([^]]*)\]|\(([^)]*)\))\s*$", name)
+    """Return what stands in brackets at the end of a column's name, if it is no number."""
+    ending = re.search(r"(?:\[(?!\d+\])([^]]*)\]|\(([^)]*)\))\s*$", name)
     return next(group for group in ending.groups() if group is not None).strip() if ending else None
 
 

@@ -37,18 +37,15 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
     except ImportError:
         advice = "pip install 'bwbayes[xlsx]', or export it as CSV"
         raise InputError(f"{path}: reading a workbook needs openpyxl; {advice}") from None
-    book = load_workbook(path, read_only=True, data_only=True)
-    # Its numbers in place of times, which openpyxl rounds to milliseconds.
-    times = _Times(book.epoch, book._date_formats, book._timedelta_formats)
-    book._date_formats = set()
+    with warnings.catch_warnings():  # of styles and validations, which do not matter here
+        warnings.filterwarnings("ignore", module="openpyxl")
+        texts = _texts(load_workbook(path, read_only=True, data_only=True))
     tables: dict[str, tuple[Source, list[str]]] = {}
     unread: dict[str, InputError] = {}
-    for sheet in book.worksheets:
-        sheet.reset_dimensions()  # what programs write of them may be wrong
-        text = _text(sheet, times)
+    for sheet, text in texts.items():
         titles = [title for _, title in tables_of(text.split("\n"))]
         for number, title in enumerate(titles, start=1):
-            name = sheet.title if len(titles) == 1 else f"{sheet.title}: {title}"
+            name = sheet if len(titles) == 1 else f"{sheet}: {title}"
             try:
                 with warnings.catch_warnings(record=True) as remarks:
                     warnings.simplefilter("always", InputWarning)
@@ -58,7 +55,6 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
                 continue
             if any(series.size > 1 for series in source.series):  # else a number among words
                 tables[name] = source, [str(remark.message) for remark in remarks]
-    book.close()
     if str(table) in unread or not tables:
         nothing = NoNumbersError(f"{path}: no sheet has columns of numbers; give a row a sample")
         raise unread.get(str(table), nothing)
@@ -74,6 +70,19 @@ class _Times(NamedTuple):
     epoch: datetime
     styles: Collection[int]
     durations: Collection[int]
+
+
+def _texts(book: Any) -> dict[str, str]:
+    """Return the sheets of a workbook as text, and close it."""
+    # Its numbers in place of times, which openpyxl rounds to milliseconds.
+    times = _Times(book.epoch, book._date_formats, book._timedelta_formats)
+    book._date_formats = set()
+    texts = {}
+    for sheet in book.worksheets:
+        sheet.reset_dimensions()  # what programs write of them may be wrong
+        texts[sheet.title] = _text(sheet, times)
+    book.close()
+    return texts
 
 
 def _text(sheet: Any, times: _Times) -> str:
