@@ -52,7 +52,8 @@ class NoNumbersError(InputError):
 class ColumnsError(InputError):
     """Columns or units of a file that are not known; ``columns`` and ``units`` are a guess.
 
-    So is ``fs``, the sampling rate, Hz, if no column can be the time.
+    So is ``fs``, the sampling rate, Hz, if no column can be the time. What cannot be guessed is a
+    word, ``"HZ"``, or a question mark, which are refused.
 
     The text says what to write in Python; :meth:`in_config` and :meth:`in_command` what to write
     elsewhere. ``place`` is the table of the config that names the file.
@@ -64,12 +65,12 @@ class ColumnsError(InputError):
         columns: Mapping[str, str | int],
         units: Mapping[str, str],
         place: str = "record",
-        fs: float | None = None,
+        fs: float | str | None = None,
     ) -> None:
         self.problem, self.place, self.fs = problem, place, fs
         self.guess: dict[str, dict[str, Any]] = {"columns": dict(columns), "units": dict(units)}
         said = [f"{key}={table!r}" for key, table in self.guess.items() if table]
-        said += [] if fs is None else [f"fs={fs:g}"]
+        said += [] if fs is None else [f"fs={_rate(fs)}"]
         super().__init__(f"{problem}; say {', '.join(said)}")
 
     def within(self, place: str) -> ColumnsError:
@@ -83,7 +84,7 @@ class ColumnsError(InputError):
         for key, table in self.guess.items():
             pairs = ", ".join(f"{quantity} = {text!r}" for quantity, text in table.items())
             lines += [f"{key} = {{ {pairs} }}"] if table else []
-        lines += [] if self.fs is None else [f"fs = {self.fs:g}"]
+        lines += [] if self.fs is None else [f"fs = {_rate(self.fs)}"]
         return InputError(f"{self.problem}; under [{self.place}] say {' and '.join(lines)}")
 
     def in_command(self, command: str) -> InputError:
@@ -92,14 +93,20 @@ class ColumnsError(InputError):
         return InputError(f"{self.problem}; copy and correct: {typed}")
 
 
-def with_naming(command: str, tables: Mapping[str, Mapping[str, Any]], fs: float | None) -> str:
+def _rate(fs: float | str) -> str:
+    return fs if isinstance(fs, str) else f"{fs:.12g}"
+
+
+def with_naming(
+    command: str, tables: Mapping[str, Mapping[str, Any]], fs: float | str | None
+) -> str:
     """Return a command with the options that say columns and units by quantity, and the rate."""
     options = [
         f"--{key.removesuffix('s')} {quantity}={quote(str(text))}"
         for key, table in tables.items()
         for quantity, text in table.items()
     ]
-    return " ".join([command, *options, *([] if fs is None else [f"--fs {fs:.12g}"])])
+    return " ".join([command, *options, *([] if fs is None else [f"--fs {_rate(fs)}"])])
 
 
 @contextmanager

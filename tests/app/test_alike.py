@@ -133,6 +133,31 @@ noise = "white"
     assert problem.config == resolve(problem.config, folder.path).config
 
 
+def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
+    bwbayes: Type, tmp_path: Path
+) -> None:
+    """Its folder opens without them; a planned voltage alone is read as the first was."""
+    time = 0.01 * np.arange(300)
+    voltage = 50 + 40 * np.sin(6 * time)
+    np.savetxt(tmp_path / "u.txt", voltage)
+    np.savetxt(tmp_path / "x.txt", 0.7 * voltage + 0.1 * np.cos(9 * np.arange(300)))
+    files = ["--voltage", tmp_path / "u.txt", "--displacement", tmp_path / "x.txt"]
+    options = ["--unit", "voltage=V", "--unit", "displacement=um", "--fs", "100"]
+    bwbayes("init", *files).assert_refused("--displacement", "--unit displacement=um --fs")
+    config = tmp_path / "a.toml"
+    assert bwbayes("init", *files, *options, "--out", config).status == 0
+    folder = RunFolder.create(tmp_path / "run", resolve(load(config), tmp_path))
+    for name in "ux":
+        (tmp_path / f"{name}.txt").rename(tmp_path / f"{name}2.txt")
+    problem = folder.problem()
+    np.testing.assert_allclose(problem.records["record"].voltage, voltage)
+    alike = options_alike(tmp_path / "u2.txt", problem.config.records["record"].read_as)
+    plan = readable(tmp_path / "u2.txt", **alike)
+    measured = readable(tmp_path / "u2.txt", displacement_file=tmp_path / "x2.txt", **alike)
+    assert (plan.readings, measured.readings) == (0, 300)
+    assert (plan.interval, measured.interval) == (0.01, 0.01)
+
+
 @pytest.fixture
 def renamed(copy: RunFolder, tmp_path: Path) -> Path:
     """Return a file of the columns of a run's record, which a run can be told of alone."""

@@ -64,7 +64,8 @@ def test_help_lists_every_part_of_a_model(bwbayes: Type, command: str) -> None:
     ("typed", "text"),
     [
         ("frobnicate", "No such command 'frobnicate'"),
-        ("run", "Missing argument 'CONFIG'"),
+        ("run", "run: give either CONFIG, or --voltage FILE and --displacement FILE"),
+        ("init a.csv --voltage b.csv", "init: give either RECORD, or --voltage"),
         ("run a.toml --bogus", "No such option"),
         ("run a.toml --seed 99999999999999999999", "--seed"),
         ("check a.toml", "a.toml: No such file"),

@@ -165,7 +165,7 @@ def test_the_config_names_the_table_that_was_chosen(bwbayes: Type, write: Write)
     read = read_record(path.with_name(record.file), table=record.table)
     np.testing.assert_array_equal(read.displacement, alone.displacement)
     said = bwbayes("check", path.with_suffix(".toml"), "--table", "1")
-    said.assert_refused("--table are for a record")
+    said.assert_refused("--table and --displacement are for a record")
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1e3, 1.0), (1.0, 1e-4, 1.0), (1.0, 1.0, 1e4)])

@@ -12,6 +12,7 @@ from rich.console import Console
 from bwbayes.app.commands.shared import (
     FILE,
     command_as_typed,
+    file_argument,
     finish,
     folder_argument,
     naming_options,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("record", type=FILE)
+@file_argument("record")
 @naming_options
 @click.option("--out", type=FILE, help="The config; default: NAME-OF-RECORD.toml.")
 def init(record: Path, out: Path | None, **naming: Any) -> int:
@@ -57,7 +58,7 @@ def init(record: Path, out: Path | None, **naming: Any) -> int:
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@file_argument("config")
 @click.option("--record", type=FILE, help="Check this record instead of the config's.")
 @naming_options
 @click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
@@ -78,7 +79,7 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@file_argument("config")
 @click.option("--record", type=FILE, help="Fit this record instead of the config's.")
 @naming_options
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
@@ -179,8 +180,8 @@ def _config_or_proposal(
         config = load(path)
         if any(value not in (None, {}) for value in naming.values()):
             raise InputError(
-                f"{path}: --column, --unit, --fs and --table are for a record; in a config say "
-                "columns, units, fs and table under [record]"
+                f"{path}: --column, --unit, --fs, --table and --displacement are for a record; in "
+                "a config say columns, units, fs, table and displacement_file under [record]"
             )
         return config if record is None else config.with_record(record), False
     try:
@@ -193,7 +194,8 @@ def _config_or_proposal(
     config = proposal.config
     tables = {key: naming[key] for key in ("columns", "units")}
     init = f"bwbayes init {shlex.quote(str(path))}"
-    init += "" if naming["table"] is None else f" --table {shlex.quote(naming['table'])}"
+    for option, key in ("table", "table"), ("displacement", "displacement_file"):
+        init += "" if naming[key] is None else f" --{option} {shlex.quote(str(naming[key]))}"
     init = with_naming(init, tables, naming["fs"])
     if command != "check" and proposal.pointless is not None:
         raise InputError(

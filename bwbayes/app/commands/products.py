@@ -55,9 +55,13 @@ def _saved(
 
 @click.command()
 @folder_argument
-@click.option("--record", type=FILE, help="Record to predict (measured, or voltage only).")
+@click.option(
+    "--record", "--voltage", type=FILE, help="Record to predict (measured, or voltage only)."
+)
 @naming_options
-@options_of("bwbayes.app.jobs.predict:predict", "name", "table", "own_offset", "watch")
+@options_of(
+    "bwbayes.app.jobs.predict:predict", "name", "table", "displacement_file", "own_offset", "watch"
+)
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
 @overwrite_option
@@ -70,7 +74,6 @@ def predict(
     columns: dict[str, str],
     units: dict[str, str],
     fs: float | None,
-    table: str | None,
     **options: Any,
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
@@ -102,10 +105,10 @@ def predict(
         other: Record | Path | None = record
         try:
             if record and (columns or units or fs is not None):
-                naming: dict[str, Any] = {"columns": columns, "units": units}
-                naming |= {"fs": fs, "table": table}
+                naming: dict[str, Any] = {"columns": columns, "units": units, "fs": fs}
+                naming |= {key: options[key] for key in ("table", "displacement_file")}
                 other = read_record(record, need_displacement=False, **naming)
-            options |= {"name": name, "table": table, "own_offset": not same_offset, "watch": watch}
+            options |= {"name": name, "own_offset": not same_offset, "watch": watch}
             bands = predict_record(fit, other, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None

@@ -143,8 +143,38 @@ class WithParts(click.Command):
             formatter.write_dl([(kind, ", ".join(names)) for kind, names in PARTS.items()])
 
 
+def file_argument(name: str) -> Callable[[AnyCommand], AnyCommand]:
+    """Return a decorator that adds the file that a command is about, or --voltage in its place."""
+
+    def decorate(command: AnyCommand) -> AnyCommand:
+        @wraps(command)
+        def usable(*, voltage: Path | None, **options: Any) -> Any:
+            given = [file for file in (options[name], voltage) if file is not None]
+            if len(given) != 1:
+                context = click.get_current_context()
+                raise InputError(
+                    f"{context.info_name}: give either {name.upper()}, or --voltage FILE and "
+                    "--displacement FILE"
+                )
+            return command(**options | {name: given[0]})
+
+        argument = click.argument(name, type=FILE, required=False)
+        text = "A record's file with the voltage, if --displacement has the rest."
+        option = click.option("--voltage", type=FILE, help=text)
+        decorated: AnyCommand = argument(option(usable))
+        return decorated
+
+    return decorate
+
+
 def naming_options(command: AnyCommand) -> AnyCommand:
-    """Add the options that say what of a record's file is meant: columns, units, fs and table."""
+    """Add the options that say what of a record's files is meant, as a naming has it."""
+    other = click.option(
+        "--displacement",
+        "displacement_file",
+        type=FILE,
+        help="The file with the displacement, if the record's has the voltage alone.",
+    )
     table = click.option("--table", metavar="N", help="One of several tables: number or sheet.")
     fs = click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column.")
     units = click.option(
@@ -164,7 +194,7 @@ def naming_options(command: AnyCommand) -> AnyCommand:
         callback=_pairs,
         help="The column of time, voltage or displacement: a name, or a number from 1 on.",
     )
-    return columns(units(fs(table(command))))
+    return columns(units(fs(table(other(command)))))
 
 
 def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
@@ -284,7 +314,7 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
 
 
 # What is called otherwise there.
-OTHERWISE = {"fit": "run", "folder": "out"}
+OTHERWISE = {"fit": "run", "folder": "out", "displacement_file": "displacement"}
 
 
 def as_typed(text: str) -> str:

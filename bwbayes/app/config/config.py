@@ -121,7 +121,8 @@ class Config(ConfigTable):
                 f"record: the config has several ({names}), and another one cannot stand for all "
                 "of them; change their files there"
             )
-        source = self.record.model_copy(update={"file": str(file.resolve()), "signal": None})
+        changes = {"file": str(file.resolve()), "displacement_file": None, "signal": None}
+        source = self.record.model_copy(update=changes)
         return self.model_copy(update={"record": source})
 
     def renamed(self, name: str, seed: int | None) -> Config:

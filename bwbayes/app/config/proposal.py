@@ -121,8 +121,14 @@ def _text(
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
     # A JSON string is a TOML string too, except for DEL, which no column's name has.
     quoted = partial(json.dumps, ensure_ascii=False)
-    relative = Path(os.path.relpath(path.absolute(), where.absolute())).as_posix()
-    source = f"file = {quoted(path_text(relative))}"
+
+    def relative(file: Path) -> str:
+        place = Path(os.path.relpath(file.absolute(), where.absolute()))
+        return quoted(path_text(place.as_posix()))
+
+    source = f"file = {relative(path)}"
+    if naming.displacement_file is not None:
+        source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
     for key, table in (("columns", naming.columns), ("units", naming.units)):
         if table:
             pairs = ", ".join(

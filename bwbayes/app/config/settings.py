@@ -8,6 +8,7 @@ A key is a field here and nowhere else: its type is what is checked, its docstri
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
@@ -105,6 +106,8 @@ class _Source(ConfigTable):
     """Of a workbook or text with several tables the one that counts: its number, from 1 on, or the
     sheet's name.
     """
+    displacement_file: str | None = key(None, example='"my_displacement.csv"')
+    """The file with the displacement, if the record's has the voltage alone."""
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
     """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
     that is predicted by default those of the training record.
@@ -114,7 +117,8 @@ class _Source(ConfigTable):
     def _naming(self) -> Self:
         from bwbayes.record.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
-        Naming(self.columns or {}, self.units or {}, self.fs)
+        other = None if self.displacement_file is None else Path(self.displacement_file)
+        Naming(self.columns or {}, self.units or {}, self.fs, displacement_file=other)
         return self
 
 

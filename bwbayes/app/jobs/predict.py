@@ -28,6 +28,7 @@ def predict(
     signal: str | None = None,
     name: str | None = None,
     table: int | str | None = None,
+    displacement_file: str | Path | None = None,
     window: tuple[float, float] | None = None,
     from_rest: bool = False,
     own_offset: bool = True,
@@ -52,6 +53,8 @@ def predict(
         Name of the bands; by default the file's or the signal's, or "prediction".
     table
         Of a file with several tables the one that counts: its number, from 1 on, or its title.
+    displacement_file
+        The file with the displacement, if the record's has the voltage alone.
     window
         Judge and write this part of the record alone: start and stop, s.
     from_rest
@@ -112,8 +115,9 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or Path(str(record)).stem
-        alike = options_alike(record or "", problem.config.records[of].read_as, table)
-        record = read_record(record or "", need_displacement=False, **alike)
+        alike = options_alike(record, problem.config.records[of].read_as, table)
+        alike |= {"displacement_file": displacement_file}
+        record = read_record(record, need_displacement=False, **alike)
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold

@@ -30,7 +30,11 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     if not stated or source.file is None:
         return None
     content = _content(folder / source.file, source.table)
-    columns = {q: series_named(content, c, q).name for q, c in (source.columns or {}).items()}
+    columns = {
+        q: series_named(content, c, q).name
+        for q, c in (source.columns or {}).items()
+        if q != "displacement" or source.displacement_file is None
+    }
     names = [item.name for item in content.series]
     return {**stated, "columns": columns, "all_columns": names}
 

@@ -326,7 +326,9 @@ def _explicit(
         )
         for name, source in config.records.items()
     }
-    as_read = dict.fromkeys(("signal", "voltage_is", "columns", "units", "fs", "table"))
+    as_read = dict.fromkeys(
+        ("signal", "voltage_is", "columns", "units", "fs", "table", "displacement_file")
+    )
     validation = {
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()

@@ -222,6 +222,7 @@ def _read(
             units=source.units,
             fs=source.fs,
             table=source.table,
+            displacement_file=source.displacement_file and folder / source.displacement_file,
         )
     except ColumnsError as error:
         raise error.within(table) from None

@@ -298,6 +298,8 @@ class CampaignFolder(Folder):
             for name, validation in parse(text, str(self.config)).validation.items():
                 if validation.file is not None:
                     files[f"validation.{name}"] = where / validation.file
+                if validation.displacement_file is not None:
+                    files[f"validation.{name}.displacement"] = where / validation.displacement_file
         return {name: sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
 
     def is_done(self, file: Path) -> bool:

@@ -9,49 +9,31 @@ the series that there are and a guess.
 from __future__ import annotations
 
 import operator
-import re
 import warnings
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
-from bwbayes.record.io.series import Clock, Series, Source
-from bwbayes.record.io.units import (
-    COMMON_UNITS,
-    QUANTITIES,
-    epoch_unit,
-    rates_by_unit,
-    scale_of,
-    unit_in,
-    unit_in_brackets,
-    unit_scale,
+from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.record.io.questions import columns_error
+from bwbayes.record.io.recognition import (
+    bare_name,
+    beside,
+    counts_samples,
+    finite,
+    is_demand,
+    likeness,
+    listed,
+    ranges_of,
+    unit_of,
 )
-
-# In the names of displacements that are asked for, not measured.
-_DEMANDS = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
-# What other people call the quantities, in lower case and without a unit.
-_WORDS = {
-    "time": (
-        *("t", "time", "timestamp", "sec", "seconds", "elapsed time", "x_value"),
-        *("unix", "unix_time", "unix time", "unix_timestamp", "unix timestamp", "posix_time"),
-        *("epoch", "epoch_time", "epoch time"),
-        *("zeit", "temps"),
-    ),
-    "voltage": (
-        *("u", "v", "volt", "volts", "voltage", "drive", "command", "input"),
-        *("spannung", "tension"),
-    ),
-    "displacement": (
-        *("x", "y", "z", "pos", "position", "disp", "displacement", "stroke", "deflection"),
-        *("sensor", "output", "weg", "auslenkung", "déplacement"),
-    ),
-}
+from bwbayes.record.io.series import Clock, Series, Source
+from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, epoch_unit, scale_of
 
 
 @dataclass(frozen=True)
@@ -71,6 +53,8 @@ class Naming:
         The sampling rate, Hz, in place of a time column.
     table
         Of a file with several tables the one that counts: its number, from 1 on, or its title.
+    displacement_file
+        The file with the displacement, if it is another one than that with the voltage.
 
     Raises
     ------
@@ -83,6 +67,7 @@ class Naming:
     units: Mapping[str, str] = field(default_factory=dict)
     fs: float | None = None
     table: int | str | None = None
+    displacement_file: Path | None = None
 
     def __post_init__(self) -> None:
         for key, table in (("columns", self.columns), ("units", self.units)):
@@ -108,7 +93,10 @@ class Naming:
             q: c if isinstance(c, str) else operator.index(c) for q, c in self.columns.items()
         }
         object.__setattr__(self, "columns", columns)
-        if len(set(self.columns.values())) < len(self.columns):
+        beside = [
+            c for q, c in columns.items() if q != "displacement" or not self.displacement_file
+        ]
+        if len(set(beside)) < len(beside):
             raise InputError("columns: two quantities have the same column; give each its own")
         if self.fs is not None and not 0 < self.fs < np.inf:
             raise InputError(f"fs: {self.fs:g} Hz is no sampling rate; give a number above 0")
@@ -184,16 +172,16 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     timed = [series for quantity, series in chosen.items() if quantity != "time"] or source.series
     has_rate = naming.fs is not None or all(series.clock for series in timed)
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]
-    units = {q: naming.units.get(q) or _unit_of(s.label, s.unit, q) for q, s in chosen.items()}
+    units = {q: naming.units.get(q) or unit_of(s.label, s.unit, q) for q, s in chosen.items()}
     if "time" in units:
-        units["time"] = units["time"] or epoch_unit(chosen["time"].label, _finite(chosen["time"]))
+        units["time"] = units["time"] or epoch_unit(chosen["time"].label, finite(chosen["time"]))
     for series in (chosen[q] for q in chosen if "V" in naming.units.get(q, "") and q != "voltage"):
-        if (stated := _unit_of(series.label, series.unit, "voltage")) not in (None, "V"):
+        if (stated := unit_of(series.label, series.unit, "voltage")) not in (None, "V"):
             advice = f"say how many um is 1 {stated}, as '0.35 um'"
             raise InputError(f"{source.path}: {series.name}: in {stated}, not in V; {advice}")
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
-        raise _columns_error(source, naming, chosen, missing, unknown)
+        raise columns_error(source, naming, chosen, missing, unknown)
     path = source.path
     if by_unit:
         reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
@@ -214,7 +202,7 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         shown = ", ".join(others[:10]) + ", ..." * (len(others) > 10)
         _warn(f"{path}:{max(source.lines[0] - 1, 1)}: ignored columns: {shown}")
     foreign = {
-        q: name for q, name in names.items() if q in QUANTITIES and _likeness(name, "", q) != 0
+        q: name for q, name in names.items() if q in QUANTITIES and likeness(name, "", q) != 0
     }
     used = Naming({**foreign, **naming.columns}, naming.units, naming.fs, naming.table)
     group = next(iter(chosen.values())).group
@@ -238,7 +226,7 @@ def series_named(source: Source, name: str | int, quantity: str) -> Series:
     exact = [s for s in source.series if s.name == word and name == str(name)]
     matches = exact or [s for s in source.series if s.label == word and name == str(name)]
     if not matches:  # without its unit, which a reader may have appended
-        matches = [s for s in source.series if name == _bare(s.label, quantity)]
+        matches = [s for s in source.series if name == bare_name(s.label, quantity)]
     if not matches and word.isdecimal():
         matches = list(source.series[int(word) - 1 : int(word)]) if int(word) else []
     if len(matches) == 1:
@@ -246,7 +234,7 @@ def series_named(source: Source, name: str | int, quantity: str) -> Series:
     problem = "several columns" if matches else "no column"
     raise InputError(
         f"{source.path}: {problem} {name!r} for the {quantity}; choose another. "
-        f"{_listed(matches or source.series, _ranges(matches or source.series))}"
+        f"{listed(matches or source.series, ranges_of(matches or source.series))}"
     )
 
 
@@ -255,212 +243,25 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
     settled = {*chosen, *(["time"] if naming.fs is not None else [])}
     long = [s for s in source.series if s.size > 1] or source.series
     by_unit = []
-    for likeness in range(3):
+    for rank in range(3):
         for quantity in (*QUANTITIES, "truth"):
             names = [series.name for series in chosen.values()]
             candidates = [
                 s
                 for s in long
                 if s.name not in names
-                and _likeness(s.label, s.unit, quantity) == likeness
+                and likeness(s.label, s.unit, quantity) == rank
                 # Neither what counts the samples, nor what is asked for, nor an empty column.
-                and not (likeness and quantity != "time" and _counts_samples(s))
-                and not (likeness == 2 and quantity == "displacement" and _is_demand(s))
-                and not (quantity == "time" and s.clock and not _finite(s).size)
+                and not (rank and quantity != "time" and counts_samples(s))
+                and not (rank == 2 and quantity == "displacement" and is_demand(s))
+                and not (quantity == "time" and s.clock and not finite(s).size)
             ]
             if quantity in settled or not candidates:
                 continue
             settled.add(quantity)
-            candidates = _beside(candidates, chosen)
+            candidates = beside(candidates, chosen)
             if len(candidates) == 1:  # several leave it open, whatever their units are
                 chosen[quantity] = candidates[0]
-                if likeness == 2 and quantity != "time":  # of seconds there is no doubt
+                if rank == 2 and quantity != "time":  # of seconds there is no doubt
                     by_unit.append(quantity)
     return by_unit
-
-
-def _likeness(label: str, unit: str, quantity: str) -> int | None:
-    """Tell if a name means a quantity: 0 as the package's own, 1 by its word, 2 by its unit."""
-    word, _, ending = label.strip(" _").rpartition("_")
-    if word.lower() == quantity and unit_scale(ending, quantity):
-        return 0
-    if quantity == "truth" or _likeness(label, "", "truth") == 0:
-        return None
-    stated = {q: _unit_of(label, unit, q) for q in QUANTITIES}
-    if any(stated.values()) and stated[quantity] is None:
-        return None
-    if _bare(label, quantity).lower() in _WORDS[quantity] or word.lower() == quantity:
-        return 1
-    return 2 if stated[quantity] else None
-
-
-def _bare(label: str, quantity: str) -> str:
-    """Return a name without the unit of the quantity at its end."""
-    unit = unit_in(label, quantity)
-    return (
-        re.sub(rf"[\s_/.\-\[(]*{re.escape(unit)}[\])\s_]*$", "", label).strip() if unit else label
-    )
-
-
-def _is_demand(series: Series) -> bool:
-    """Tell whether a name is that of a displacement that is asked for, not measured."""
-    return re.search(_DEMANDS, series.label.lower()) is not None
-
-
-def _counts_samples(series: Series) -> bool:
-    """Tell whether a series only numbers the samples."""
-    steps = np.diff(_finite(series))
-    return bool(steps.size) and bool((steps == 1).all())
-
-
-def _foreign_unit(series: Series, quantity: str) -> str:
-    """Return the unit that a file states for a series, if it is none of the quantity."""
-    stated = series.unit or unit_in_brackets(series.label) or ""
-    others = [unit for q in QUANTITIES if (unit := _unit_of(series.label, series.unit, q))]
-    return "" if _unit_of(series.label, series.unit, quantity) else next(iter(others), stated)
-
-
-def _beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
-    """Keep the series that stand beside those that are chosen, and are as long, if any do."""
-    first = next(iter(chosen.values()), None)
-    for key in ("group", "size") if first else ():
-        alike = [s for s in candidates if getattr(s, key) == getattr(first, key)]
-        candidates = alike or candidates
-    return candidates
-
-
-def _unit_of(label: str, unit: str, quantity: str) -> str | None:
-    """Return the unit that a file states for a series, if it is one of the quantity."""
-    return unit if unit_scale(unit, quantity) else unit_in(label, quantity)
-
-
-def _guess(label: str, quantity: str) -> str:
-    """Return the unit that stands anywhere in a name, as in ``ms_since_midnight``, or the usual."""
-    words = (word for word in re.split(r"[\W_]+", label) if unit_scale(word, quantity))
-    return next(words, COMMON_UNITS[quantity][0])
-
-
-def _columns_error(
-    source: Source,
-    naming: Naming,
-    chosen: Mapping[str, Series],
-    missing: Sequence[str],
-    unknown: Sequence[str],
-) -> InputError:
-    """Return the error that names all that is open, and guesses it."""
-    where = str(source.path)
-    if source.lines and source.lines[0] > 1:
-        where += f":{source.lines[0] - 1}"
-    if all(series.size == 1 for series in source.series):
-        return InputError(
-            f"{where}: no column has more than one number; give a row for each sample"
-        )
-    ranges = _ranges(source.series)
-    if not ranges:
-        return InputError(f"{where}: no column holds only numbers; export it as CSV")
-    others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
-    if chosen:
-        others = [s for s in others if s.size in {c.size for c in chosen.values()}]
-    moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
-    candidates = _beside(moving or others, chosen)
-    clock = chosen["time"] if "time" in unknown else None
-    steps = {s.name: np.diff(_finite(s)) for s in candidates if s.name in ranges}
-    # But for those that number the samples.
-    candidates = [
-        s for s in candidates if _unit_of(s.label, s.unit, "time") or not _counts_samples(s)
-    ]
-    clocks = [
-        s
-        for s in candidates
-        if s.name in steps and steps[s.name].size == s.size - 1 and (steps[s.name] > 0).all()
-    ]
-    timeless = "time" in missing and not clocks
-    missing = [q for q in missing if not (q == "time" and timeless)]
-    columns, units = dict(naming.columns), dict(naming.units)
-    proposed = {q: chosen[q] for q in unknown}  # those whose unit is open
-    for quantity in missing:
-        pool = clocks if quantity == "time" else candidates
-        if quantity == "displacement":
-            pool = sorted(pool, key=_is_demand)
-        words = [word for word in _WORDS[quantity] if len(word) > 3]
-        alike = [s for s in pool if any(word in s.label.lower() for word in words)]
-        pool = [s for s in pool if _unit_of(s.label, s.unit, quantity)] or alike or pool
-        if not pool:
-            continue
-        columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
-        candidates = [s for s in candidates if s is not pool[0]]
-        if _unit_of(pool[0].label, pool[0].unit, quantity) is None:
-            clock = pool[0] if quantity == "time" else clock
-            proposed[quantity] = pool[0]
-    sensitivities = _guess_units(proposed, units)
-    unknown = [q for q in unknown if units[q] == _guess(chosen[q].label, q)]
-    listing = _listed(source.series, ranges)
-    lost = [q for q in missing if q not in columns]
-    if lost:
-        return InputError(f"{where}: no column for the {' and the '.join(lost)}; add it. {listing}")
-    questions = [f"which column is the {', which the '.join(missing)}"] if missing else []
-    if unknown:
-        names = ", which ".join(f"{chosen[q].name!r} ({q})" for q in unknown)
-        questions.append(f"which unit has {names}")
-    questions += sensitivities
-    if timeless:
-        questions.append(
-            "what is the sampling rate, Hz (no column can be the time; with any other rate "
-            "dynamics, creep and correlation times mean nothing)"
-        )
-    extent = float(np.ptp(ranges[clock.name])) if clock and clock.name in ranges else 0.0
-    rates = f"{clock.name!r} is {rates_by_unit(clock.size, extent)}. " if clock and extent else ""
-    problem = f"{where}: {', and '.join(questions)}? {rates}{listing}"
-    fs = source.stated_rate(1000.0) if timeless else naming.fs
-    return ColumnsError(problem, columns, units, fs=fs)
-
-
-def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[str]:
-    """Add a guess of the units that are open; return questions for those that a file states."""
-    questions = []
-    for quantity, series in proposed.items():
-        guess = _guess(series.label, quantity)
-        foreign = _foreign_unit(series, quantity)
-        if foreign and quantity not in units:  # as of a sensor's volts
-            questions.append(f"how many {guess} is 1 {foreign} of {series.name!r}")
-            guess = f"1 {guess}"
-        units.setdefault(quantity, guess)
-    return questions
-
-
-def _finite(series: Series) -> FloatArray:
-    """Return the finite numbers of a series; none of one that has something else but words."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)
-            values = series.numbers("", readings=True).astype(np.float64)
-    except InputError:
-        return np.empty(0)
-    return values[np.isfinite(values)] + 0.0
-
-
-def _ranges(series: Sequence[Series]) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest number of each series of numbers, of the first forty."""
-    values = {s.name: _finite(s) for s in series[:40]}
-    return {name: (v.min(), v.max()) for name, v in values.items() if v.size}
-
-
-def _listed(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) -> str:
-    """List series of equal length with their ranges, the most usual length first."""
-    numbers = [s for s in series if s.name in ranges]
-    listed = []
-    for size, _ in Counter(s.size for s in numbers).most_common():
-        names = [s.name for s in numbers if s.size == size]
-        texts = [f"{name!r} ({_span(*ranges[name])})" for name in names[:12]]
-        listed.append(f"{size} values each: {', '.join(texts)}{', ...' * (len(names) > 12)}")
-    return f"There are {'; '.join(listed)}" if listed else "There are no series of numbers"
-
-
-def _span(low: float, high: float) -> str:
-    """Write a range with digits that tell its ends apart, if they differ."""
-    digits = 4
-    while low != high and float(f"{low:.{digits}g}") == float(f"{high:.{digits}g}"):
-        digits += 1
-    # Two more: how long a record is, not only that it has a length.
-    digits += 2 * (digits > 4)
-    return f"{low:.{digits}g} to {high:.{digits}g}"

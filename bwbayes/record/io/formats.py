@@ -29,6 +29,7 @@ from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.record.io.netcdf import read_netcdf
+from bwbayes.record.io.pair import select_pair
 from bwbayes.record.io.series import Source, array_source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
@@ -50,6 +51,7 @@ def read_record(
     units: Mapping[str, str] | None = None,
     fs: float | None = None,
     table: int | str | None = None,
+    displacement_file: str | Path | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -77,6 +79,8 @@ def read_record(
     table : int or str
         Of a workbook or text with several tables the one that counts: its number, from 1 on, or
         the sheet's name.
+    displacement_file : path
+        The file with the displacement, if ``path`` has the voltage alone.
 
     Raises
     ------
@@ -94,7 +98,9 @@ def read_record(
     if voltage_is is not None:
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
-    content = read_table(path, Naming(columns or {}, units or {}, fs, table), needed)
+    other = None if displacement_file is None else Path(displacement_file)
+    naming = Naming(columns or {}, units or {}, fs, table, other)
+    content = read_table(path, naming, needed)
     record = Record(**record_fields(content, voltage_is, need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() not in _TEXT or not truth_path.exists():
@@ -131,7 +137,10 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
     InputError
         The file cannot be read, or a column that is needed is not known.
     """
-    return select(read_source(path, naming.table), naming, needed)
+    if naming.displacement_file is None:
+        return select(read_source(path, naming.table), naming, needed)
+    files = {"voltage": path, "displacement": naming.displacement_file}
+    return select_pair({q: read_source(f, naming.table) for q, f in files.items()}, naming)
 
 
 def read_source(path: Path, table: int | str | None = None) -> Source:

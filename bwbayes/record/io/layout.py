@@ -1,7 +1,7 @@
 """How the numbers stand in a text: between which separators, from which line on, below which names.
 
-Commas, semicolons, tabs, bars or blanks separate the columns. The line above the numbers names the
-columns; a second line may hold their units.
+Commas, semicolons, tabs, bars or blanks separate the columns, if there are several. The line above
+the numbers names the columns; a second line may hold their units.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     for candidate in SEPARATORS if rows else ():
         split = [cells_of(line, candidate) for line in rows]
         width = Counter(map(len, split)).most_common(1)[0][0]
-        if width < 2:
+        if width < 2 or (candidate == "," and _is_one_with_decimals(split)):
             continue
         whole = [row for row in split if len(row) == width]
         numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in whole])
@@ -70,6 +70,10 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         if share > best and numeric_columns:
             best, separator, fields, columns = share, candidate, width, numeric_columns
             whole_columns = np.flatnonzero(numeric.all(axis=0)).tolist()
+    # A column alone has no separator; as none of its cells has tabs, they are as good as any.
+    alone = [_NUMBER.fullmatch(line.strip(' "')) is not None for line in rows]
+    if not columns and np.mean([False, *alone]) > 0.5:
+        separator, fields, columns = "\t", 1, [0]
     in_a_row: list[int] = []
     for index, line in enumerate(lines if columns else []):
         if not line.strip():
@@ -87,6 +91,12 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         del in_a_row[0], below[0]
     empty = frozenset(i for i in range(fields) if not "".join(below[0][i : i + 1]))
     return Layout(separator, fields, in_a_row[0], empty)
+
+
+def _is_one_with_decimals(rows: Sequence[list[str]]) -> bool:
+    """Tell whether commas are those of decimals in one column: no second number begins with 0."""
+    pairs = [row for row in rows if len(row) == 2]
+    return len(pairs) > 0.5 * len(rows) and any(re.fullmatch(r"0\d+", row[1]) for row in pairs)
 
 
 def _is_numbering(rows: Sequence[list[str]]) -> bool:

@@ -109,8 +109,8 @@ class Source:
     notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     lines: Sequence[int] = ()
 
-    def stated_rate(self, default: float = 0.0) -> float:
-        """Return the sampling rate, Hz, that is stated beside the series, or the default."""
+    def stated_rate(self) -> float:
+        """Return the sampling rate, Hz, that is stated beside the series, or 0."""
         texts = {n.lower(): t for notes in self.notes.values() for n, t in notes.items()}
         for series in self.series:
             if series.size == 1 and series.label.lower() in RATES:
@@ -122,7 +122,7 @@ class Source:
                 text = texts.get(name, "").strip(" ,;\t").removesuffix("Hz").removesuffix("s")
                 if 0 < float(text) < np.inf:
                     return float(float(text) ** power)
-        return default
+        return 0.0
 
 
 def vectors(

@@ -114,7 +114,7 @@ def text_source(
         for number, line in enumerate(lines[layout.first :], start=layout.first + 1)
         if line.strip(" ")
         and line not in heading
-        and (line[0] not in "#%" or len(cells_of(line, layout.separator)) == layout.fields)
+        and (line[0] not in "#%" or len(cells_of(line, layout.separator)) == layout.fields > 1)
     ]
     numbered = _samples(path, numbered, layout, len(names), is_whole=is_whole)
     numbers, body = [n for n, _ in numbered], [line for _, line in numbered]
