@@ -29,6 +29,7 @@ class ExitStatus(IntEnum):
     NOT_CONVERGED = 4
     VALIDATION_INCONCLUSIVE = 5
     INTERRUPTED = 130
+    UNREAD = 141
 
 
 class InputError(ValueError):

@@ -3,7 +3,8 @@
 Exit status 0: success. 2: invalid input, said in one line. 3: converged, but validation failed: the
 bands do not hold on a record that was measured, fitted or not. 4: not converged, or calibration
 failed. 5: converged, but validation is inconclusive. 130: interrupted; what was computed is kept.
-Commands that build on a run end with the status of that run.
+141: nobody reads its output any more, as behind `head`; a run can be resumed. Commands that build
+on a run end with the status of that run.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ def cli() -> None:
     """Bayesian uncertainty of piezoelectric actuators with the Bouc-Wen hysteresis model.
 
     Exit status: 0 success; 2 invalid input; 3 validation failed; 4 not converged or calibration
-    failed; 5 validation inconclusive; 130 interrupted. Commands that build on a run end with the
-    status of that run.
+    failed; 5 validation inconclusive; 130 interrupted; 141 output no longer read. Commands that
+    build on a run end with the status of that run.
     """
 
 
@@ -149,6 +150,8 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         line, status = _failure(error)
         click.echo(line, err=True)
+    except SystemExit:  # click's own, without a word, where nobody reads the output any more
+        status = ExitStatus.UNREAD
     # All that is left ends with the process: to look through it once more takes a second.
     gc.freeze()
     sys.exit(status if isinstance(status, int) else 0)
