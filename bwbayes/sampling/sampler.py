@@ -262,7 +262,9 @@ class _Sampling:
                 return None
             is_hopeless = latest.covered and latest.steps_needed > 4 * budget * plan.block
             if is_hopeless and at_end and not is_early:
-                why = f"about {latest.steps_needed:.0f} steps are needed: {'; '.join(missing)}"
+                most, steps = 100 * plan.most_steps, latest.steps_needed
+                about = f"about {steps:.0f}" if steps < most else f"more than {most}"
+                why = f"{about} steps are needed: {'; '.join(missing)}"
                 return Outcome(False, f"step limit {plan.most_steps} out of reach: {why}", latest)
             first = not latest.shortcomings(plan.ess, FIRST_PART)
             ess = latest.lowest_ess
@@ -318,9 +320,8 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     """
     fraction = 1.0 if passed else FIRST_PART
     with np.errstate(divide="ignore"):
-        steps = np.maximum(
-            latest.steps * plan.ess / latest.lowest_ess, LENGTH * np.max(latest.autocorrelation)
-        )
+        draws = np.divide(latest.steps * plan.ess, latest.lowest_ess)  # of none, where none moves
+        steps = np.maximum(draws, LENGTH * np.max(latest.autocorrelation))
     following = max(fraction * steps / plan.block, APART * passed)
     if not following > blocks:  # nan too
         following = LEAST_STRETCH * blocks

@@ -109,7 +109,7 @@ class ChainFile(Chain):
             It is damaged further on; the blocks before that are read.
         """
         if not path.exists():
-            raise InputError(f"{path}: the chain does not exist; run again")
+            raise InputError(f"{path}: the chain does not exist; resume the run")
         chain: ChainFile | None = None
         try:
             load = partial(_load, path)
@@ -119,7 +119,8 @@ class ChainFile(Chain):
             damage = one_line(str(error)) or type(error).__name__
             if chain is None:
                 raise InputError(
-                    f"{path}: the chain cannot be read ({damage}); run again"
+                    f"{path}: the chain cannot be read ({damage}); delete it and resume the run, "
+                    "which samples anew"
                 ) from None
             n_blocks = sum(len(chain.history(phase)) for phase in PHASES)
             warnings.warn(

@@ -12,9 +12,10 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.diagnostics import Check, Outcome
+from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
-from bwbayes.sampling.sampler import FIRST_CHECK, sample
+from bwbayes.sampling.sampler import FIRST_CHECK, _next_check, sample
 from tests.sampling.samplings import (
     PLAN,
     POSTERIOR,
@@ -91,3 +92,10 @@ def test_without_any_proposal_differential_evolution_goes_on(
 def test_a_plan_that_cannot_be_is_refused(change: dict[str, int], says: str) -> None:
     with pytest.raises(InputError, match=says):
         new_chain(replace(PLAN, **change))
+
+
+def test_a_chain_without_an_effective_draw_is_looked_at_again() -> None:
+    """As where no walker moves; needed steps are said up to a hundred times the budget."""
+    nothing = np.zeros(2)
+    still = Check(50, nothing, nothing, nothing, nothing, np.full(2, np.nan), 0.0, 96)
+    assert _next_check(SamplingPlan(), 2, 0, still) == 3

@@ -153,11 +153,11 @@ def test_another_file_in_place_of_the_start_is_refused(
     whole: Path, tmp_path: Path, content: bytes
 ) -> None:
     path = tmp_path / "chain"
-    with pytest.raises(InputError, match=f"^{path}: the chain does not exist; run again$"):
+    with pytest.raises(InputError, match=f"^{path}: the chain does not exist; resume the run$"):
         ChainFile.read(path)
     shutil.copytree(whole, path)
     (path / "start.npz").write_bytes(content)
-    with pytest.raises(InputError, match=f"^{path}: the chain cannot be read .*; run again$"):
+    with pytest.raises(InputError, match=f"^{path}: the chain cannot be read .*; delete it "):
         ChainFile.read(path)
 
 
