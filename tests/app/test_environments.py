@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
+import bwbayes as bw
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, InputWarning
+from tests.app import small
 
 
 def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -42,6 +47,33 @@ def test_a_reader_that_has_gone_is_no_error(stream: str) -> None:
     command = f"{sys.executable} -m bwbayes models {stream}"
     ended = subprocess.run(["sh", "-c", command], capture_output=True, check=False)
     assert ended.stderr == b""
+
+
+@pytest.mark.parametrize("command", [["models"], ["run", "small.toml", "--quiet"]])
+def test_what_nobody_reads_ends_as_a_broken_pipe_does(tmp_path: Path, command: list[str]) -> None:
+    """With 128 + SIGPIPE and no word; what prints nothing comes to its own end."""
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write) as closed:
+        ended = subprocess.run(
+            [sys.executable, "-m", "bwbayes", *command],
+            cwd=tmp_path, stdout=closed, stderr=subprocess.PIPE, check=False,
+        )  # fmt: skip
+    assert ended.returncode == (0 if "--quiet" in command else 141)
+    assert ended.stderr == b""
+
+
+def test_a_run_behind_head_is_resumed(tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(small.TEXT)
+    command = f"{sys.executable} -m bwbayes run small.toml --out run | head -n 1"
+    ended = subprocess.run(
+        ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert "rror" not in ended.stderr
+    assert len(ended.stdout.splitlines()) == 1
+    resumed = python("-m", "bwbayes", "resume", str(tmp_path / "run"))
+    assert resumed.returncode == 0, resumed.stderr
 
 
 def test_numba_may_be_switched_off() -> None:
@@ -88,6 +120,35 @@ def test_where_no_process_starts_this_one_computes(tmp_path: Path, broken: str) 
     assert (ended.returncode, ended.stdout) == (0, "3\n"), ended.stderr
     assert ended.stderr.count("no worker process starts") == 1
     assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize(
+    "file", ["result.npz", "chain/start.npz", "chain/sampling-0001.npz", "chain.h5", "posterior.nc"]
+)
+def test_a_run_of_which_a_file_is_cut_off_is_resumed_to_its_end(
+    copy: RunFolder, file: str, share: float
+) -> None:
+    """At once, or after a line that says what to do."""
+    whole = (copy.path / file).read_bytes()
+    (copy.path / file).write_bytes(whole[: int(share * len(whole))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # the chain is damaged
+        if file == "chain/start.npz":
+            with pytest.raises(InputError, match=r"chain cannot be read .*; delete it"):
+                bw.resume(copy.path, progress=False)
+            shutil.rmtree(copy.chain)
+        assert bw.resume(copy.path, progress=False).converged
+    assert copy.numbers()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("file", ["records/record.h5", "config.toml"])
+def test_what_a_run_is_about_is_not_made_up(copy: RunFolder, file: str, share: float) -> None:
+    whole = (copy.path / file).read_bytes()
+    (copy.path / file).write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(InputError, match=re.escape(str(copy.path / file))):
+        bw.resume(copy.path, progress=False)
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"a": 1', "[]", "\0"])
