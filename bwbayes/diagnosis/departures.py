@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
+from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
@@ -173,6 +174,11 @@ class Standardized:
             if slow > max(0.05 * extent, fast) and extent:
                 reasons.append(f"NRMSE {percent(rms / extent)} on the training readings")
         square = float(np.mean(self.z**2))
+        # A model that follows rounded readings exactly misses less than rounding would.
+        assert self.bands.measured is not None
+        if rounding := rounding_sd(self.bands.measured[self.scored]):
+            widths = np.maximum(self.bands.sd("sensor")[self.scored], rounding)
+            square = max(square, float(np.mean((rounding / widths) ** 2)))
         chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
         if square < 0.25 and chance < ALARM:
             ratio = 1 / max(np.sqrt(square), 1e-9)

@@ -60,6 +60,8 @@ def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
     share that is done.
     """
     best: dict[str, Explanation] = {}
+    if scene.posterior.only.is_followed(scene.fit.displacement):
+        return ()
     rough = scene.with_rough_noise()
     kinds = ADDITIONS + CHANGES
     for number, kind in enumerate(kinds):

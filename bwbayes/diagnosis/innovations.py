@@ -34,7 +34,8 @@ class Innovations:
 
     All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
     ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
-    the noise model for that interval, and ``parameters`` (parameters,) are its own.
+    the noise model for that interval, and ``parameters`` (parameters,) are its own. ``followed``
+    tells that the residual is no larger than that of rounding, and shows nothing.
     """
 
     __repr__ = brief
@@ -47,6 +48,7 @@ class Innovations:
     interval: float
     noise: Noise
     parameters: FloatArray
+    followed: bool = False
 
     def noise_density(self, frequency: FloatArray) -> FloatArray:
         """Return the noise model's amplitude spectral density (frequencies,), um/√Hz, one-sided."""
@@ -152,12 +154,13 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
         interval * readings.stride,
         noise,
         parameters[0],
+        record.is_followed(readings.values - residual[0]),
     )
 
 
 def departures(series: Innovations) -> tuple[Finding, ...]:
     """Return where the innovations depart from what the noise model assumes."""
-    if series.white.size < 100:  # these show nothing
+    if series.white.size < 100 or series.followed:  # these show nothing
         return ()
     findings = []
     # The octave that tells most against white innovations, if its power is off by a fifth.

@@ -26,6 +26,7 @@ from bwbayes.diagnosis.series_patterns import (
     scatter,
     spikes,
 )
+from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
@@ -39,8 +40,8 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     Findings are "unlikely units", "no relation", "late voltage", "late displacement",
     "reversed sign", "swapped columns", "few readings", "coarse sampling", "one amplitude",
     "held readings", "repeated samples", "clipping", "coarse resolution", "jump", "spikes",
-    "switch-on transient", "drift" and "no hysteresis". A planned voltage is looked at for its own
-    sake alone.
+    "switch-on transient", "drift", "no hysteresis" and "no noise". A planned voltage is looked at
+    for its own sake alone.
 
     Examples
     --------
@@ -85,6 +86,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
             *(transient if late is None else [late]),
             *_drift(record, loop),
             *_no_hysteresis(record, loop),
+            *_no_noise(record),
         ]
     return tuple(findings)
 
@@ -280,6 +282,14 @@ def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
         text = "a curve and a lag explain rising and falling voltage alike, over these volts"
         fix = 'hysteresis = "linear" under [model]'
         yield _whole(record, "no hysteresis", text, fix)
+
+
+def _no_noise(record: Record) -> Iterator[Finding]:
+    """Find readings without noise, as of a simulation or of a sensor coarser than its noise."""
+    if sd := rounding_sd(_readings(record)):
+        text = f"the readings show no noise but rounding, which has an SD of {sd:.2g} um"
+        fix = "record with a finer resolution; add the sensor's noise to simulated readings"
+        yield _whole(record, "no noise", text, fix)
 
 
 def _leads(voltage: FloatArray, displacement: FloatArray) -> bool | None:

@@ -13,6 +13,7 @@ explicit numbers, which a run prints and stores.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.reversals import time_between_turns
+from bwbayes.record.voltage_path import noise_sd, rounding_step
 
 
 def ranges_of(
@@ -44,7 +46,21 @@ def ranges_of(
         bias=float(np.min(volts) + np.max(volts)) / 2,
         interval=interval,
         duration=volts.size * interval,
+        rounding=rounding_sd(readings[~np.isnan(readings)]),
     )
+
+
+def rounding_sd(readings: FloatArray) -> float:
+    """Return the sd of the rounding of readings (readings,) that show no other noise, um; else 0.
+
+    Numbers that are multiples of a step q are rounded to it, with an sd of q/√12; others to 2⁻²⁴ of
+    their range, of which no converter resolves less. The likelihood of a model that follows them
+    exactly has no bound where the sensor's sd may be less.
+    """
+    step = max(rounding_step(readings), 2.0**-24 * float(np.ptp(readings)))
+    rounding = step / math.sqrt(12)
+    enough = readings.size > 10  # for differences of the highest order
+    return rounding if enough and noise_sd(readings)[0] < 1.1 * rounding else 0.0
 
 
 def joined(records: Sequence[Ranges]) -> Ranges:
@@ -67,4 +83,5 @@ def joined(records: Sequence[Ranges]) -> Ranges:
         bias=(high + low) / 2,
         interval=min(record.interval for record in records),
         duration=max(record.duration for record in records),
+        rounding=min(record.rounding for record in records),
     )

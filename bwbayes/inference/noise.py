@@ -13,17 +13,27 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.state_space import Noise
-from bwbayes.model.declaration import Declaration, lognormal
+from bwbayes.model.declaration import Context, Declaration, lognormal, rounded
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import made
+
+
+def _sensor_sd(context: Context) -> Distribution:
+    """Return the default prior of the sensor's sd; where rounding alone is seen, above its sd."""
+    if not (rounding := rounded(context.ranges.rounding)):
+        return lognormal(0.006 * context.ranges.displacement, 2.0)
+    # What is seen may be all there is; a model that misses some of it needs many times that.
+    return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
+
 
 SENSOR_SD = Declaration(
     "sensor_sd",
     "um",
     r"s",
     "sd of the sensor noise",
-    lambda context: lognormal(0.006 * context.ranges.displacement, 2.0),
+    _sensor_sd,
     floor=0.0,
+    pressed={"lower": "record with a finer resolution; the readings show no noise but rounding"},
     aliases=("noise",),
 )
 DISCREPANCY_SD = Declaration(

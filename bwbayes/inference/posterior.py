@@ -18,6 +18,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
+from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.parameter_table import ParameterTable
@@ -90,6 +91,14 @@ class Dataset:
     def extent(self) -> float:
         """Range of the readings that enter the likelihood, um."""
         return float(np.ptp(self.readings.values))
+
+    def is_followed(self, displacement: FloatArray) -> bool:
+        """Tell whether a displacement (readings,), um, misses no more than rounding would.
+
+        Where readings show no noise nothing else is left to learn from what it misses.
+        """
+        values = self.readings.values
+        return float(np.std(values - displacement)) < rounding_sd(values)
 
     def likelihood(self, engine: Engine) -> Likelihood:
         """Return the likelihood of the record."""

@@ -35,7 +35,8 @@ class Ranges:
     ``voltage`` is U, half the range of the voltage, V; ``displacement`` is Y, um; ``middle`` the
     middle of the displacement's range, um; ``time`` is T, the typical time between turning points
     of the drive, s; ``bias`` the middle of the voltage's range, V; ``interval`` between samples and
-    ``duration`` of the record, s.
+    ``duration`` of the record, s. ``rounding`` is the sd of the rounding of readings that show no
+    other noise, um; 0 where they show some.
     """
 
     voltage: float
@@ -45,6 +46,7 @@ class Ranges:
     bias: float = 0.0
     interval: float = 0.0
     duration: float = 0.0
+    rounding: float = 0.0
 
     @property
     def gain(self) -> float:

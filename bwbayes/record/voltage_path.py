@@ -136,7 +136,7 @@ def rounding_step(voltage: FloatArray) -> float:
     """Return the step of which all differences of a voltage are multiples, V, or 0."""
     gaps = np.diff(np.unique(voltage))
     gaps = gaps[gaps > 1e-6 * np.ptp(voltage)]  # not the rounding of doubles
-    if gaps.size < 2:
+    if not gaps.size:
         return 0.0
     multiples = gaps / gaps.min()
     return float(gaps.min()) if np.all(np.abs(multiples - np.rint(multiples)) < 0.02) else 0.0

@@ -331,3 +331,18 @@ def test_every_spike_counts_once_and_its_neighbors_do_not(seed: int, pairs: bool
     planted = np.sort(np.concatenate([planted, planted + 1])) if pairs else planted
     values[planted] += 25.0 * generator.choice([-1, 1])
     assert planted.tolist() == spikes(values, 0.6 * voltage, 1.2).tolist()
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3, 0.1])
+def test_readings_without_noise_are_named_and_those_with_some_are_not(step: float) -> None:
+    """Those of a simulation, rounded or not: noise of one step is enough to say nothing."""
+    time = np.arange(0, 6, 2e-3)
+    voltage = 100 * np.exp(-0.2 * time) * np.sin(2 * np.pi * time)
+    clean = hysteresis(drawn(np.random.default_rng(0)), voltage)
+    noise = max(step, 1e-4) * np.random.default_rng(1).standard_normal(clean.size)
+
+    def rounded(values: FloatArray) -> FloatArray:
+        return step * np.round(values / step) if step else values
+
+    assert len(findings("no noise", voltage, rounded(clean))) == 1
+    assert [] == findings("no noise", voltage, rounded(clean + noise))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.defaults import ranges_of
+from bwbayes.inference.defaults import joined, ranges_of, rounding_sd
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
@@ -55,7 +55,8 @@ def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
     every: int, amplitude: float, bias: float
 ) -> None:
     voltage = drive(amplitude, bias=bias)
-    reading = displacement(voltage)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(voltage.size)
+    reading = displacement(voltage) + noise
     whole = ranges_of(voltage, reading, 1e-3)
     part = ranges_of(voltage[::every], reading[::every], every * 1e-3)
     for name in NAMES:
@@ -152,3 +153,35 @@ def test_a_default_prior_goes_with_the_units(name: str, exponent: float) -> None
     for k, m in ((1000.0, 1.0), (1.0, 0.001), (0.03, 7.0)):
         grown = half_width(name, exponent, k, m) / half_width(name, exponent)
         np.testing.assert_allclose(k**of_k * m**of_m, grown, rtol=0.01)
+
+
+@settings(deadline=None, max_examples=30)
+@given(digits=st.integers(0, 3), scale=st.floats(0.1, 10), seed=st.integers(0, 9))
+def test_readings_without_noise_have_that_of_rounding(digits: int, scale: float, seed: int) -> None:
+    """Of q/√12 in multiples of q, of 2⁻²⁴ of the range in others; none is said of noisy readings.
+
+    Scaled readings have a scaled rounding.
+    """
+    clean = scale * displacement(drive(interval=2e-3), 2e-3)
+    finest = 2.0**-24 * np.ptp(clean) / np.sqrt(12)
+    assert rounding_sd(clean) == pytest.approx(finest)
+    step = scale * 10.0**-digits
+    rounded = step * np.round(clean / step)
+    assert rounding_sd(rounded) == pytest.approx(step / np.sqrt(12), rel=1e-6)
+    noise = np.random.default_rng(seed).standard_normal(clean.size)
+    assert rounding_sd(clean + 1e-4 * np.ptp(clean) * noise) == 0
+    assert rounding_sd(step * np.round((clean + step * noise) / step)) == 0
+
+
+def test_a_record_without_noise_has_a_sensor_as_good_as_its_rounding_at_best() -> None:
+    """Its density would have no bound; several records have a sensor of the finest of them."""
+    voltage = drive()
+    clean = displacement(voltage)
+    noise = 0.1 * np.random.default_rng(0).standard_normal(clean.size)
+    exact, rounded, noisy = (
+        ranges_of(voltage, readings, 1e-3)
+        for readings in (clean, np.round(clean, 2), clean + noise)
+    )
+    assert prior("sensor_sd", rounded).support[0] == pytest.approx(0.01 / np.sqrt(12), rel=0.01)
+    assert prior("sensor_sd", joined([exact, rounded])).support == prior("sensor_sd", exact).support
+    assert prior("sensor_sd", joined([rounded, noisy])).support[0] == 0
