@@ -110,6 +110,30 @@ def _pandas(folder: Path, kind: str) -> tuple[h5py.File, h5py.Group]:
 NAMES = ("time_s", "voltage_V", "displacement_um")
 
 
+def _tektronix(folder: Path, columns: list[Any], names: str, units: str) -> Path:
+    head = [
+        *("Model,MSO44", "Firmware Version,1.2.3", "Horizontal Units,s", "Horizontal Scale,0.4"),
+        *(f"Sample Interval,{INTERVAL}", f"Record Length,{SAMPLES}", "Gating,0.0% to 100.0%"),
+        *("Probe Attenuation,10,1", f"Vertical Units,{units}", "Vertical Offset,0,0", ","),
+        *("Label,Monitor,Sensor", names),
+    ]
+    rows = [",".join(f"{value:.6f}" for value in row) for row in zip(*columns, strict=True)]
+    (folder / "a.csv").write_text("\n".join([*head, *rows, ""]))
+    return folder / "a.csv"
+
+
+@_maker("oscilloscope, units and rate above the header")
+def _(folder: Path) -> Written:
+    path = _tektronix(folder, COLUMNS, "TIME,CH1,CH2", "V,um")
+    return Written(path, {"voltage": "CH1", "displacement": "CH2"})
+
+
+@_maker("oscilloscope, rate above the header in place of times")
+def _(folder: Path) -> Written:
+    path = _tektronix(folder, COLUMNS[1:], "CH1,CH2", "V,um")
+    return Written(path, {"voltage": "CH1", "displacement": "CH2"})
+
+
 @_maker("pandas to HDF5, fixed")
 def _(folder: Path) -> Written:
     file, frame = _pandas(folder, "frame")

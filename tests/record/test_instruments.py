@@ -176,3 +176,16 @@ def test_tdms_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(__import__("sys").modules, "nptdms", None)
     with pytest.raises(InputError, match=r"npTDMS; pip install 'bwbayes\[tdms\]'"):
         read_record(path)
+
+
+def test_a_rate_above_the_header_is_asked_for_unless_the_length_beside_it_is_right(
+    tmp_path: Path,
+) -> None:
+    """Else the preamble may be that of another record; the units stand in any case."""
+    written = MAKERS["oscilloscope, rate above the header in place of times"](tmp_path)
+    text = written.path.read_text()
+    for length in ("Record Length,599", "Points,600"):
+        written.path.write_text(text.replace("Record Length,600", length))
+        with pytest.raises(ColumnsError, match="sampling rate") as caught:
+            read(written)
+        assert ({}, 200.0) == (caught.value.guess["units"], caught.value.fs)

@@ -39,7 +39,8 @@ from bwbayes.record.io.layout import (
     find_layout,
     split_header,
 )
-from bwbayes.record.io.series import RATES, Clock, Series, Source, in_seconds
+from bwbayes.record.io.preamble import clock_above, settings_in, stated_above, with_units
+from bwbayes.record.io.series import Clock, Series, Source, in_seconds
 from bwbayes.record.io.tables import index_of, tables_of
 from bwbayes.record.record import Record
 
@@ -93,13 +94,9 @@ def text_source(
     layout = find_layout(path, lines)
     names, units, header = find_header(path, lines, layout)
     above = lines[: layout.first if header is None else header]
-    notes = {}
-    for line in above:
-        key, sign, value, *_ = [*re.split(r"([:=,;\t])", line, maxsplit=1), "", ""]
-        key = re.sub(r"\W+", "_", re.sub(r"\(.*", "", key)).strip("_").lower()
-        if (line.startswith("#") and sign in ("=", ":")) or key in RATES:
-            notes["voltage_is" if key == "voltage" else key] = value.strip()
-    scope_clock, settings = _settings(names, units)
+    notes, preamble = stated_above(above)
+    units = with_units(units, preamble)
+    scope_clock, settings = settings_in(names, units)
     notes |= settings
     # As data recorders of PI write them.
     names = [notes.get(f"name{i}", name) for i, name in enumerate(names)]
@@ -122,6 +119,7 @@ def text_source(
         first = min(set(range(layout.first + 1, len(lines) + 1)) - set(numbers))
         remark = f"{path}:{first}: {skipped} line{'s' * (skipped > 1)} among the numbers skipped"
         warnings.warn(one_line(remark), InputWarning, stacklevel=4)
+    scope_clock = scope_clock or clock_above(notes, preamble, len(body))
     frame, marks = _parsed(path, body, layout)
     names = _different(path, names, frame)
     series = []
@@ -141,22 +139,6 @@ def text_source(
             )
         )
     return Source(path, tuple(series), {"": notes}, numbers)
-
-
-def _settings(names: Sequence[str], units: Sequence[str]) -> tuple[Clock | None, dict[str, str]]:
-    """Return the clock that oscilloscopes write into the header, if they do, and such numbers.
-
-    As a number below its name, ``Increment``, or behind it, ``tInc = 1e-6``.
-    """
-    settings = {}
-    for name, unit in zip(names, units, strict=True):
-        key, _, value = name.partition("=")
-        with suppress(ValueError):
-            text = (value or unit).strip().removesuffix("s")
-            settings[key.strip().lower()] = repr(float(text))
-    rate = Source(Path(), (), {"": settings}).stated_rate()
-    start = float(settings.get("start", settings.get("t0", "0")))
-    return Clock(1 / rate, start) if rate else None, settings
 
 
 def _different(path: Path, names: Sequence[str], frame: pd.DataFrame) -> list[str]:
