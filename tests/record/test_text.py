@@ -270,8 +270,14 @@ def test_decimals_of_three_digits_are_no_thousands(tmp_path: Path) -> None:
     for separator, decimal in ((",", "."), (";", "."), (";", ",")):
         rows = [f"{i}|{1 + i / 7:.3f}|{7 + np.sin(i):.3f}" for i in range(500)]
         rows = [row.replace(".", decimal).replace("|", separator) for row in rows]
-        record = read(tmp_path, lines("time_ms,voltage_V,displacement_um", *rows))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            record = read(tmp_path, lines("time_ms,voltage_V,displacement_um", *rows))
         assert 1.143 == record.voltage[1]
+        # Which reading was taken is said, unless commas between columns leave no other.
+        said = [str(remark.message) for remark in caught]
+        expected = f"1{decimal}000 is read as 1.000; write numbers without marks"
+        assert [expected in text for text in said] == [True] * (separator != ",")
 
 
 def test_whole_numbers_with_marks_alone_are_said_to_be_such(tmp_path: Path) -> None:
@@ -279,6 +285,29 @@ def test_whole_numbers_with_marks_alone_are_said_to_be_such(tmp_path: Path) -> N
     with pytest.warns(InputWarning, match="csv: 1,000 is read as 1000; write numbers without"):
         record = read(tmp_path, lines("time_ms;voltage_mV;displacement_nm", *rows))
     assert 2.9 == record.voltage[-1]
+
+
+@given(
+    order=st.sampled_from(["names, units", "units, names"]),
+    settings=st.lists(
+        st.sampled_from(["Vertical Units,CH1:V", "Model Number,SDS1204", "Source,CH1,CH2"]),
+        min_size=2,
+        max_size=4,
+    ),
+    comma=st.sampled_from(["", ","]),
+)
+def test_units_may_stand_above_names_below_settings(
+    tmp_path_factory: pytest.TempPathFactory, order: str, settings: list[str], comma: str
+) -> None:
+    """As oscilloscopes write them, each line of the header with a comma at its end or without."""
+    head = ["time,voltage,displacement", "s,V,um"][:: 1 if order == "names, units" else -1]
+    head = [*(settings if order == "units, names" else []), *head]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        record = read(
+            tmp_path_factory.getbasetemp(), lines(*(f"{line}{comma}" for line in head), *ROWS)
+        )
+    assert record.sha256 == read(tmp_path_factory.getbasetemp(), GOOD).sha256
 
 
 @pytest.mark.parametrize(

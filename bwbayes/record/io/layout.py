@@ -157,7 +157,9 @@ def find_header(
     # From the numbers upwards: comments, units and names, or names alone.
     used = rows[:1]
     if unit_row is not None:
-        used = rows[unit_row : unit_row + 2] if rows[unit_row + 1 :] else rows[: unit_row + 1][-2:]
+        # Names stand above units as a file's first such line; below settings, beneath the units.
+        is_below = unit_row > 0 and len(rows) != unit_row + 2
+        used = rows[: unit_row + 1][-2:] if is_below else rows[unit_row : unit_row + 2]
     units = rows[unit_row][1] if unit_row is not None else []
     names = next((cells for _, cells in used[::-1] if cells is not units), [])
     first = used[-1][0] if used else None

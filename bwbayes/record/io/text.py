@@ -278,7 +278,8 @@ def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFra
         )
 
     try:
-        marks = _shown_marks(text, layout.separator) or _likely_marks(path, read(".", None, str))
+        marks = _shown_marks(text, layout.separator)
+        marks = marks or _likely_marks(path, read(".", None, str), layout.separator)
         frames = [(read(*pair), pair) for pair in marks]
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {one_line(str(error))[:200]}; write it again") from None
@@ -318,29 +319,39 @@ def _shown_marks(text: str, separator: str) -> list[Marks]:
     return [(mark, None) for mark in (".," if shown else "." * (not grouped))]
 
 
-def _likely_marks(path: Path, cells: pd.DataFrame) -> list[Marks]:
+def _likely_marks(path: Path, cells: pd.DataFrame, separator: str) -> list[Marks]:
     """Return the decimal mark and that of thousands of numbers that show none.
 
     Decimals do not always have three digits: if a column has numbers below 1,000 without a mark,
-    and none above, the mark is that of thousands.
+    and none above, the mark is that of thousands. Else it is that of decimals, as usual.
 
     Warns
     -----
     InputWarning
-        If it is taken for that of thousands.
+        Of what a number is read as, but for decimal points beside commas that separate columns.
     """
+    columns = [column.dropna().str.strip() for _, column in cells.items()]
+    read: tuple[str, str] | None = None
+    taken: list[Marks] = [(".", None), (",", None)]
     for mark, other in (".,", ",."):
-        for _, column in cells.items():
-            text = column.dropna().str.strip()
+        for text in columns:
             is_grouped = text.str.fullmatch(_GROUPED.format(mark))
             is_small = text.str.fullmatch(r"[+-]?\d{1,3}")
-            if is_grouped.any() and is_small.any() and (is_grouped | is_small).all():
-                example = text[is_grouped].iloc[0]
-                remark = f"{path}: {example} is read as {example.replace(mark, '')}"
-                advice = "write numbers without marks between thousands if that is wrong"
-                warnings.warn(one_line(f"{remark}; {advice}"), InputWarning, stacklevel=5)
-                return [(other, mark)]
-    return [(".", None), (",", None)]
+            if not is_grouped.any() or not (is_grouped | is_small).all():
+                continue
+            example = text[is_grouped].iloc[0]
+            if is_small.any():
+                read, taken = (example, example.replace(mark, "")), [(other, mark)]
+                break
+            if (mark, separator) != (".", ","):
+                read = read or (example, example.replace(mark, "."))
+        if taken == [(other, mark)]:
+            break
+    if read is not None:
+        remark = f"{path}: {read[0]} is read as {read[1]}"
+        advice = "write numbers without marks between thousands if that is wrong"
+        warnings.warn(one_line(f"{remark}; {advice}"), InputWarning, stacklevel=5)
+    return taken
 
 
 def _numbers(
