@@ -34,10 +34,9 @@ from bwbayes.shown import brief
 # about an extreme may lie from the outermost of them.
 WITHIN, ABOUT = 1.5, 3.0
 
-# Parts of the range. Beyond the first, what the path leaves unsure shows in the parameters' sds
-# (tests/README.md); from the second on, in the parameters; what seems noise beyond the third is a
-# voltage that changes too fast for its sampling.
-SURE, REPAIRABLE, LARGEST = 0.002, 0.005, 0.03
+# Parts of the range: from the first on the path is not known well enough for parameters; what
+# seems noise beyond the second is a voltage that changes too fast for its sampling.
+REPAIRABLE, LARGEST = 0.005, 0.03
 
 # The same of a step to which the voltage is rounded: a hold's level is known to half of it.
 COARSE = 0.003
@@ -56,18 +55,22 @@ LINES, ROUNDS = 3, 8
 class VoltagePath:
     """The voltage that moves the actuator, as far as its reading shows it.
 
-    ``voltage`` (samples,), V, is the measured one bit for bit where noise adds nothing to its path.
-    ``noise_sd``, V, is the sd of the noise on it (0: none was found, or nothing to find it by),
-    ``reversals`` the number of its reversals that are real, where there is noise, and ``remark``
-    what to know of it, if anything.
+    ``voltage`` (samples,), V, is the measured one without noise of the sd ``noise_sd``, V; where
+    that is 0, it is the measured one bit for bit. ``remark`` is what to know of it, if anything.
     """
 
     __repr__ = brief
 
     voltage: FloatArray
     noise_sd: float = 0.0
-    reversals: int = 0
     remark: str = ""
+
+    def redrawn(self, generator: np.random.Generator) -> FloatArray:
+        """Return the path (samples,), V, that is estimated of this one with new noise on it."""
+        if self.noise_sd == 0:
+            return self.voltage
+        noise = self.noise_sd * generator.standard_normal(self.voltage.size)
+        return estimate_path(self.voltage + noise).voltage
 
 
 def estimate_path(voltage: FloatArray) -> VoltagePath:
@@ -88,10 +91,13 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         # To round is monotone: that alone adds no reversal.
         if sd == 0 or (settled and sd < 1.1 * step / sqrt(12)):
             return VoltagePath(voltage)
+        if not (settled or searched):
+            remark = "voltage changes too fast for its sampling to tell its noise: none is removed"
+            return VoltagePath(voltage, remark=remark)
         fitted = _fit(u - hum, max(sd, step / 2))
         # The first and the last may not have shown yet that they are real.
-        if settled and not searched and turns(u) <= fitted.reversals + 1:
-            return VoltagePath(voltage, sd, fitted.reversals)
+        if not searched and turns(u) <= fitted.reversals + 1:
+            return VoltagePath(voltage)
         residual = u - hum - fitted.path
         frequency = _line(residual, sd)
         known = any(abs(frequency - other) < 6 / u.size for other in frequencies)
@@ -108,16 +114,13 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         left = size / last if known and last else 0.0
         last = 0.0 if left else size
         hum = hum + (more / (1 - left) if left < 0.95 else more)
-    if not settled:
-        remark = "voltage changes too fast for its sampling to tell its noise: none is removed"
-        return VoltagePath(voltage, remark=remark)
     path = fitted.path + hum
     shown = f"noise of {sd:.2g} V SD ({100 * sd / extent:.2g}% of its range)"
     length = _length(path)
     excess = _length(u) - length
     if excess <= max(HARMLESS * length, DOUBTFUL * fitted.length_sd):
         left_in = f"voltage may have {shown}, which cannot be told from the drive: none is removed"
-        return VoltagePath(voltage, sd, fitted.reversals, left_in * (excess > HARMLESS * length))
+        return VoltagePath(voltage, remark=left_in * (excess > HARMLESS * length))
     remark = (
         f"voltage has {shown}: the model is driven by its estimated path, with {fitted.reversals} "
         f"reversals for {turns(u)}"
@@ -127,9 +130,7 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
             f"voltage has {shown}, too much to repair: do not trust the parameters; measure the "
             'voltage with less noise, or give the command (voltage_is = "command")'
         )
-    elif sd > SURE * extent:
-        remark += "; parameters' SDs may be too small by a factor of 2"
-    return VoltagePath(path + center, sd, fitted.reversals, remark)
+    return VoltagePath(path + center, sd, remark)
 
 
 def rounding_step(voltage: FloatArray) -> float:
