@@ -46,7 +46,8 @@ def predict(
         What is built on.
     record
         The record or its file, at any sampling interval. A file of the same columns as that of the
-        training record is read as that was.
+        training record is read as that was. A voltage without readings is a plan, and drives the
+        model as it is, noise included.
     signal
         A signal to predict instead, by its name.
     name

@@ -30,6 +30,7 @@ from bwbayes.prediction.prediction import forecast, predict_record, predict_wind
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
+from bwbayes.record.voltage_path import estimate_path
 from bwbayes.report.figures import drawn
 from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
@@ -146,12 +147,26 @@ def predict_another(
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
     rest = _from_rest_remark(problem, subset, other, bands, beyond)
+    noise = path.remark or planned_noise(other.record)
     remarks = (
-        *[path.remark] * bool(path.remark),
+        *[noise] * bool(noise),
         *[rest] * bool(rest),
         *(finding.note for finding in beyond),
     )
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
+
+
+def planned_noise(record: Record) -> str:
+    """Say that a planned voltage looks like a measured one; nothing of any other."""
+    if record.displacement is not None or record.voltage_is == "command":
+        return ""
+    sd = estimate_path(record.voltage).noise_sd
+    if sd == 0:
+        return ""
+    return (
+        f"voltage without readings drives the model as it is, with noise of {sd:.2g} V SD; if it "
+        "was measured, give the command"
+    )
 
 
 def _from_rest_remark(
