@@ -42,7 +42,8 @@ class Result:
         All parameters, fixed ones included.
     draws, log_density
         (steps, ensembles, walkers, free), parameters in their own units; (steps, ensembles,
-        walkers), nats.
+        walkers), nats. Where a voltage has noise, the draws are the chain's made wider, and the
+        density is that of the chain's own.
     moves
         How often each kind of move was proposed to a walker for these draws, and accepted.
     bands, scores, verdicts

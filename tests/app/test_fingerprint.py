@@ -31,7 +31,7 @@ def problem(run: Path) -> Problem:
 
 def require(problem: Problem, changed: Config) -> None:
     """Hold a config against the chain of a problem."""
-    noted = {"data_sha256": problem.sha256, "posterior": fingerprint(problem.config)}
+    noted = {"data_sha256": problem.sha256, "posterior": fingerprint(problem)}
     require_own(replace(problem, config=changed), Path("x"), noted)
 
 

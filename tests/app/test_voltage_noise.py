@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +11,16 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
+from bwbayes.app.running.assembling import VOLTAGE_NOISE
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.predictions import planned_noise
+from bwbayes.app.running.run import resume
+from bwbayes.errors import InputError
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record import Record, write_record
+from bwbayes.sampling.chain import draws
+from tests.app import small
 from tests.record.drives import drive
 
 TEXT = (
@@ -61,6 +69,42 @@ def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folde
     np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
     np.testing.assert_array_equal(again.posterior.only.voltage, problem.posterior.only.voltage)
     assert again.remarks == problem.remarks
+
+
+def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(folder: Path) -> None:
+    """And a chain from before the voltage's noise was removed is not read."""
+    text = TEXT + 'hysteresis = "linear"\n[sampling]\ness = 100\nsteps = 200\nblock = 25\n'
+    kept = RunFolder.create(folder / "run", resolve(parse(text, "my.toml"), folder))
+    fit = resume(kept, small.quiet(), workers=1, predict=False)
+    posterior, chain = fit.problem.posterior, fit.chain
+    more = np.array(json.loads(str(chain.attributes()[VOLTAGE_NOISE])))
+    column = posterior.names.index("d")
+    assert more[column, column] > 0.1 * chain.point.covariance[column, column]
+    sampled = draws(posterior, chain).reshape(fit.flat_draws.shape)
+    wider = np.var(posterior.prior.unconstrain(fit.flat_draws)[:, column])
+    before = np.var(posterior.prior.unconstrain(sampled)[:, column])
+    assert wider / before == pytest.approx(
+        1 + more[column, column] / chain.point.covariance[column, column], rel=1e-6
+    )
+    likelihood = posterior.log_likelihood(posterior.prior.theta(sampled[:10]))
+    np.testing.assert_allclose(fit.log_likelihood.ravel()[:10], likelihood)
+    with np.load(kept.chain / "start.npz") as file:
+        arrays = dict(file)
+    noted = json.loads(str(arrays["text"]))
+    old = json.loads(noted["attributes"]["posterior"])
+    del old["voltage of record"]
+    noted["attributes"]["posterior"] = json.dumps(old)
+    np.savez(kept.chain / "start.npz", allow_pickle=False, **arrays | {"text": json.dumps(noted)})
+    with pytest.raises(InputError, match=r"voltage of record was .* start a new run"):
+        resume(kept, small.quiet(), workers=1)
+
+
+def test_noise_on_a_planned_voltage_is_said() -> None:
+    record = noisy_record(1)
+    planned = replace(record, displacement=None)
+    assert "without readings drives the model as it is, with noise of 0.1" in planned_noise(planned)
+    for other in (record, replace(planned, voltage_is="command")):
+        assert not planned_noise(other)
 
 
 def test_a_command_is_what_it_says(folder: Path) -> None:

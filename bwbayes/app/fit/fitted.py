@@ -171,14 +171,17 @@ class Fit(Shown):
     @cached_property
     def flat_draws(self) -> FloatArray:
         """All draws, (draws, free), parameters in their own units."""
-        drawn = draws(self.problem.posterior, self.chain)
+        from bwbayes.app.running.assembling import run_draws
+
+        drawn = run_draws(self.problem, self.chain)
         return drawn.reshape(-1, drawn.shape[-1])
 
     @property
     def log_likelihood(self) -> FloatArray:
         """The log likelihood of each draw, nats, (steps, ensembles, walkers)."""
-        prior, log_density = self.problem.posterior.prior, log_densities(self.chain)
-        _, log_prior = prior.constrain(prior.unconstrain(self.flat_draws))
+        posterior, log_density = self.problem.posterior, log_densities(self.chain)
+        sampled = draws(posterior, self.chain).reshape(-1, len(posterior.names))
+        _, log_prior = posterior.prior.constrain(posterior.prior.unconstrain(sampled))
         return log_density - log_prior.reshape(log_density.shape)
 
     @property

@@ -186,7 +186,7 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
             # A target or budget that was changed by `bwbayes resume` is kept.
             found = existing.problem()
             expected = problem.with_noise(found.config.model.noise)
-            same_posterior = fingerprint(found.config) == fingerprint(expected.config)
+            same_posterior = fingerprint(found) == fingerprint(expected)
             if same_posterior and found.digests == problem.digests:
                 return existing
         except (InputError, OSError):

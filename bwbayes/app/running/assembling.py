@@ -6,6 +6,7 @@ What is worked out is kept with the run, and read from there; see
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -18,22 +19,27 @@ from bwbayes.app.running.explaining import explained, lines
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import load, save, state_of, version_remarks, versions
 from bwbayes.app.running.predictions import predictions, validate_predictions
+from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.identifiability import information_gain
 from bwbayes.diagnosis.predictive_checks import check_predictions
 from bwbayes.diagnosis.validation import Background
-from bwbayes.inference.map_estimate import distinct
+from bwbayes.inference.map_estimate import PointFit, distinct
+from bwbayes.inference.voltage_noise import path_covariance, widened
 from bwbayes.prediction.loops import measure_loops
 from bwbayes.prediction.prediction import thinned
 from bwbayes.prediction.scores import score
 from bwbayes.prediction.steps import measure_steps
 from bwbayes.report.result import Result
-from bwbayes.sampling.chain import PHASES, draws, log_densities
+from bwbayes.sampling.chain import PHASES, constrain_steps, draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import WatchSteps, unwatched
+from bwbayes.watching import Watch, WatchSteps, unwatched
+
+# What a chain notes it by: (free, free), in unconstrained coordinates.
+VOLTAGE_NOISE = "voltage_noise_covariance"
 
 
 def assemble(
@@ -132,6 +138,33 @@ def assemble(
     )
 
 
+def voltage_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) -> dict[str, str]:
+    """Return what a chain notes of what noise on the voltages leaves unsure; nothing without."""
+    paths = {name: record.path for name, record in problem.records.items()}
+    if not any(path.noise_sd for path in paths.values()):
+        return {}
+    source = generator(problem.config.seed, "voltage noise")
+    covariance = path_covariance(problem.posterior, paths, point, source, watch)
+    return {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
+
+
+def run_draws(problem: Problem, chain: ChainFile) -> FloatArray:
+    """Return a run's draws in their own units, (steps, ensembles, walkers, free).
+
+    Those of its chain, or wider by what noise on the voltages leaves unsure; where the prior allows
+    no such place, as sampled.
+    """
+    noted = chain.attributes().get(VOLTAGE_NOISE)
+    if noted is None:
+        return draws(problem.posterior, chain)
+    more = np.array(json.loads(str(noted)))
+    coordinates = chain.coordinates("sampling", thinning(chain.draws("sampling")))
+    wide = widened(coordinates, chain.point.covariance, more)
+    _, log_prior = problem.posterior.prior.constrain(wide.reshape(-1, len(more)))
+    possible = np.isfinite(log_prior).reshape(*wide.shape[:-1], 1)
+    return constrain_steps(problem.posterior, np.where(possible, wide, coordinates))
+
+
 def _read_draws(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
     """Return the draws, and what the problem says of them."""
     plan, steps = problem.plan, ", ".join(f"{chain.steps(p)} steps of {p}" for p in PHASES)
@@ -148,7 +181,7 @@ def _read_draws(problem: Problem, chain: ChainFile, outcome: Outcome) -> Result:
         name=problem.config.name or "run",
         outcome=outcome,
         parameters=problem.parameters,
-        draws=draws(problem.posterior, chain),
+        draws=run_draws(problem, chain),
         log_density=log_densities(chain),
         moves=chain.moves("sampling"),
         facts=problem.facts | facts,

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bwbayes.app.config.config import Config, dump
+from bwbayes.app.config.config import dump
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
@@ -38,9 +38,12 @@ from bwbayes.record.io.formats import draft_of
 from bwbayes.sampling.storage import ChainFile
 
 
-def fingerprint(config: Config) -> str:
-    """Return what a chain notes of a resolved config: its keys and values, as JSON."""
-    values = dict(_flat(config.model_dump(exclude_none=True)))
+def fingerprint(problem: Problem) -> str:
+    """Return what a chain notes of a problem: its resolved config's keys and values, as JSON.
+
+    And which voltages drive the model without their noise.
+    """
+    values = dict(_flat(problem.config.model_dump(exclude_none=True)))
     # Keys that a chain does not depend on; of tables, everything in them. The record is compared by
     # its readings, not by its file's name.
     free_to_change = re.compile(
@@ -48,6 +51,9 @@ def fingerprint(config: Config) -> str:
         r"|record\.([^.]+\.)?(file|missing|remarks|signal|read_as)|parameters\..*\.(label|description))(\..*)?"
     )
     noted = {key: value for key, value in values.items() if not free_to_change.fullmatch(key)}
+    for name, record in problem.records.items():
+        if record.path.noise_sd:
+            noted[f"voltage of {name}"] = "without its noise"
     return json.dumps({"coordinates": COORDINATES, **noted})
 
 
@@ -65,7 +71,7 @@ def require_own(problem: Problem, chain: Path, attributes: Mapping[str, str | in
             f"{chain}: does not say which priors and settings it was sampled with; start a new run"
         )
     before: dict[str, object] = json.loads(str(attributes["posterior"]))
-    now: dict[str, object] = json.loads(fingerprint(problem.config))
+    now: dict[str, object] = json.loads(fingerprint(problem))
     differing = [key for key in before | now if before.get(key) != now.get(key)]
     if differing:
         first, *others = differing

@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
+from functools import partial
 
 from rich.console import Console
 
@@ -20,7 +21,7 @@ from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.assembling import assemble, load_result, save_result
+from bwbayes.app.running.assembling import assemble, load_result, save_result, voltage_noise
 from bwbayes.app.running.explaining import find_map
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
@@ -139,6 +140,7 @@ def _open_chain(
     if not folder.chain.exists():
         with StepProgress(console, "computing the MAP estimate ...") as watch:
             problem, point, why = find_map(problem, watch)
+            unsure = voltage_noise(problem, point, partial(watch, "noise on the voltage"))
         posterior, config = problem.posterior, problem.config
         if why:  # the noise was chosen
             console.print(why, highlight=False, soft_wrap=True)
@@ -146,12 +148,13 @@ def _open_chain(
         attributes: dict[str, str | int] = {
             "config": dump(config),
             "data_sha256": problem.sha256,
-            "posterior": fingerprint(config),
+            "posterior": fingerprint(problem),
             "versions": json.dumps(versions(posterior.engine)),
             "engine": posterior.engine,
             "platform": platform.platform(),
             "seed": config.seed,
             "parameters": json.dumps(posterior.names),
+            **unsure,
         }
         first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
         chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
