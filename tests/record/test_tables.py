@@ -78,6 +78,39 @@ def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
             read_record(path, table=wrong)
 
 
+@given(
+    st.lists(st.integers(12, 40), min_size=2, max_size=4),
+    st.sampled_from([*HEADERS[:2], ""]),
+    st.sampled_from(["", "\n"]),
+    st.sampled_from([",", "\t", ";"]),
+    st.data(),
+)
+def test_a_block_below_an_empty_line_in_which_times_begin_again_is_a_table(
+    tmp_path_factory: pytest.TempPathFactory,
+    lengths: list[int],
+    header: str,
+    between: str,
+    separator: str,
+    data: st.DataObject,
+) -> None:
+    """Below the header of the first one, if that has one."""
+    content = tables(lengths)
+    blocks = ["\n".join(separator.join(map(repr, row)) for row in rows) for rows in content]
+    path = tmp_path_factory.getbasetemp() / "blocks.csv"
+    header = header.replace(",", separator)
+    path.write_text(f"{header}\n{f'\n{between}\n'.join(blocks)}\n")
+    number = data.draw(st.integers(1, len(blocks)))
+    naming: dict[str, Any] = {
+        "columns": {"time": 1, "voltage": 2, "displacement": 3},
+        "units": {"time": "s", "voltage": "V", "displacement": "um"},
+    }
+    record = read_record(path, table=number, **({} if header else naming))
+    np.testing.assert_allclose(record.voltage, np.array(content[number - 1])[:, 1], rtol=1e-15)
+    listed = ", ".join(rf"{i} '.*' \({n} rows.*\)" for i, n in enumerate(lengths, start=1))
+    with pytest.raises(InputError, match=f"tables with numbers: {listed}; choose one"):
+        read_record(path)
+
+
 @pytest.mark.parametrize("between", ["", "# paused", HEADERS[0], "\n\n"])
 def test_a_table_goes_on_after_a_pause(tmp_path: Path, between: str) -> None:
     """With the header once more, an empty line or a comment, and alone it has number 1."""

@@ -41,7 +41,7 @@ from bwbayes.record.io.layout import (
 )
 from bwbayes.record.io.preamble import clock_above, settings_in, stated_above, with_units
 from bwbayes.record.io.series import Clock, Series, Source, in_seconds
-from bwbayes.record.io.tables import index_of, tables_of
+from bwbayes.record.io.tables import described, index_of, tables_of
 from bwbayes.record.record import Record
 
 type Marks = tuple[str, str | None]
@@ -85,10 +85,14 @@ def text_source(
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     tables = tables_of(lines)
-    chosen = tables[index_of(path, [title for _, title in tables], table)][0]
+    said = described(tables, lines) if tables[1:] else ()
+    chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, said)]
     is_whole |= chosen.stop < len(lines)
-    # Empty lines in place of the tables above, so that the others keep their numbers.
-    lines = [""] * chosen.start + lines[chosen.start : chosen.stop]
+    # Empty lines in place of the tables above, so that the others keep their numbers; a block below
+    # an empty line has the header of the one above.
+    has_own = shared in lines[chosen.start : chosen.stop]
+    above_it = ["" if has_own else shared][: chosen.start]
+    lines = [""] * (chosen.start - 1) + above_it + lines[chosen.start : chosen.stop]
     while not lines[-1].strip():
         lines.pop()
     layout = find_layout(path, lines)

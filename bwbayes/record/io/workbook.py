@@ -43,7 +43,7 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
     tables: dict[str, tuple[Source, list[str]]] = {}
     unread: dict[str, InputError] = {}
     for sheet, text in texts.items():
-        titles = [title for _, title in tables_of(text.split("\n"))]
+        titles = [found.title for found in tables_of(text.split("\n"))]
         for number, title in enumerate(titles, start=1):
             name = sheet if len(titles) == 1 else f"{sheet}: {title}"
             try:
