@@ -128,7 +128,9 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
     residual = bands.measured[rows] - mean
     own, slow, whole = (float(np.mean(bands.sd(kind)[rows] ** 2)) for kind in KINDS)
-    floor = 1e-12 * max(whole, 1e-300)
+    # No band is narrower than the resolution of floating-point numbers.
+    largest = float(np.max(np.abs([bands.measured[rows], mean])))
+    floor = max(1e-12 * whole, max(np.spacing(largest), 1e-150) ** 2)
     sds = np.sqrt(np.maximum([whole - slow, slow - own if memory > 0 else 0.0], floor))
     noise = np.array([[*sds, max(memory, interval)]])
     # The parameters' errors, each of an independent standard normal size.

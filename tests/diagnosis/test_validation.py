@@ -376,3 +376,14 @@ def test_a_few_outliers_are_no_cause_of_an_error_everywhere(size: float) -> None
         assert cause is not None
         named[scale] += "outliers" in cause.kind.split(" or ")
     assert named == {0.0: 10, size: 0}
+
+
+@pytest.mark.parametrize("error", [1e-12, 1.0, 1e9])
+@pytest.mark.parametrize("memory", [0.0, 1.0])
+def test_bands_without_any_width_have_a_cause(error: float, memory: float) -> None:
+    """Their residuals are counted in what a floating-point number resolves: none overflows."""
+    time = 0.01 * np.arange(200.0)
+    kinds = {kind: np.zeros(200) for kind in KINDS}
+    bands = normal_bands(time, np.sin(time), np.sin(time), kinds, None)
+    errors = error * np.random.default_rng(0).standard_normal(200)
+    assert cause(replace(bands, measured=np.sin(time) + errors), memory).text
