@@ -7,7 +7,8 @@ the voltage counts once, under a discrepancy of that percent. The posterior itse
 noise model, may look surer.
 
 After, by the draws (:func:`information_gain`). The contraction 1 − (posterior sd / prior sd)² is
-near one where the record decided and near zero where it told nothing. Scaling the power of the
+near one where the record decided and near zero where it told nothing. Both are of the effective
+prior: γ, which lies within β, is held against the β that the record has. Scaling the power of the
 prior, or of the likelihood, by a little shows which of them a posterior hangs on: one that moves
 with the prior and not with the likelihood is what was put in.
 """
@@ -24,7 +25,6 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.diagnosis.conflict import normal_scores
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import DiscrepancyNoise
@@ -68,7 +68,7 @@ def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
     elif swings.size < 2 or swings.min() > 0.8 * swings.max():
         advice = "vary the amplitude: let it decay to a tenth over ten periods"
     for i in range(min(count, 2)):
-        text = f"{combined(directions[:, i], names)}: {percent(parts[i])} of the prior's SD remains"
+        text = f"{combined(directions[:, i], names)}: {remaining(parts[i])}"
         if i == count - 1 < parts.size - 1:
             text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
         elif i == 1:
@@ -79,6 +79,11 @@ def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
 def percent(share: float) -> str:
     """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
     return "all" if share >= 0.995 else f"{share:.0%}"
+
+
+def remaining(share: float) -> str:
+    """Say what part of a prior's sd is left after the constraints and the record."""
+    return f"{percent(share)} of the effective prior's SD remains"
 
 
 def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -181,7 +186,7 @@ def combined(direction: FloatArray, names: Sequence[str]) -> str:
 class ParameterInformation:
     """What is known of one parameter after a record.
 
-    ``contraction`` as above, in the normal scores of its prior, so that it is the same for a
+    ``contraction`` as above, in the joint prior's coordinates, so that it is the same for a
     parameter and its logarithm; below zero where the posterior is wider than the prior.
     ``prior`` and ``likelihood`` are the power-scaling sensitivities.
     """
@@ -234,7 +239,7 @@ class InformationGain:
             if taught.prior_decides
         ]
         for combination, left in self.combinations[:1]:
-            text = f"{combination}: {percent(left)} of the prior's SD remains"
+            text = f"{combination}: {remaining(left)}"
             fix = "quote its members together, or add a record that tells them apart"
             findings.append(Finding("determined worst", text, fix))
         return findings
@@ -279,11 +284,8 @@ def information_gain(
     count = 4000  # draws of the prior, and of the posterior, that are looked at
     step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
-    log_likelihood = log_density.ravel()[::step] - prior.constrain(prior.unconstrain(thin))[1]
-    before, after = (
-        np.stack([normal_scores(*pair) for pair in zip(prior.free, every.T, strict=True)], axis=1)
-        for every in (prior.draw(generator, count), thin)
-    )
+    before, after = (prior.unconstrain(every) for every in (prior.draw(generator, count), thin))
+    log_likelihood = log_density.ravel()[::step] - prior.constrain(after)[1]
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
     # The draws are taken as one chain: weights depend on no order.
     tree = arviz_base.from_dict(
@@ -298,9 +300,9 @@ def information_gain(
         name: ParameterInformation(float(share), float(to_prior[name]), float(to_likelihood[name]))
         for name, share in zip(prior.free_names, contraction, strict=True)
     }
-    # The three directions that keep most of their prior sd, in the prior's own normal scores, whose
-    # spread the constraints may have changed: the eigenvectors of the posterior's covariance
-    # relative to the prior's.
+    # The three directions that keep most of their prior sd, in coordinates, whose spread the
+    # constraints may have changed: the eigenvectors of the posterior's covariance relative to the
+    # prior's.
     given, left = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
     variances, directions = scipy.linalg.eigh(left, given)
     combinations = []
