@@ -117,9 +117,13 @@ def _disagreement(
         wider = Distribution(stated.name, double)
     if wider == parameter.prior:  # it ends at a bound, which is said where the posterior is near
         return None
-    line = _line(parameter.name, wider)
-    fix = f"check the units of prior and record; if both are right, give {line}"
-    return Finding(parameter.name, text, fix)
+    return Finding(parameter.name, text, conflict_fix(parameter.name, wider))
+
+
+def conflict_fix(name: str, wider: Distribution) -> str:
+    """Return what to do where a record does not go together with a parameter's prior."""
+    line = _line(name, wider)
+    return f"check the units of prior and record; if both are right, give {line}"
 
 
 def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:

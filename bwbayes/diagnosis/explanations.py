@@ -27,6 +27,7 @@ ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     effects.moving_gain,
     effects.reversed_sign,
     effects.delay,
+    model.prior,
     model.heavy_tails,
     model.growing_noise,
 )

@@ -1,4 +1,4 @@
-"""What the model may lack: another value of a key of [model], or noise of another kind.
+"""What the model may lack: a key of [model], another prior, or noise of another kind.
 
 Another model has its own evidence; noise may have heavy tails, or be more where the drive is.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from types import MappingProxyType
 from typing import Any
@@ -15,9 +16,11 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.conflict import conflict_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
 from bwbayes.model.registry import HYSTERESIS
@@ -119,6 +122,28 @@ def _changed(
     if stated:
         fix += f", with what is known of {', '.join(stated)} in [parameters]"
     yield scene.explained(kind or text, text, fix, fit, spec=spec, stated=stated, **facts)
+
+
+def prior(scene: Scene) -> Iterator[Explanation]:
+    """Try the default prior of each parameter that has another one.
+
+    Whether the fit has left the prior, or what else it has has made up for it.
+    """
+    before, defaults = scene.posterior.prior, scene.study.defaults if scene.study else {}
+    for parameter in before.free:
+        default = defaults.get(parameter.name)
+        if default is None or parameter.prior == default:
+            continue
+        parameters = [replace(p, prior=default) if p is parameter else p for p in before.parameters]
+        posterior = replace(scene.posterior, prior=JointPrior(parameters, before.constraint))
+        places = [
+            posterior.prior.unconstrain(before.constrain(scene.places)[0]),
+            map_estimate.valleys(posterior, scene.generator, 1),
+        ]
+        fit = scene.extended(posterior=posterior, places=np.concatenate(places))
+        text = f"prior of {parameter.name}, {parameter.prior}, that excludes the record's value"
+        fix = conflict_fix(parameter.name, default)
+        yield scene.explained(f"prior of {parameter.name}", text, fix, fit, foreign=True)
 
 
 def _lines(before: ModelSpec, after: ModelSpec) -> str:

@@ -22,11 +22,12 @@ from tests.prediction.runs import problem_of
 from tests.stand import Stand
 
 
-def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0) -> Scene:
-    """Fit the good model to a plant."""
+def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters: str = "") -> Scene:
+    """Fit the good model to a plant, with some priors stated."""
     (folder / "record.h5").unlink(missing_ok=True)
     write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', folder)
+    text = f'[record]\nfile = "record.h5"\nfrom_rest = true\n[parameters]\n{parameters}\n'
+    problem = problem_of(text, folder)
     rng = np.random.default_rng(seed)
     point = pointfit.fit(problem.posterior, rng)
     return Scene.of(problem.posterior, point.optima, rng, study=problem.study)
@@ -124,6 +125,24 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     assert found.text.startswith("displacement" if late > 0 else "voltage")
     assert abs(0.8 * float(found.text.split()[-2]) / 1000 - abs(late)) < 0.03
     assert found.rmse[1] < found.rmse[0] / 2
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.6])
+@pytest.mark.parametrize("name", ["d", "beta"])
+def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
+    name: str, factor: float, tmp_path: Path
+) -> None:
+    """With an sd of a fiftieth; the twin: one that has the truth in its middle is none."""
+    truth = factor * getattr(drawn(np.random.default_rng((5, 0))), name)
+    prior = f'{{ distribution = "lognormal", median = {truth}, sigma = 0.02 }}'
+    seen = scene("good", 0, tmp_path, 5.0, f"{name} = {{ prior = {prior} }}")
+    families = model.prior, effects.transient, effects.drift, effects.moving_gain
+    found = [explanation for family in families for explanation in family(seen)]
+    likely = likely_causes(sorted(found, key=lambda each: -each.nats))
+    assert ([] if factor == 1.0 else [f"prior of {name}"]) == [each.kind for each in likely]
+    for each in likely:
+        assert each.nats > LIMIT
+        assert f"give {name} = {{ prior = " in each.fix
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
