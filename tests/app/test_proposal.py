@@ -84,6 +84,30 @@ def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: W
     )
 
 
+@pytest.mark.parametrize("begin", [0.3, 0.6, 0.72, 0.95])
+@pytest.mark.parametrize("takes", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_the_only_motion_of_a_step_or_ramp_is_fitted(
+    tmp_path: Path, begin: float, takes: float, noise: float
+) -> None:
+    """Of a step nothing is held out; whatever is held out, the other readings move by half."""
+    rng, time = np.random.default_rng(4), np.arange(800) / 800
+    ramp = np.clip((time - begin * (1 - takes)) / max(takes, 1e-6), 0.0, 1.0)
+    voltage = 80 * ramp + noise * rng.standard_normal(time.size)
+    readings = 0.5 * voltage + 0.02 * rng.standard_normal(time.size)
+    columns = np.stack([time, voltage, readings], axis=1)
+    path = tmp_path / "step.csv"
+    np.savetxt(path, columns, "%.6g", ",", header=OWN, comments="")
+    proposal = proposed(path)
+    if not takes:
+        assert not proposal.config.validation
+        assert "# Too little of the record, or of its motion, can be left out" in proposal.text
+    train = proposal.config.records["record"].train
+    assert train is not None
+    inside = [voltage[(a <= time) & (time < b)] for a, b in train]
+    assert sum(np.ptp(window) for window in inside) > 40
+
+
 # What is wrong
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 
 from bwbayes.app.config.config import Config, parse
+from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning, path_text
@@ -147,7 +148,7 @@ def _text(
     ending += "  # s: held out, used to validate the bands"
     if not held:
         ending = """\
-# Too little of the record can be left out of the fit to hold bands against it:
+# Too little of the record, or of its motion, can be left out of the fit to hold bands against it:
 # [validation.another]
 # file = "another.csv\""""
     assert record.displacement is not None
@@ -217,7 +218,8 @@ def _difference(record: Record, windows: list[slice]) -> float:
     """Return how far windows are from being like the rest of a record; 1 where they will not do.
 
     The largest difference of the distribution functions of voltages and rates, or half of the part
-    of the voltages' range that is missing.
+    of the voltages' range that is missing. A single step or ramp has to be fitted, so that the rest
+    has to move by half of the range, and the windows have to move by a tenth.
     """
     held = np.zeros(record.samples, dtype=np.bool_)
     for window in windows:
@@ -229,13 +231,29 @@ def _difference(record: Record, windows: list[slice]) -> float:
     slack = 0.02 * float(np.ptp(fitted))
     inside = other.min() >= fitted.min() - slack and other.max() <= fitted.max() + slack
     assert record.displacement is not None
-    if not inside or np.ptp(other) == 0 or np.ptp(record.displacement[readings & held]) == 0:
+    if not inside or np.ptp(record.displacement[readings & held]) == 0:
+        return 1.0
+    extent = float(np.ptp(record.voltage[readings]))
+    motion, tested = _motion(record.voltage[readings], held[readings])
+    if motion < extent / 2 or tested < max(extent / 10, 1e-300):
         return 1.0
     thinned = slice(None, None, 1 + record.samples // 20_000)
     held = held[thinned]
     drive = record.voltage[thinned], np.abs(rate(record.voltage, record.interval))[thinned]
     differences = [scipy.stats.ks_2samp(x[held], x[~held])[0] for x in drive]
     return float(max(*differences, (1 - np.ptp(other) / np.ptp(fitted)) / 2))
+
+
+def _motion(voltage: FloatArray, held: BoolArray) -> tuple[float, float]:
+    """Return by how much a voltage (readings,) moves within the stretches fitted, and held out, V.
+
+    In all of them, each by its range.
+    """
+    edges = np.flatnonzero(np.diff(held)) + 1
+    motion = [0.0, 0.0]
+    for stretch, out in zip(np.split(voltage, edges), np.split(held, edges), strict=True):
+        motion[int(out[0])] += float(np.ptp(stretch))
+    return motion[0], motion[1]
 
 
 def _windows(record: Record, windows: list[slice]) -> str:
