@@ -155,11 +155,12 @@ def _lines(before: ModelSpec, after: ModelSpec) -> str:
 def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     """Try innovations of a Student t distribution, of whatever scale, if any might be set aside."""
     white = scene.innovations
-    far = int(np.sum(np.abs(white) > 5))
-    if not far:
+    far = np.abs(white) > 5
+    if not far.any():
         return
-    text = f"outliers ({far} of {white.size} innovations beyond 5 SD)"
-    rmse = scene.without[0], scene.fit.rmse
+    text = f"outliers ({np.sum(far)} of {white.size} innovations beyond 5 SD)"
+    others = (scene.posterior.only.readings.values - scene.fit.displacement)[~far]
+    rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
     fix = "set outliers = true in [model]"
     nats = tail_nats(white) - scene.lead
     yield Explanation("heavy tails", text, fix, nats=nats, rmse=rmse, foreign=True, noise=True)

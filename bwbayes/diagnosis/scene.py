@@ -49,6 +49,12 @@ class Explanation(Finding):
     stated: Mapping[str, Stated] = field(default_factory=dict)
 
     @property
+    def mends(self) -> bool:
+        """Whether it takes away most of what the fit misses; also where that is not known."""
+        without, with_it = self.rmse
+        return not with_it**2 > without**2 / 2
+
+    @property
     def worth(self) -> str:
         """What it is worth, in words: nats, and errors with it instead of without it."""
         errors = ((self.rmse, "RMSE"), (self.held_out, "held out"))

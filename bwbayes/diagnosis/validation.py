@@ -238,22 +238,24 @@ def assess(
         return None
     standard = Standardized.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
-    notes: tuple[str, ...] = ()
-    lead = bands.lead_in
+    width = (standard.excess_width,) if bands.training and standard.excess_width else ()
+    verdict = Verdict(bands.name, bands.training, True, notes=width, separate=bands.separate)
+    # What bands hold after has done no harm.
+    lead, doubted = bands.lead_in, verdict
     if lead is not None and lead.p_value < LEAD_IN_ALARM:
         span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
         p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
-        notes = (f"the lead-in of {span} s does not fit the model ({p_value})",)
-    if bands.training and standard.excess_width:
-        notes += (standard.excess_width,)
-    verdict = Verdict(bands.name, bands.training, True, notes=notes, separate=bands.separate)
+        note = f"the lead-in of {span} s does not fit the model ({p_value})"
+        doubted = replace(verdict, notes=(note, *width))
     if reasons:
-        why = joined(likely_causes(explanations)) or (
+        missed = any(reason.startswith("NRMSE") for reason in reasons)
+        mending = [each for each in explanations if each.mends or not missed]
+        why = joined(likely_causes(mending)) or (
             REVERSED_SIGN
             if reasons[0].startswith("the readings fall")
             else cause(bands, background.memory, beyond)
         )
-        return replace(verdict, holds=False, reasons=tuple(reasons), cause=why)
+        return replace(doubted, holds=False, reasons=tuple(reasons), cause=why)
     doubts = [
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"
         for text, chance in standard.chances()
@@ -276,7 +278,7 @@ def assess(
             f"bands; use a record {least / standard.effective_size:.2g} times as long"
         )
     return (
-        replace(verdict, holds=None, reasons=tuple(doubts), cause=followed or better)
+        replace(doubted, holds=None, reasons=tuple(doubts), cause=followed or better)
         if doubts
         else verdict
     )

@@ -72,10 +72,13 @@ def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
     coarse[::7], coarse[3::7] = 3.0, -3.0
     assert model.tail_nats(coarse) > LIMIT
     seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0)
-    seen.fit = SimpleNamespace(rmse=1.0)
+    readings = SimpleNamespace(values=coarse)
+    seen.posterior = SimpleNamespace(only=SimpleNamespace(readings=readings))
+    seen.fit = SimpleNamespace(displacement=np.zeros(3000))
     assert [] == [*model.heavy_tails(seen)]
-    coarse[7] = 6.0
-    assert 1 == len([*model.heavy_tails(seen)])
+    coarse[8] = 600.0
+    (found,) = model.heavy_tails(seen)
+    assert found.rmse[1] == pytest.approx(np.sqrt(2 * 9 / 7), rel=0.01)
 
 
 FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {

@@ -286,25 +286,49 @@ def test_a_band_many_times_wider_than_the_noise_is_noted(discrepancy: float, not
     assert () == judged(bands_of(record), background).notes
 
 
-def test_a_lead_in_that_does_not_fit_is_a_note_and_decides_nothing() -> None:
-    """It is the likely cause where the bands fail after it."""
+def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_it() -> None:
+    """Where they fail it is the likely cause too."""
     record = made(np.random.default_rng(3), length=30)
     bands = replace(bands_of(record), scored_from=100)
     background = Background(record.memory, 0.0, FITTED)
     note = "the lead-in of 0 to 1 s does not fit the model (p < 0.001)"
-    for p_value, notes in ((1e-5, (note,)), (0.01, ())):
-        lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=p_value)
-        verdict = judged(replace(bands, lead_in=lead), background)
-        assert verdict.holds is True
-        assert notes == verdict.notes
+    lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
+    verdict = judged(replace(bands, lead_in=lead), background)
+    assert verdict.holds is True
+    assert () == verdict.notes
     assert bands.measured is not None
     shifted = replace(bands, measured=bands.measured + 5 * float(record.sds["sensor"].mean()))
-    lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
+    fitting = replace(lead, p_value=0.01)
+    assert () == judged(replace(shifted, lead_in=fitting), background).notes
     verdict = judged(replace(shifted, lead_in=lead), background)
     assert verdict.holds is False
+    assert (note,) == verdict.notes
     assert verdict.cause is not None
     assert "lead-in" == verdict.cause.kind
     assert "--lead-in-from" in verdict.cause.fix
+
+
+def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
+    """Not three outliers, whatever their evidence is."""
+    poor = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
+    background = Background(poor.memory, 0.0, FITTED)
+    tails = Explanation("heavy tails", "outliers", "do", nats=900.0, rmse=(9.0, 8.9), foreign=True)
+    creep = Explanation("creep", "creep", "do", nats=500.0, rmse=(9.0, 2.0))
+    for explanations, kind in (
+        ([tails, creep], "creep"),
+        ([creep], "creep"),
+        ([replace(tails, rmse=(9.0, 1.0)), creep], "heavy tails"),
+    ):
+        bands = bands_of(poor, training=True)
+        verdict = assess(bands, background, explanations=explanations)
+        assert verdict is not None
+        assert verdict.cause is not None
+        assert any(reason.startswith("NRMSE") for reason in verdict.reasons)
+        assert kind == verdict.cause.kind
+    verdict = assess(bands, background, explanations=[tails])
+    assert verdict is not None
+    assert verdict.cause is not None
+    assert "outliers" not in verdict.cause.text
 
 
 def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
