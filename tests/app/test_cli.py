@@ -312,6 +312,15 @@ def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_
     assert said.rstrip().endswith("--fs 200")
 
 
+def test_a_predicted_files_name_need_not_be_utf_8(bwbayes: Type, run: Path, tmp_path: Path) -> None:
+    """Its bands, scores and figure are called as it can be written."""
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/messung_\xe4.csv"))
+    write_record(read_record(run / "records/sine.h5"), path)
+    out = tmp_path / "bands.csv"
+    assert bwbayes("predict", run, "--record", path, "--out", out).status in (0, 3, 5)
+    assert out.with_suffix(".png").exists()
+
+
 def test_a_files_name_need_not_be_utf_8(bwbayes: Type, tmp_path: Path) -> None:
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/messung_\xe4.csv"))
     path.write_text(lines(HEADER, *ROWS))

@@ -20,7 +20,7 @@ from bwbayes.app.commands.shared import (
     show_report,
     working,
 )
-from bwbayes.errors import ColumnsError, ExitStatus, InputError
+from bwbayes.errors import ColumnsError, ExitStatus, InputError, path_text
 
 
 def _saved(
@@ -85,7 +85,7 @@ def predict(
     """
     if (record is None) == (options["signal"] is None):
         raise InputError("predict: give either a record or a signal")
-    name = options["signal"] if record is None else record.stem
+    name = options["signal"] if record is None else path_text(record.stem)
     bands_file = out or folder / "predictions" / f"{name}.csv"
     files = [bands_file, bands_file.with_suffix(".json"), bands_file.with_suffix(".png")]
     if bands_file in files[1:]:

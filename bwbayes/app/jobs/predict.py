@@ -12,7 +12,7 @@ from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.errors import InputError, refuse_unwritable, suggestion
+from bwbayes.errors import InputError, path_text, refuse_unwritable, suggestion
 from bwbayes.prediction.initial_state import Start
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
@@ -115,7 +115,7 @@ def predict(
             "`Record.from_arrays(voltage, interval=...)`"
         )
     elif not isinstance(record, Record):
-        name = name or Path(str(record)).stem
+        name = name or path_text(Path(record).stem)
         alike = options_alike(record, problem.config.records[of].read_as, table)
         alike |= {"displacement_file": displacement_file}
         record = read_record(record, need_displacement=False, **alike)
