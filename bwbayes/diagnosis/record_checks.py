@@ -434,4 +434,6 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     if share > 0.1 and abs(size) > max(7 * spread / np.sqrt(share), 0.05 * extent):
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
+        if share < 0.5:  # the drive has a trend itself, which creep follows
+            fix = f"if it creeps, set creep = true in [model]; else {fix}"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")
