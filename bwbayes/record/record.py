@@ -240,6 +240,23 @@ class Record:
         return float(self.voltage.min()), float(self.voltage.max())
 
     @property
+    def starts_at_zero(self) -> bool:
+        """Whether the first voltage is zero to a hundredth of the range: perhaps from rest."""
+        return abs(float(self.voltage[0])) <= 0.01 * float(np.ptp(self.voltage))
+
+    @property
+    def beginning(self) -> str:
+        """How the voltage starts: where, and how long it rests there, to a hundredth of the range.
+
+        A hundredth of the record at most counts as moving at once.
+        """
+        first = float(self.voltage[0])
+        moving = np.abs(self.voltage - first) > 0.01 * float(np.ptp(self.voltage))
+        still = int(np.argmax(moving))
+        motion = f"at rest for {still * self.interval:.3g} s"
+        return f"starts at {first:.3g} V, {motion if still > self.samples // 100 else 'moving'}"
+
+    @property
     def sha256(self) -> str:
         """Hex digest of the data: voltage, displacement, interval and start, not the origin."""
         digest = hashlib.sha256(f"{self.samples} {self.displacement is not None}\n".encode())

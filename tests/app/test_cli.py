@@ -195,7 +195,7 @@ def test_predict_takes_a_voltage_alone(
     rows = [f"{i / 100},{volts * np.sin(i / 30)}" for i in range(300)]
     (tmp_path / "plan.csv").write_text(lines("time_s,voltage_V", *rows))
     said = bwbayes("predict", run, "--record", "plan.csv", "--out", "bands.csv")
-    assert "the state that the actuator starts from is unknown" in " ".join(said.out.split())
+    assert "starts at 0 V, perhaps from rest: the 95% sensor band" in " ".join(said.out.split())
     assert 0 == said.status
     assert "Coverage" not in said.out
     assert ["time_s", "voltage_V", "mean_um"] == columns(tmp_path / "bands.csv")[0][:3]

@@ -232,5 +232,10 @@ def _show(proposal: ConfigProposal, conclusion: str) -> None:
         Banner("note", finding.kind, [finding.text, f"    fix: {finding.fix}"])
         for finding in proposal.findings
     ]
+    if proposal.record.starts_at_zero:
+        conclusion += (
+            f"\nthe record {proposal.record.beginning}: its initial state is estimated; if it was "
+            "demagnetized and nothing moved, from_rest = true under [record] makes it known"
+        )
     banners = [*remarks_banner(proposal.remarks), *findings]
     show_report(Report(title="", banners=banners, blocks=[Text(conclusion, on="screen")]))

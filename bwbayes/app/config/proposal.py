@@ -181,16 +181,12 @@ dynamics = "lag"  # or {", ".join(quoted(name) for name in DYNAMICS if name != "
 
 
 def _start(record: Record) -> str:
-    """Say how the drive starts, to a hundredth of its range, and what no record tells of it."""
-    first, hundredth = float(record.voltage[0]), 0.01 * float(np.ptp(record.voltage))
-    still = int(np.argmax(np.abs(record.voltage - first) > hundredth))
-    motion = f"at rest for {still * record.interval:.3g} s"
-    state = f"starts at {first:.3g} V, {motion if still > record.samples // 100 else 'moving'}"
-    if abs(first) > hundredth:
-        return f"# from_rest = false  # {state}; the initial state is unknown and will be estimated"
-    return (
-        f"# from_rest = true  # {state}; say so if the actuator was demagnetized and nothing moved"
-    )
+    """Say how the drive starts, and what no record tells of it."""
+    if not record.starts_at_zero:
+        unknown = "the initial state is unknown and will be estimated"
+        return f"# from_rest = false  # {record.beginning}; {unknown}"
+    said = "say so if the actuator was demagnetized and nothing moved"
+    return f"# from_rest = true  # {record.beginning}; {said}"
 
 
 def _held_out(record: Record) -> list[slice]:

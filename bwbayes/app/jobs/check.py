@@ -53,7 +53,9 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     nothing = "the record by itself shows no transient, spike, jump, clipping, drift or the like"
     title = "No issues of the record" if remarks else "No issues found"
     several = len(problem.records) > 1
-    about = [fact for subject, fact in problem.facts.items() if subject.startswith("record")]
+    about = [
+        fact for subject, fact in problem.facts.items() if subject.startswith(("record", "start"))
+    ]
     about += [why] * bool(why)
     pictures: list[Picture] = []
     for name, record in problem.records.items():

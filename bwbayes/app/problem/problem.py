@@ -148,6 +148,7 @@ class Problem:
             if missing := self.config.records[name].missing:
                 fact += f" ({' and '.join(f'{value:g}' for value in missing)} um taken as missing)"
             facts[f"record{which}"] = fact
+            facts[f"start{which}"] = _start(record, self.config.records[name].from_rest)
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.alone(name).only.training
@@ -250,6 +251,15 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     # As the config says it from now on, in explicit numbers.
     study = study_of(explicit, fitted, training)
     return Problem(explicit, fitted, study, posterior, plan, validations, defaults)
+
+
+def _start(record: Record, from_rest: bool) -> str:
+    """Say what is taken of a record's start, and what declaring it from rest would change."""
+    if from_rest:
+        return f"{record.beginning}, demagnetized and at rest, as from_rest declares"
+    unknown = "; the hysteresis's state and how the dynamics move then are estimated"
+    known = "; if it was demagnetized and nothing moved, from_rest = true makes them known"
+    return f"{record.beginning}{unknown}{known * record.starts_at_zero}"
 
 
 def _outliers(

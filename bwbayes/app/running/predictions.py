@@ -174,12 +174,11 @@ def _from_rest_remark(
 ) -> str:
     """Say what it would change to declare a record from rest; nothing unless it may start so.
 
-    It may where the first voltage is zero, to a hundredth of the range. Of every fourth draw.
+    Of every fourth draw.
     """
     record, start = other.record, other.start
     assert record is not None
-    first, extent = float(record.voltage[0]), float(np.ptp(record.voltage))
-    if start.from_rest or start.after or abs(first) > 0.01 * extent:
+    if start.from_rest or start.after or not record.starts_at_zero:
         return ""
     rested = replace(other, start=replace(start, from_rest=True))
     declared = _of_another(problem, draws[::4], rested, bands.name, beyond)
