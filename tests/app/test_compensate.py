@@ -17,7 +17,9 @@ from bwbayes.errors import InputError
 from tests.app.conftest import Type
 
 
-@pytest.mark.filterwarnings("ignore:the reference is smoothed", "ignore:between samples")
+@pytest.mark.filterwarnings(
+    "ignore:the reference is smoothed", "ignore:between samples", "ignore:voltage and last reversal"
+)
 def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
     made = fit.compensate(shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
@@ -42,7 +44,7 @@ def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: P
     assert made.save(tmp_path / "new", overwrite=True) == files
 
 
-@pytest.mark.filterwarnings("ignore:between samples")
+@pytest.mark.filterwarnings("ignore:between samples", "ignore:voltage and last reversal")
 def test_a_file_and_an_array_give_one_command(fit: bw.Fit, tmp_path: Path) -> None:
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
@@ -124,3 +126,15 @@ def test_what_is_no_reference_is_one_line(
     with pytest.raises(InputError, match=re.escape(line)) as refused:
         fit.compensate(reference, from_rest=True, voltage=(-100.0, 100.0), **options)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+def test_a_command_after_any_drive_says_what_a_demagnetized_start_would_change(fit: bw.Fit) -> None:
+    """Where that at least halves the largest error; and nothing of one that is declared so."""
+    values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
+    waited, rested = (fit.compensate(values, from_rest=declared) for declared in (False, True))
+    errors = [float(np.mean(made.compensated.largest)) for made in (waited, rested)]
+    assert errors[1] < 0.4 * errors[0]
+    (said,) = [remark for remark in waited.remarks if "--from-rest" in remark]
+    assert f"the largest error is {errors[0]:.3g} um in the mean, but" in said
+    assert not any("--from-rest" in remark for remark in rested.remarks)

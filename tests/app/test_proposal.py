@@ -231,6 +231,7 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     done = command("init", path)
     assert 0 == done.return_value
     assert done.output.startswith("wrote ")
+    assert "starts at 0 V, moving: its initial state is estimated; if it was" in done.output
     assert path.with_suffix(".toml").read_text() == proposed(path).text
     again = command("init", path)
     assert isinstance(again.exception, InputError)
