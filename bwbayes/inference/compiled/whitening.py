@@ -1,7 +1,8 @@
 """The noise's filter along series that come from NumPy: their innovations themselves, not sums.
 
 As :meth:`~bwbayes.inference.state_space.Noise.filter` does, for any number of states: a model's
-covariance goes on once for all of its series, and each series follows with the gains of its model.
+covariance goes on once for all of its series. The series of some models are taken side by side, so
+that no reading of one waits for the one before it.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import inner
 
-# Readings whose series are put side by side at a time.
-PIECE = 64
+# Readings whose series are put side by side at a time, and models that go together.
+PIECE, TOGETHER = 16, 32
 
 
 @compile_cached(error_model="numpy")
@@ -41,39 +42,93 @@ def whitened(
     series
         (models, series, readings), um.
     """
-    _, count, readings = series.shape
-    states = observe.size
     white, logs = np.empty_like(series), np.zeros(len(series))
-    covariance, work = np.empty((states, states)), np.empty((3, states, states))
-    shared = np.empty(states)
-    mean, after = np.empty((states, count)), np.empty((states, count))
-    values = np.empty((PIECE, count))
-    for model in range(len(series)):
-        covariance[:], mean[:] = stationary[model], 0.0
-        settled, variance = False, 1.0
-        for first in range(0, readings, PIECE):
-            size = min(PIECE, readings - first)
-            for k in range(count):
-                for t in range(size):
-                    values[t, k] = series[model, k, first + t]
-            for t in range(size):
-                if not settled:
-                    variance = _observe(covariance, observe, sensor[model], shared)
-                logs[model] += math.log(variance)
-                step = gaps[first + t + 1] if first + t + 1 < readings else 0
-                kept = transitions[step, model]
-                _innovate(values[t], mean, after, kept, shared, observe, variance)
-                mean, after = after, mean
-                if not settled or step > 0:
-                    # After a gap the covariance is another one, and so are its gains.
-                    settled = _advance(
-                        covariance, kept, gained[step, model], shared, observe, sensor[model],
-                        variance, work,
-                    ) and step == 0  # fmt: skip
-            for k in range(count):
-                for t in range(size):
-                    white[model, k, first + t] = values[t, k]
+    for begin in range(0, len(series), TOGETHER):
+        models = slice(begin, begin + TOGETHER)
+        _whiten(
+            transitions[:, models], gained[:, models], stationary[models].copy(), observe,
+            sensor[models], gaps, series[models], white[models], logs[models],
+        )  # fmt: skip
     return white, logs
+
+
+@inner(error_model="numpy")
+def _whiten(
+    transitions: FloatArray,
+    gained: FloatArray,
+    covariance: FloatArray,
+    observe: FloatArray,
+    sensor: FloatArray,
+    gaps: IntArray,
+    series: FloatArray,
+    white: FloatArray,
+    logs: FloatArray,
+) -> None:
+    """Write what is whitened of models that go together; their covariance goes on in its place."""
+    models, count, readings = series.shape
+    states, columns = observe.size, models * count
+    work, shared = np.empty((3, states, states)), np.empty((models, states))
+    variance, log_variance = np.ones(models), np.zeros(models)
+    settled, before = np.zeros(models, np.bool_), -1
+    # Of each series: what is expected of its states, its model's F and gain, one over its sd.
+    mean, after = np.zeros((states, columns)), np.zeros((states, columns))
+    kept, gain = np.empty((states, states, columns)), np.empty((states, columns))
+    scale, values = np.empty(columns), np.empty((PIECE, columns))
+    for first in range(0, readings, PIECE):
+        size = min(PIECE, readings - first)
+        for model in range(models):
+            for k in range(count):
+                values[:size, model * count + k] = series[model, k, first : first + size]
+        for t in range(size):
+            step = gaps[first + t + 1] if first + t + 1 < readings else 0
+            for model in range(models):
+                if not settled[model]:
+                    variance[model] = _observe(
+                        covariance[model], observe, sensor[model], shared[model]
+                    )
+                    log_variance[model] = math.log(variance[model])
+                if not settled[model] or step != before:
+                    own = slice(model * count, (model + 1) * count)
+                    scale[own] = 1.0 / math.sqrt(variance[model])
+                    _set_gain(
+                        transitions[step, model], shared[model], variance[model], kept[..., own],
+                        gain[:, own],
+                    )  # fmt: skip
+                logs[model] += log_variance[model]
+            before = step
+            _innovate(values[t], mean, after, kept, gain, observe, scale)
+            mean, after = after, mean
+            for model in range(models):
+                if not settled[model] or step > 0:
+                    # After a gap the covariance is another one, and so are its gains.
+                    settled[model] = _advance(
+                        covariance[model], transitions[step, model], gained[step, model],
+                        shared[model], observe, sensor[model], variance[model], work,
+                    ) and step == 0  # fmt: skip
+        for model in range(models):
+            for k in range(count):
+                white[model, k, first : first + size] = values[:size, model * count + k]
+
+
+@inner(error_model="numpy")
+def _set_gain(
+    transition: FloatArray,
+    shared: FloatArray,
+    variance: float,
+    kept: FloatArray,
+    gain: FloatArray,
+) -> None:
+    """Write F and F P h / S for the series of a model, (states, states, series), (states, series).
+
+    P h (states,) is ``shared``, S the ``variance`` of a reading.
+    """
+    states = shared.size
+    for i in range(states):
+        own = 0.0
+        for j in range(states):
+            own += transition[i, j] * shared[j]
+            kept[i, j] = transition[i, j]
+        gain[i] = own / variance
 
 
 @inner(error_model="numpy")
@@ -82,31 +137,26 @@ def _innovate(
     mean: FloatArray,
     after: FloatArray,
     kept: FloatArray,
-    shared: FloatArray,
+    gain: FloatArray,
     observe: FloatArray,
-    variance: float,
+    scale: FloatArray,
 ) -> None:
     """Turn a reading of each series (series,) into its innovation over its sd.
 
     ``mean`` (states, series) is expected of it, and ``after`` written: what is of the next one.
     """
     states, count = mean.shape
-    scale = 1.0 / math.sqrt(variance)
     for i in range(states):
         for k in range(count):
             values[k] -= observe[i] * mean[i, k]
     for i in range(states):
-        gain = 0.0
-        for j in range(states):
-            gain += kept[i, j] * shared[j]
-        gain /= variance
         for k in range(count):
-            after[i, k] = gain * values[k]
+            after[i, k] = gain[i, k] * values[k]
         for j in range(states):
             for k in range(count):
-                after[i, k] += kept[i, j] * mean[j, k]
+                after[i, k] += kept[i, j, k] * mean[j, k]
     for k in range(count):
-        values[k] *= scale
+        values[k] *= scale[k]
 
 
 @inner(error_model="numpy")
