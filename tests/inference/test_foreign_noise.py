@@ -30,7 +30,7 @@ from bwbayes.inference.noise import (
     noise_model,
 )
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.state_space import LOG_TWO_PI, Noise
+from bwbayes.inference.state_space import LOG_TWO_PI, Noise, root
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration
 from bwbayes.model.distributions import Distribution
@@ -253,6 +253,22 @@ def test_draws_have_the_covariance(case: Case) -> None:
     factor = np.linalg.cholesky(dense(case, theta, np.arange(30)))
     white = scipy.linalg.solve_triangular(factor, draws.T, lower=True)
     assert np.abs(np.mean(white**2, axis=1) - 1).max() < 4.5 * np.sqrt(2 / 1_000)
+
+
+@EACH
+def test_draws_go_on_sample_by_sample(case: Case) -> None:
+    """A long draw is x ← F x + shock, one sample after the other, to 1e-12 of its largest value."""
+    theta = stationary_theta(case, np.array([0.3, 0.6, 0.4]))[np.newaxis]
+    noise, samples = noise_model(case.noise, INTERVAL), 3_000
+    drawn, _ = noise.draw(theta, samples, np.random.default_rng(3))
+    scores = np.random.default_rng(3).standard_normal((noise.states + 1, samples))[:-1].T
+    (kept,) = noise.transition(theta)
+    shocks = scores @ root(noise.process_covariance(theta))[0]
+    states = [scores[0] @ root(noise.stationary(theta))[0]]
+    for shock in shocks[1:]:
+        states.append(kept @ states[-1] + shock)
+    slow = np.stack(states) @ noise.observe
+    assert drawn == pytest.approx(slow, rel=0, abs=1e-12 * np.abs(slow).max())
 
 
 @EACH
