@@ -13,7 +13,7 @@ with the curvature H of minus the log density at the mode z. A fit takes some te
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 
@@ -175,11 +175,23 @@ class _Target:
     ) -> FloatArray:
         """Log density (models,), less a constant, where the displacement (readings,) is known."""
         possible, density = np.isfinite(log_prior), log_prior.copy()
-        if possible.any():
-            theta = theta[possible]
+        likelihood, theta = self.posterior.likelihood, theta[possible]
+        readings = likelihood.readings
+        if not possible.any():
+            return density
+        if likelihood.engine == "numba" and 2 * readings.rows.size > readings.samples:
+            # To simulate again is faster than to pass whitened series through the memory. What an
+            # effect does to the displacement is taken from the readings.
+            plain = displacement
+            if self.effect is not NONE:
+                model = likelihood.table.actuator(theta[:1])
+                voltage = likelihood.voltage[: readings.samples]
+                plain = likelihood.simulate(model, voltage)[0, readings.where]
+            readings = replace(readings, values=readings.values + (plain - displacement))
+            density[possible] += replace(likelihood, readings=readings).log_density(theta)
+        else:
             moved = np.tile(displacement, (len(theta), 1))
-            score = self.posterior.likelihood.score(theta, moved[:0], moved)
-            density[possible] += score.log_density
+            density[possible] += likelihood.score(theta, moved[:0], moved).log_density
         return np.where(np.isfinite(density), density, -np.inf)
 
     def at(self, coordinates: FloatArray) -> _State:
