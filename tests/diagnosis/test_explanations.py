@@ -260,6 +260,7 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
         assert 500 == seen.posterior.only.readings.rows.size
         families = effects.delay, effects.moving_gain, model.creep, model.hold
         found = [explanation for family in families for explanation in family(seen)]
+        found.sort(key=lambda explanation: explanation.nats)
         nats[stride] = {explanation.kind: explanation.nats for explanation in found}
     whole, thin = nats[1], nats[4]
     best = max(whole, key=whole.__getitem__)
