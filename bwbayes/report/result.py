@@ -164,8 +164,11 @@ def summary(result: Result) -> dict[str, object]:
         "remarks": list(result.remarks),
     }
     if not outcome.converged:
-        sections = ("parameters", "validation", "innovations", "loops", "step_responses")
-        return numbers | dict.fromkeys((*sections, "identifiability", "replicated", "explanations"))
+        sections = (
+            *("parameters", "validation", "validated_drives", "innovations", "loops"),
+            *("step_responses", "identifiability", "replicated", "explanations"),
+        )
+        return numbers | dict.fromkeys(sections)
     innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
     if len(innovations) == 1:
         # Those of one record stand alone, those of several by their names.
@@ -175,6 +178,8 @@ def summary(result: Result) -> dict[str, object]:
     return numbers | {
         "parameters": result.estimates,
         "validation": result.validation,
+        # No other drives: what a model lacks is of another size there.
+        "validated_drives": result.facts["drive"] if result.standing.holds else None,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.steps.items()},
