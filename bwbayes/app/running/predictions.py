@@ -172,9 +172,10 @@ def planned_noise(record: Record) -> str:
 def _from_rest_remark(
     problem: Problem, draws: FloatArray, other: Validation, bands: Bands, beyond: Iterable[Finding]
 ) -> str:
-    """Say what it would change to declare a record from rest; nothing unless it may start so.
+    """Say what it would change to declare a record from rest.
 
-    Of every fourth draw.
+    Nothing unless it may start so, or where width and coverage stay the same to a tenth. Of every
+    fourth draw.
     """
     record, start = other.record, other.start
     assert record is not None
@@ -189,8 +190,11 @@ def _from_rest_remark(
         widths.append(float(np.mean((upper - lower)[scored])))
         if bands.measured is not None:
             inside = predicted.covers("sensor", 95, bands.measured)[scored]
-            shares.append(f" and covers {np.mean(inside[np.isfinite(bands.measured[scored])]):.1%}")
-    unknown, known = (f"{w:.3g} um wide{c}" for w, c in zip_longest(widths, shares, fillvalue=""))
+            shares.append(float(np.mean(inside[np.isfinite(bands.measured[scored])])))
+    if np.allclose(widths[0], widths[1], rtol=0.1) and np.ptp(shares or [0.0]) < 0.1:
+        return ""
+    covers = [f" and covers {share:.1%}" for share in shares]
+    unknown, known = (f"{w:.3g} um wide{c}" for w, c in zip_longest(widths, covers, fillvalue=""))
     return (
         f"the record starts at 0 V, perhaps from rest: the 95% sensor band is {unknown}; "
         f"{known} if the actuator was demagnetized and nothing moved, which --from-rest declares"
