@@ -179,7 +179,7 @@ def summary(result: Result) -> dict[str, object]:
         "parameters": result.estimates,
         "validation": result.validation,
         # No other drives: what a model lacks is of another size there.
-        "validated_drives": result.facts["drive"] if result.standing.holds else None,
+        "validated_drives": result.facts.get("drive") if result.standing.holds else None,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.steps.items()},

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.validation import Verdict
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
 from bwbayes.report.result import summary
@@ -51,6 +52,14 @@ def test_the_means_error_is_that_of_a_known_process() -> None:
     expected = 3.0 * np.sqrt((1 + kept) / (1 - kept) / (600 * 4 * 16))
     for row in parameters(draws).values():
         assert expected == pytest.approx(row["mcse_mean"], rel=0.2)
+
+
+@pytest.mark.parametrize("holds", [True, False, None])
+def test_drives_are_validated_only_where_all_bands_passed(holds: bool | None) -> None:
+    run = replace(example.run(), facts={"drive": "0 to 95 V"})
+    verdict = Verdict("verification", training=False, holds=holds)
+    validated = summary(replace(run, verdicts={"verification": verdict}))["validated_drives"]
+    assert validated == ("0 to 95 V" if holds else None)
 
 
 # What a run's files hold is what was computed, to the digits that matter
