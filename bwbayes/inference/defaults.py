@@ -21,7 +21,6 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.reversals import time_between_turns
-from bwbayes.record.voltage_path import noise_sd, rounding_step
 
 
 def ranges_of(
@@ -57,6 +56,9 @@ def rounding_sd(readings: FloatArray) -> float:
     their range, of which no converter resolves less. The likelihood of a model that follows them
     exactly has no bound where the sensor's sd may be less.
     """
+    # Here, because to open a run is to read files: records bring what reads any of them.
+    from bwbayes.record.voltage_path import noise_sd, rounding_step  # noqa: PLC0415
+
     step = max(rounding_step(readings), 2.0**-24 * float(np.ptp(readings)))
     rounding = step / math.sqrt(12)
     enough = readings.size > 10  # for differences of the highest order

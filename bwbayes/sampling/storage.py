@@ -29,7 +29,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import emcee
 import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, one_line
@@ -203,7 +202,8 @@ class ChainFile(Chain):
         InputError
             There is no room for it; the chain is whole without it.
         """
-        import h5py  # noqa: PLC0415  # slow to load
+        import emcee  # noqa: PLC0415  # slow to load, as HDF5 is
+        import h5py  # noqa: PLC0415
 
         file = self.path.with_suffix(".h5")
         draft = self.path.with_suffix(".h5.partial")

@@ -36,6 +36,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.watching import Watch
 from tests.app.mutations import KINDS, QUICK, Case, case, made
 from tests.measured import keep
 
@@ -75,7 +76,7 @@ def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app_check, "save", lambda *_, **__: [])
 
 
-def best_draw(posterior: Posterior, generator: np.random.Generator) -> pointfit.PointFit:
+def best_draw(posterior: Posterior, generator: np.random.Generator, _: Watch) -> pointfit.PointFit:
     """Stand in for the point fit, with its error for priors that the record contradicts."""
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(generator, 64))

@@ -181,7 +181,7 @@ def test_the_config_names_the_table_that_was_chosen(bwbayes: Type, write: Write)
     path.write_text(f"first\n{turned}\nsecond\n{write().read_text()}")
     for name in ("init", "run", "check"):
         said = bwbayes(name, path)
-        said.assert_refused("2 tables with numbers: 1 'first', 2 'second'", "`--table 1`")
+        said.assert_refused("2 tables with numbers: 1 'first' (", ", 2 'second' (", "`--table 1`")
     assert 0 == bwbayes("init", path, "--table", "second").status
     record = load(path.with_suffix(".toml")).records["record"]
     assert "second" == record.table

@@ -121,8 +121,10 @@ def test_a_pickle_in_a_record_is_refused_or_inert(
     if plant == "attribute in h5":
         np.testing.assert_array_equal(good_arrays()["voltage_V"], read_record(path).voltage)
     else:
-        with pytest.raises(InputError):
-            read_record(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)  # an object may be named before
+            with pytest.raises(InputError):
+                read_record(path)
     assert not mark.exists()
 
 
@@ -248,7 +250,9 @@ def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
     """Brackets are no markup there, and do not stop the command."""
     parameters = [dataclasses.replace(p, unit=text) for p in example.PARAMETERS]
     report = Report(title="", blocks=[priors_table(JointPrior(parameters))])
-    assert text.partition("\0")[0] in as_text(report, width=500)
+    # A long one may go on in the next line.
+    shown = " ".join(as_text(report, width=500).split())
+    assert " ".join(text.partition("\0")[0].split()) in shown
 
 
 # Names and paths

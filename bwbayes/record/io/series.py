@@ -199,7 +199,9 @@ def pass_over_object(path: Path, name: str, kind: str) -> None:
     advice = "save its numbers as variables"
     if kind in ways:
         advice = f"{ways[kind]}; save('record.mat', '-struct', 's')"
-    text = f"{path}: {name}: a MATLAB {kind}, which only MATLAB reads, is left out; {advice}"
+    # A damaged file may have anything for a name.
+    what = f"{name}: a MATLAB {kind}" if f"{name}{kind}".isidentifier() else "a MATLAB object"
+    text = f"{path}: {what}, which only MATLAB reads, is left out; {advice}"
     warnings.warn(one_line(text), InputWarning, stacklevel=5)
 
 
