@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from openpyxl import Workbook
 
@@ -38,6 +38,8 @@ def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
     tmp_path_factory: pytest.TempPathFactory, shown: str, dt: float, start: float, by_python: bool
 ) -> None:
     """As 15 digits of days, or as openpyxl writes Python's times; both far below 1 ms."""
+    # Of a date 15 digits of days are 9 us.
+    assume(by_python or shown != "date" or dt > 2e-5)
     book = Workbook()
     book.active.append(["Time", "U [V]", "x [um]"])
     whole_days = 46_084 if shown == "date" else 0
