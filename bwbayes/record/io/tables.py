@@ -20,7 +20,7 @@ _CELL = re.compile(_NUMBER, re.IGNORECASE)
 _FEWEST = 3
 
 
-class Table(NamedTuple):
+class TextTable(NamedTuple):
     """Where a table is in a text, the lines above its header included, its title and its header."""
 
     lines: range
@@ -28,7 +28,7 @@ class Table(NamedTuple):
     header: str
 
 
-def tables_of(lines: Sequence[str]) -> list[Table]:
+def tables_of(lines: Sequence[str]) -> list[TextTable]:
     """Return the tables in a text.
 
     A table ends where a header follows its rows: a line of words, as many as the cells of the
@@ -67,10 +67,10 @@ def tables_of(lines: Sequence[str]) -> list[Table]:
         last = index if rows >= _FEWEST else last
     starts = [0, *(start for start, *_ in tables[1:]), len(lines)]
     named = [(title, header) for _, title, header in tables] or [("", "")]
-    return [Table(range(*starts[i : i + 2]), *names) for i, names in enumerate(named)]
+    return [TextTable(range(*starts[i : i + 2]), *names) for i, names in enumerate(named)]
 
 
-def described(tables: Sequence[Table], lines: Sequence[str]) -> list[str]:
+def described(tables: Sequence[TextTable], lines: Sequence[str]) -> list[str]:
     """Say of each of several tables how many rows are below which header."""
     rows = [sum(map(bool, map(_ROW.match, lines[t.lines.start : t.lines.stop]))) for t in tables]
     heads = [f" below {t.header[:60]!r}" * (t.header not in ("", t.title)) for t in tables]
