@@ -97,6 +97,38 @@ for number in range(2):
     assert "no cache can be written" in ended.stderr
 
 
+OUTER = """
+from bwbayes.inference.compiled.caching import compile_cached
+from bwbayes.model.inner import inner
+
+@compile_cached()
+def outer():
+    return inner()
+"""
+INNER = """
+from bwbayes.inference.compiled.caching import compile_cached
+
+@compile_cached()
+def inner():
+    return {}
+"""
+
+
+def test_what_is_compiled_of_other_sources_is_not_taken(tmp_path: Path) -> None:
+    """What is called has changed alone, which numba does not look at; else the cache is taken."""
+    package = tmp_path / "bwbayes"
+    shutil.copytree(Path(bw.__file__).parent, package, ignore=shutil.ignore_patterns("*cache*__"))
+    (package / "inference" / "compiled" / "outer.py").write_text(OUTER)
+    (tmp_path / "script.py").write_text("""
+from bwbayes.inference.compiled.outer import outer
+print(outer(), sum(outer.stats.cache_hits.values()))
+""")
+    for value, hits in ((1, 0), (1, 1), (20, 0)):
+        (package / "model" / "inner.py").write_text(INNER.format(value))
+        ended = python(str(tmp_path / "script.py"))
+        assert ended.stdout == f"{value} {hits}\n", ended.stderr
+
+
 WORK = """
 from bwbayes.app.running.workers import open_executor
 {broken}

@@ -1,9 +1,15 @@
-"""Compile and keep what is compiled on disk, where a place can be written."""
+"""Compile and keep what is compiled on disk, where a place can be written.
+
+numba looks for changes in the file of the function that is called alone, and has compiled into it
+what other files say. So what is kept is named after all sources that may be compiled in.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, cast
 
 from numba import njit
@@ -11,15 +17,29 @@ from numba import njit
 from bwbayes.errors import InputWarning
 
 
+def _digest() -> str:
+    """Return a digest of the sources of the compiled likelihood and of the models."""
+    compiled = Path(__file__).parent
+    sources = [*compiled.glob("*.py"), *(compiled.parents[1] / "model").rglob("*.py")]
+    return sha256(b"".join(path.read_bytes() for path in sorted(sources))).hexdigest()[:16]
+
+
+SOURCES = _digest()
+
+
 def compile_cached[Function: Callable[..., Any]](**options: Any) -> Callable[[Function], Function]:
     """Return numba's decorator with a cache; without one, and a warning, if none can be written."""
 
     def decorate(function: Function) -> Function:
+        name = function.__qualname__
         try:
+            function.__qualname__ = f"{name}-{SOURCES}"  # numba names what it keeps after it
             return cast("Function", njit(nogil=True, cache=True, **options)(function))
         except RuntimeError as error:
             if "cannot cache" not in str(error):
                 raise
+        finally:
+            function.__qualname__ = name
         # At one place for all functions, so that it is shown once.
         warnings.warn(
             "numba: no cache can be written, so that every process compiles anew; set "
