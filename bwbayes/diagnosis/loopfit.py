@@ -22,6 +22,9 @@ from bwbayes.record.record import Record
 WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])
 FREE_STARTS = slice(2, None, 2)
 
+# A decay that takes longer, as a fraction of the record, is a drift.
+LONG_DECAY = 0.13
+
 
 @dataclass(frozen=True)
 class LoopFit:
@@ -43,12 +46,13 @@ class LoopFit:
         How far off the displacement starts in all: the decay, and what another state of the plays
         would change.
     decay_share : float
-        Part of the decay's variance that loops and a trend do not imitate, at most 1; with little
+        Part of the decay's variance that loops, creep and a trend do not imitate; with little
         of it neither `decay` nor `start` means anything.
     trend : float, um
-        How far the displacement goes from the first reading to the last at equal voltages.
+        How far the displacement goes from the first reading to the last at equal voltages: evenly,
+        and by a decay that takes longer than `LONG_DECAY`.
     trend_share : float
-        The same of the trend, that loops do not imitate.
+        Part of the trend's variance that loops and creep do not imitate.
     explained : float
         Part of the displacement's variance that the voltage explains, at most 1.
     missed : float
@@ -56,6 +60,9 @@ class LoopFit:
     without_loops : float
         Probability (F test, for white noise) that a curve and a lag leave so much more than loops
         do if there are none.
+    driven_decay, driven_trend : float, um
+        How large a decay and a trend of other origin the voltage may drive: by creep, and by small
+        hysteresis loops that do not close.
     """
 
     rows: IntArray
@@ -71,43 +78,46 @@ class LoopFit:
     explained: float
     missed: float
     without_loops: float
+    driven_decay: float
+    driven_trend: float
 
 
 def fit_loop(record: Record) -> LoopFit:
-    """Fit loops to a record's readings."""
+    """Fit loops and creep to a record's readings."""
     assert record.displacement is not None
     rows = _rows(record.voltage, np.flatnonzero(record.has_reading))
     has_reading = record.has_reading[rows]
-    displacement = record.displacement[rows[has_reading]]
-    time = record.time[rows]
-    centered = displacement - displacement.mean()
-
-    elapsed = time[has_reading] - time[has_reading][0]
+    displacement, time = record.displacement[rows[has_reading]], record.time[rows[has_reading]]
+    centered, elapsed = displacement - displacement.mean(), time - time[0]
     trend_shape = elapsed / elapsed[-1] - 0.5
     times = np.geomspace(max(elapsed[1], 1e-5 * elapsed[-1]), elapsed[-1] / 6, 20)
     decays = np.exp(-elapsed[:, np.newaxis] / times)
     columns = np.column_stack([decays, centered])
     among_columns = _products(columns, columns)
 
-    # None, and from half an interval to a part of a half turn.
-    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
-    edges = np.concatenate([[0], turns, [record.samples - 1]])
-    slowest = 0.3 * record.interval * float(np.median(np.diff(edges)))
-    lagging = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
-    lags = np.concatenate([[0.0], lagging])
-    fits = []
+    lags, fits = _lags(record), []
     lagged_voltages = [_lagged(record.voltage, lag / record.interval)[rows] for lag in lags]
     for lag, loops in zip(lags, _bases(np.array(lagged_voltages), has_reading), strict=True):
         basis = np.column_stack([loops, trend_shape])
         fits.append((*_best_decay(basis, columns, among_columns), basis, float(lag)))
-    remainder, which, basis, lag = min(fits, key=lambda fit: fit[0])
-    design = np.column_stack([basis, decays[:, which]])
-    products = _products(design, centered[:, np.newaxis])
+    remainder, _, basis, lag = min(fits, key=lambda fit: fit[0])
+    creep, slow = _slow(_lagged(record.voltage, lag / record.interval), rows[has_reading])
+    design, which, coefficients = _with_creep(basis, creep, columns, among_columns)
+    # A gain and a half is creep of 7% a decade: what goes back, or further, is something else.
+    slope = np.ptp(centered) / max(float(np.ptp(record.voltage)), 1e-300)
+    if not 0 <= coefficients[1] < 1.5 * slope:
+        nothing = np.zeros(creep.size)
+        design, which, coefficients = _with_creep(basis, nothing, columns, among_columns)
     among = _products(design, design)
-    coefficients = _inverse(among) @ products[:, 0]
+    imitated = np.abs(_inverse(among) @ _products(design, slow)).sum(axis=1)
     residual = centered - (design * coefficients).sum(axis=1)
     undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centered - undriven
+    drift = undriven if times[which] > LONG_DECAY * elapsed[-1] else coefficients[-2] * trend_shape
+    moved = float(drift[-1] - drift[0])
+    alone = np.column_stack([design[:, :-2], drift])
+    among_alone = _products(alone, alone)
+    followed = np.abs(_inverse(among_alone) @ _products(alone, slow)).sum(axis=1)
     lagged = basis[:, 1] - basis[:, 1].mean()
 
     def curved(samples: float) -> float:
@@ -128,22 +138,34 @@ def fit_loop(record: Record) -> LoopFit:
     remainder = min(remainder, behind_lag)
     added, degrees = basis.shape[1] - 4, max(centered.size - basis.shape[1] - 2, 1)
     ratio = (optimum.fun - remainder) / added / max(remainder / degrees, 1e-300)
+    gain = float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300))
     return LoopFit(
         rows[has_reading],
         residual,
-        float(lagged @ (driven - residual) / max(float(lagged @ lagged), 1e-300)),
+        gain,
         lag,
         float(coefficients[-1]),
         float(times[which]),
-        float(design[0, 3 + WIDTHS.size :] @ coefficients[3 + WIDTHS.size :])
+        float(design[0, 4 + WIDTHS.size :] @ coefficients[4 + WIDTHS.size :])
         + coefficients[-2] / 2,
         _distinct(among),
-        float(coefficients[-2]),
-        _distinct(among[:-1, :-1]),
+        moved,
+        _distinct(among_alone),
         1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
         max(float(np.var(residual) - _white(residual)), 0.0) / max(np.var(centered), 1e-300),
         float(scipy.stats.f.sf(ratio, added, degrees)),
+        abs(gain) * float(imitated[-1]),
+        abs(gain * moved) * float(followed[-1]),
     )
+
+
+def _lags(record: Record) -> FloatArray:
+    """Return the lags to try, s: none, and from half an interval to a part of a half turn."""
+    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
+    edges = np.concatenate([[0], turns, [record.samples - 1]])
+    slowest = 0.3 * record.interval * float(np.median(np.diff(edges)))
+    lagging = np.geomspace(0.5 * record.interval, max(slowest, record.interval), 9)
+    return np.concatenate([[0.0], lagging])
 
 
 def find_delay(record: Record, limit: float) -> tuple[float, float]:
@@ -225,6 +247,23 @@ def _bases(voltages: FloatArray, has_reading: BoolArray) -> Iterator[FloatArray]
         yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[has_reading]
 
 
+def _slow(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return what a voltage (samples,) drives beside loops that close, at rows, for a gain of 1.
+
+    Creep of 5% of the gain in each decade of the time from ten samples on, (rows,); and each decade
+    by itself, with the states of two Bouc-Wen models, h' = 0.4 u' - b (|u'| h + u' |h| / 2), whose
+    small loops do not close, (rows, decades + 2).
+    """
+    times = 10.0 ** np.arange(1.0, max(np.log10(voltage.size), 1.1))
+    decades = 0.05 * np.stack([_lagged(voltage, time)[rows] for time in times], axis=1)
+    half = max(float(np.ptp(voltage)) / 2, 1e-300)
+    rates, h, states = np.array([1.0, 3.0]), np.zeros(2), np.zeros((rows.size, 2))
+    for row, step in enumerate(np.diff(voltage[rows] / half).tolist(), 1):
+        h = (h + 0.4 * step) / (1 + rates * (abs(step) + step * np.sign(h) / 2))  # stable
+        states[row] = h
+    return decades.sum(axis=1), np.column_stack([decades, half * states])
+
+
 def _best_decay(
     basis: FloatArray, columns: FloatArray, among_columns: FloatArray
 ) -> tuple[float, int]:
@@ -239,6 +278,24 @@ def _best_decay(
     gained = np.where(distinct, remainder[-1, :-1] ** 2 / np.maximum(power, 1e-300), 0.0)
     which = int(np.argmax(gained))
     return float(remainder[-1, -1] - gained[which]), which
+
+
+def _with_creep(
+    basis: FloatArray, creep: FloatArray, columns: FloatArray, among_columns: FloatArray
+) -> tuple[FloatArray, int, FloatArray]:
+    """Fit the basis with creep (readings,) and the best decay to the last of the columns.
+
+    Returns the design, (readings, n), with creep second and the decay last, which decay that is,
+    and the coefficients (n,).
+    """
+    full = np.column_stack([basis[:, 0], creep, basis[:, 1:]])
+    _, which = _best_decay(full, columns, among_columns)
+    design = np.column_stack([full, columns[:, which]])
+    return (
+        design,
+        which,
+        _inverse(_products(design, design)) @ _products(design, columns[:, -1:])[:, 0],
+    )
 
 
 def _products(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -258,7 +315,7 @@ def _distinct(products: FloatArray) -> float:
     shared = products[:-1, -1]
     total = products[-1, -1] - shared[0] ** 2 / products[0, 0]
     remainder = products[-1, -1] - shared @ _inverse(products[:-1, :-1]) @ shared
-    return float(remainder / total)
+    return float(remainder / max(total, 1e-300))
 
 
 def _inverse(products: FloatArray) -> FloatArray:

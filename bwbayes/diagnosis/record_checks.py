@@ -13,7 +13,7 @@ import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.loopfit import LoopFit, find_delay, fit_loop
+from bwbayes.diagnosis.loopfit import LONG_DECAY, LoopFit, find_delay, fit_loop
 from bwbayes.diagnosis.series_patterns import (
     Stuck,
     clipped,
@@ -29,9 +29,6 @@ from bwbayes.diagnosis.series_patterns import (
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
-
-# A decay that takes longer, as a fraction of the record, is a drift.
-LONG_DECAY = 0.13
 
 
 def inspect(record: Record) -> tuple[Finding, ...]:
@@ -389,10 +386,11 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     velocity = float(np.quantile(steps, 0.99)) / record.interval
     lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
     # Another hysteretic state at the start, which steps of the voltage do not show, is less sure.
-    moving = np.count_nonzero(steps) > steps.size / 2
-    if abs(loop.start) > max(20 * spread, 0.24 * extent) and moving and abs(size) > spread:
+    moving, driven = np.count_nonzero(steps) > steps.size / 2, 2 * loop.driven_decay
+    outside = abs(loop.start) > max(20 * spread, 0.24 * extent, driven)
+    if outside and moving and abs(size) > spread:
         size = loop.start
-    elif abs(size) < max(12 * spread, 0.1 * extent, 3 * lagged) or (
+    elif abs(size) < max(12 * spread, 0.1 * extent, 3 * lagged, driven) or (
         time > LONG_DECAY * record.duration
     ):
         return
@@ -425,15 +423,12 @@ def settle_fix(voltage: FloatArray, gone: int, leave_out: str) -> str:
 
 
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a trend, of which loops would imitate nine tenths at most."""
+    """Find a trend that the voltage does not drive: twice as large as what it might."""
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     size = loop.trend
-    if loop.decay_time > LONG_DECAY * record.duration:
-        size -= loop.decay * (1 - float(np.exp(-record.duration / loop.decay_time)))
     share = max(loop.trend_share, 1e-12)
-    if share > 0.1 and abs(size) > max(7 * spread / np.sqrt(share), 0.05 * extent):
+    least = max(10 * spread / np.sqrt(share), 0.05 * extent, 2 * loop.driven_trend)
+    if share > 0.03 and abs(size) > least:
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
-        if share < 0.5:  # the drive has a trend itself, which creep follows
-            fix = f"if it creeps, set creep = true in [model]; else {fix}"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")
