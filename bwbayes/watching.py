@@ -18,9 +18,23 @@ def unwatched(*_: object) -> None:
 
 def watched[T](items: Sequence[T], watch: Watch) -> Iterator[T]:
     """Yield items one by one, and call ``watch`` with the share of them that is done."""
-    for number, item in enumerate(items, start=1):
+    more = counted(len(items), watch)
+    for item in items:
         yield item
-        watch(number / len(items))
+        more(1)
+
+
+def counted(total: int, watch: Watch) -> Callable[[int], None]:
+    """Return what is called with how many more of a total are done; ``watch`` gets the share."""
+    done = 0
+    watch(0.0 if total else 1.0)
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        watch(min(done / total, 1.0))
+
+    return more
 
 
 def part(watch: Watch, first: float, last: float) -> Watch:

@@ -26,7 +26,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
-from bwbayes.watching import Watch, unwatched, watched
+from bwbayes.watching import Watch, part, unwatched, watched
 
 
 def promises(
@@ -122,13 +122,15 @@ def promises(
     gradients = [derivatives(position, columns, quantity) for position in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
     scores = []
-    for name, voltage in watched([*candidates.items()], watch):
+    models, count = [*zip(chosen, gradients, strict=True)], len(candidates)
+    for number, (name, voltage) in enumerate(candidates.items()):
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
         if refused:
             scores.append(Promise(name, np.nan, np.nan, refused))
             continue
         likelihood, remaining = _planned(posterior, voltage), []
-        for position, gradient in zip(chosen, gradients, strict=True):
+        this = part(watch, number / count, (number + 1) / count)
+        for position, gradient in watched(models, this):
             shapes = derivatives(position, np.concatenate([columns, new]), likelihood)
             theta = prior.theta(prior.constrain(position[np.newaxis])[0])
             information = _information(likelihood, theta, shapes, columns.size)

@@ -20,6 +20,7 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
 from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.watching import Watch, unwatched, watched
 
 
 class Bridge(NamedTuple):
@@ -66,6 +67,7 @@ def evidence(
     draws: FloatArray,
     log_density: FloatArray,
     generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> Evidence:
     """Estimate the log evidence.
 
@@ -85,6 +87,8 @@ def evidence(
         (steps, ensembles, walkers), nats, as the chain has it.
     generator
         Draws from mixture and prior.
+    watch
+        Called with the share that is done.
     """
     free = draws.shape[-1]
     coordinates = posterior.prior.unconstrain(draws.reshape(-1, free))
@@ -105,7 +109,8 @@ def evidence(
     at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))
     places, proposed = proposal.evaluate(proposal.draw(random, 10_000))
-    at_places = posterior.log_density(places) - proposed
+    densities = [*map(posterior.log_density, watched(np.array_split(places, 20), watch))]
+    at_places = np.concatenate(densities) - proposed
     bridged = bridge(at_draws, at_places)
     # The chain's density leaves out the constant of the standard normal φ.
     constant = -0.5 * free * np.log(2 * np.pi)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -22,10 +23,11 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import thinned
-from bwbayes.sampling.chain import draws
-from bwbayes.sampling.diagnostics import autocorrelation_time
+from bwbayes.sampling.chain import Phase, draws
+from bwbayes.sampling.diagnostics import Check, autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
 
 # What the later half of the training readings is called.
 FUTURE = "later training"
@@ -73,6 +75,7 @@ def leave_future_out(
     executor: Executor,
     *,
     future: bool = True,
+    watch: WatchSteps = unwatched,
 ) -> dict[str, Part]:
     """Score the later half of the training readings, and the held-out windows of the same records.
 
@@ -87,6 +90,8 @@ def leave_future_out(
     future
         Whether to score the later half of the training readings, given the earlier one, which
         takes a fit to the earlier one.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Returns
     -------
@@ -101,9 +106,10 @@ def leave_future_out(
         rows = {name: dataset.readings.rows for name, dataset in datasets.items()}
         later = {name: readings[readings.size // 2 :] for name, readings in rows.items()}
         path = _path(posterior, dict.fromkeys(training, ()), training, later)
-        earlier = _fitted(path[0], plan, flat, rng, executor)
+        earlier = _fitted(path[0], plan, flat, rng, executor, partial(watch, "earlier training"))
         if earlier is not None:
-            parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng)
+            scoring = partial(watch, FUTURE)
+            parts[FUTURE] = _scored(path, {0: earlier, BLOCKS: flat}, later, rng, scoring)
     for record, named in held_out.items():
         for name, windows in named.items():
             window_rows = np.concatenate([np.arange(w.start, w.stop) for w in windows])
@@ -112,12 +118,14 @@ def leave_future_out(
                 continue
             path = _path(posterior, training, {record: windows}, later)
             training = {dataset.name: dataset.training for dataset in path[-1].datasets}
-            score = _scored(path, {0: flat}, later, rng)
+            score = _scored(path, {0: flat}, later, rng, partial(watch, name))
             # What is left of the draws at the far end is worth too few: that end is sampled too.
             if score.effective < 100:
-                longer = _fitted(path[-1], plan, flat, rng, executor)
+                again = partial(watch, f"training and {name}")
+                longer = _fitted(path[-1], plan, flat, rng, executor, part(again, 0.0, 0.8))
                 if longer is not None:
-                    score = _scored(path, {0: flat, BLOCKS: longer}, later, rng)
+                    drawn = {0: flat, BLOCKS: longer}
+                    score = _scored(path, drawn, later, rng, part(again, 0.8, 1.0))
                     flat = longer
             parts[name] = score
     return parts
@@ -209,11 +217,12 @@ def _scored(
     drawn: Mapping[int, FloatArray],
     rows: Mapping[str, IntArray],
     rng: np.random.Generator,
+    watch: Watch,
 ) -> Part:
     """Score the blocks on the way from the first posterior to the last; ``drawn`` are draws."""
     chosen = {number: thinned(flat, rng, DRAWS) for number, flat in drawn.items()}
     theta = path[0].prior.theta(np.concatenate([*chosen.values()]))
-    log_likelihood = np.stack([posterior.log_likelihood(theta) for posterior in path])
+    log_likelihood = np.stack([p.log_likelihood(theta) for p in watched(path, watch)])
     counts = {number: len(flat) for number, flat in chosen.items()}
     log_z, effective = log_ratios(log_likelihood, counts)
     likeliest = theta[np.argmax(log_likelihood[-1]), np.newaxis]
@@ -233,6 +242,7 @@ def _fitted(
     flat: FloatArray,
     rng: np.random.Generator,
     executor: Executor,
+    watch: Watch,
 ) -> FloatArray | None:
     """Draw from the posterior of other readings, from draws of one nearby; None if that fails."""
     prior = posterior.prior
@@ -245,7 +255,15 @@ def _fitted(
     point = PointFit(best, covariance, float(np.max(density)), best[np.newaxis], wide)
     short = replace(plan, ess=min(400.0, plan.ess), most_steps=min(4000, plan.most_steps))
     chain = first_chain(posterior, point, short, rng)
-    if not sample(posterior, short, chain, executor).converged:
+    share = 0.0
+
+    def checked(_: Phase, check: Check | None) -> None:
+        nonlocal share
+        if check is not None:
+            share = max(share, min(float(np.nan_to_num(check.lowest_ess)) / short.ess, 1.0))
+        watch(share)
+
+    if not sample(posterior, short, chain, executor, checked).converged:
         return None
     return draws(posterior, chain).reshape(-1, len(posterior.names))
 

@@ -35,6 +35,7 @@ from bwbayes.diagnosis.laplace import LocalFit, climb
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
+from bwbayes.watching import Watch, unwatched, watched
 
 # Probability of a false alarm for a record.
 ALARM = 1e-3
@@ -107,7 +108,10 @@ class Agreement:
 
 
 def agreements(
-    posterior: Posterior, point: PointFit, begin: Mapping[str, float] | None = None
+    posterior: Posterior,
+    point: PointFit,
+    begin: Mapping[str, float] | None = None,
+    watch: Watch = unwatched,
 ) -> dict[str, Agreement]:
     """Compare each record of a joint posterior with all of them; nothing, if there is one alone.
 
@@ -119,12 +123,14 @@ def agreements(
         Its point fit.
     begin
         Time of each record's first sample, s, by name; by default 0.
+    watch
+        Called with the share that is done.
     """
     if len(posterior.datasets) == 1:
         return {}
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
-    for name, single, joint_free in posterior.each(free):
+    for name, single, joint_free in watched([*posterior.each(free)], watch):
         # Its noise is known, as that of the joint fit.
         theta, physical = single.prior.theta(joint_free)[0], single.table.physical
         parameters = (

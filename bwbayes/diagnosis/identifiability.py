@@ -32,6 +32,7 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.reversals import monotone_stretches, turning_points
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, part, unwatched, watched
 
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
@@ -259,6 +260,7 @@ def information_gain(
     draws: FloatArray,
     log_density: FloatArray,
     generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> InformationGain:
     """Hold the posterior against the prior.
 
@@ -272,6 +274,8 @@ def information_gain(
         (steps, ensembles, walkers), nats, as the chain has it: in its coordinates.
     generator
         Draws from the prior.
+    watch
+        Called with the share that is done.
 
     Notes
     -----
@@ -287,6 +291,7 @@ def information_gain(
     before, after = (prior.unconstrain(every) for every in (prior.draw(generator, count), thin))
     log_likelihood = log_density.ravel()[::step] - prior.constrain(after)[1]
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
+    watch(0.5)
     # The draws are taken as one chain: weights depend on no order.
     tree = arviz_base.from_dict(
         {
@@ -295,7 +300,10 @@ def information_gain(
             "log_likelihood": {"joint": log_likelihood[np.newaxis]},
         }
     )
-    to_prior, to_likelihood = (psense(tree, group=group) for group in ("prior", "likelihood"))
+    to_prior, to_likelihood = (
+        psense(tree, group=group)
+        for group in watched(("prior", "likelihood"), part(watch, 0.5, 1.0))
+    )
     parameters = {
         name: ParameterInformation(float(share), float(to_prior[name]), float(to_likelihood[name]))
         for name, share in zip(prior.free_names, contraction, strict=True)

@@ -32,6 +32,7 @@ from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, s
 from bwbayes.population.specimen import Specimen, likelihoods, shared
 from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, unwatched, watched
 
 # Specimens below which nothing is said of a spread.
 FEWEST = 3
@@ -150,11 +151,14 @@ class Population:
         return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def population(specimens: Sequence[Specimen], generator: np.random.Generator) -> Population:
+def population(
+    specimens: Sequence[Specimen], generator: np.random.Generator, watch: Watch = unwatched
+) -> Population:
     """Return what specimens say together of the parameters that all of them have.
 
     Beforehand the population's mean is known as well as a specimen's parameter is under its prior,
-    and its spread is half-normal, as wide as that: μ ~ N(m₀, s₀²), τ ~ |N(0, s₀²)|.
+    and its spread is half-normal, as wide as that: μ ~ N(m₀, s₀²), τ ~ |N(0, s₀²)|. ``watch`` is
+    called with the share that is done.
 
     Raises
     ------
@@ -170,7 +174,7 @@ def population(specimens: Sequence[Specimen], generator: np.random.Generator) ->
     tests = count * len(names)
     return Population(
         tuple(specimen.name for specimen in specimens),
-        {name: _population_of(specimens, name, generator, tests) for name in names},
+        {name: _population_of(specimens, name, generator, tests) for name in watched(names, watch)},
     )
 
 

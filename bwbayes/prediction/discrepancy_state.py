@@ -20,6 +20,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.state_space import Noise
+from bwbayes.watching import Watch, unwatched, watched
 
 
 @dataclass(frozen=True)
@@ -53,16 +54,22 @@ class DiscrepancyState:
 
 
 def filter_discrepancy(
-    likelihood: Likelihood, theta: FloatArray, simulated: FloatArray
+    likelihood: Likelihood, theta: FloatArray, simulated: FloatArray, watch: Watch = unwatched
 ) -> DiscrepancyState:
     """Return what the readings of a record leave at θ (draws, parameters).
 
-    ``simulated`` (draws, readings), um, is the model's displacement at the readings.
+    ``simulated`` (draws, readings), um, is the model's displacement at the readings. ``watch`` is
+    called with the share that is done.
     """
     readings, noise = likelihood.readings, likelihood.spaced
     parameters = likelihood.table.noise(theta)
-    residual = (readings.values - simulated)[:, np.newaxis]
-    filtered = noise.filter(parameters, residual, readings.skipped)
-    mean, gained = filtered.mean[:, 0], noise.stationary(parameters) - filtered.covariance
+    mean, covariance = [], []
+    # Some draws at a time: what is kept of all readings of all would not fit into memory.
+    for rows in watched(np.array_split(np.arange(len(theta)), -(-len(theta) // 50)), watch):
+        residual = (readings.values - simulated[rows])[:, np.newaxis]
+        filtered = noise.filter(parameters[rows], residual, readings.skipped)
+        mean.append(filtered.mean[:, 0])
+        covariance.append(filtered.covariance)
+    gained = noise.stationary(parameters) - np.concatenate(covariance)
     last = int(readings.rows[-1])
-    return DiscrepancyState(last, mean, gained, likelihood.noise, parameters)
+    return DiscrepancyState(last, np.concatenate(mean), gained, likelihood.noise, parameters)

@@ -19,6 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import narrower
+from bwbayes.watching import Watch, part, unwatched, watched
 
 # Draws that are asked about each of many histories.
 FEW = 50
@@ -113,19 +114,24 @@ class States:
 
 
 def choose_histories(
-    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> tuple[Histories, FloatArray]:
     """Choose every draw's history and state by what the lead-in says; return θ with the states.
 
-    Beforehand all histories are equally probable, and in each all :class:`States`.
+    Beforehand all histories are equally probable, and in each all :class:`States`. ``watch`` is
+    called with the share that is done.
     """
     draws, single = len(theta), len(likelihoods) == 1
     if single and not States(likelihoods[0], theta, single=True).open:
         which, quantile = np.zeros(draws, dtype=np.int64), np.zeros(draws)
     elif single or draws < 2 * FEW:
-        which, quantile, _ = _by_grids(likelihoods, theta, generator)
+        which, quantile, _ = _by_grids(likelihoods, theta, generator, watch=watch)
     else:
-        which, quantile = _by_importance(likelihoods, theta, generator)
+        which, quantile = _by_importance(likelihoods, theta, generator, watch)
+    watch(1.0)
     histories = Histories(likelihoods, which)
     return histories, histories.with_states(theta, quantile)
 
@@ -135,14 +141,21 @@ def _by_grids(
     theta: FloatArray,
     generator: np.random.Generator,
     repeats: int = 1,
+    watch: Watch = unwatched,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Draw histories and quantiles, so many for each draw, and the log evidence (draws,) for all.
 
     Those of one draw follow one another, (draws * repeats,).
     """
     single = len(likelihoods) == 1
+    count = len(likelihoods)
     grids = [
-        _grid(likelihood, States(likelihood, theta, single=single)) for likelihood in likelihoods
+        _grid(
+            likelihood,
+            States(likelihood, theta, single=single),
+            part(watch, number / count, (number + 1) / count),
+        )
+        for number, likelihood in enumerate(likelihoods)
     ]
     evidence = np.stack([grid[2] for grid in grids])
     rows = np.repeat(np.arange(len(theta)), repeats)
@@ -160,7 +173,10 @@ def _by_grids(
 
 
 def _by_importance(
-    likelihoods: tuple[Likelihood, ...], theta: FloatArray, generator: np.random.Generator
+    likelihoods: tuple[Likelihood, ...],
+    theta: FloatArray,
+    generator: np.random.Generator,
+    watch: Watch,
 ) -> tuple[IntArray, FloatArray]:
     """Draw histories and quantiles (draws,) from those that a few draws would draw.
 
@@ -173,7 +189,7 @@ def _by_importance(
     few = np.arange(0, draws, draws // FEW)
     # 500 pairs or more, of which 64 are proposed to each draw.
     pool_which, pool_quantile, evidence = _by_grids(
-        likelihoods, theta[few], generator, -(-500 // few.size)
+        likelihoods, theta[few], generator, -(-500 // few.size), part(watch, 0.0, 0.2)
     )
     pool = np.arange(pool_which.size)
 
@@ -187,6 +203,7 @@ def _by_importance(
         return np.nan_to_num(values.reshape(rows.shape), nan=-np.inf, posinf=-np.inf)
 
     of_few = density(*np.broadcast_arrays(few[:, np.newaxis], pool))
+    watch(0.4)
     pooled = scipy.special.logsumexp(of_few - evidence[:, np.newaxis], axis=0)
     # Spread evenly over the pool, from another start for each draw.
     distance = pool.size * np.arange(64) // 64
@@ -195,6 +212,7 @@ def _by_importance(
     ]
     rows = np.broadcast_to(np.arange(draws), proposed.shape)
     log_weight = density(rows, proposed) - pooled[proposed]
+    watch(0.9)
     # Where none is possible all weights are zero.
     weight = np.exp(log_weight - np.max(log_weight, axis=0, initial=-1e300))
     total = np.cumsum(weight, axis=0)
@@ -210,7 +228,9 @@ def _by_importance(
     return which, quantile
 
 
-def _grid(likelihood: Likelihood, states: States) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _grid(
+    likelihood: Likelihood, states: States, watch: Watch
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Close in on the states that a lead-in allows.
 
     Returns quantiles and log densities there, up to a constant, (nodes, draws), and the log
@@ -221,7 +241,7 @@ def _grid(likelihood: Likelihood, states: States) -> tuple[FloatArray, FloatArra
     if not states.open:
         nodes = np.zeros((NODES, draws))
         return nodes, nodes, np.nan_to_num(likelihood.log_density(states.at(low)), nan=-np.inf)
-    for _ in range(6):
+    for _ in watched(range(6), watch):
         nodes = np.linspace(low, high, NODES)
         theta = np.concatenate([states.at(quantile) for quantile in nodes])
         density = likelihood.log_density(theta).reshape(NODES, draws)

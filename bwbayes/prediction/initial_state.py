@@ -27,6 +27,7 @@ from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discre
 from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, part, unwatched
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,11 @@ def estimate_initial_states(
     record: Record,
     start: Start,
     generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> InitialStates:
     """Give every draw θ (draws, parameters) a start of another record.
+
+    ``watch`` is called with the share that is done.
 
     Raises
     ------
@@ -200,9 +204,11 @@ def estimate_initial_states(
         typical = whole.table.actuator(np.mean(theta, axis=0)[np.newaxis])
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
-    histories, start_theta = choose_histories(likelihoods, theta, generator)
+    histories, start_theta = choose_histories(likelihoods, theta, generator, part(watch, 0.0, 0.5))
     informed = _informed(histories, start_theta, record, window, generator)
-    return continue_discrepancy(informed, whole, theta, generator) if start.after else informed
+    if not start.after:
+        return informed
+    return continue_discrepancy(informed, whole, theta, generator, part(watch, 0.5, 1.0))
 
 
 def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
@@ -218,11 +224,16 @@ def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
 
 
 def continue_discrepancy(
-    start: InitialStates, likelihood: Likelihood, theta: FloatArray, generator: np.random.Generator
+    start: InitialStates,
+    likelihood: Likelihood,
+    theta: FloatArray,
+    generator: np.random.Generator,
+    watch: Watch = unwatched,
 ) -> InitialStates:
     """Let the discrepancy go on from where the readings of a likelihood leave it.
 
     What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
+    ``watch`` is called with the share that is done.
     """
     column = likelihood.actuator.parameters.index("offset")
     model = start.model.copy()
@@ -231,7 +242,8 @@ def continue_discrepancy(
     matched = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
     simulated = matched.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
-    return replace(matched, discrepancy=filter_discrepancy(likelihood, theta, simulated))
+    filtered = filter_discrepancy(likelihood, theta, simulated, part(watch, 0.2, 1.0))
+    return replace(matched, discrepancy=filtered)
 
 
 def training_initial_states(

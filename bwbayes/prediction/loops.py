@@ -19,6 +19,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, part, unwatched, watched
 
 # Voltages along a branch: an odd number, so that a symmetric drive passes zero at one of them.
 POINTS = 201
@@ -154,8 +155,10 @@ class Loops:
         }
 
 
-def measure_loops(posterior: Posterior, draws: FloatArray) -> Loops:
+def measure_loops(posterior: Posterior, draws: FloatArray, watch: Watch = unwatched) -> Loops:
     """Measure the loops of every draw (draws, free), in the range of the records' voltages.
+
+    ``watch`` is called with the share that is done.
 
     Raises
     ------
@@ -169,13 +172,13 @@ def measure_loops(posterior: Posterior, draws: FloatArray) -> Loops:
     low = min(float(np.min(record.voltage)) for record in posterior.datasets)
     high = max(float(np.max(record.voltage)) for record in posterior.datasets)
     quarter = (high - low) / 4
-    voltage, curve = initial_curve(actuator, column, low, high)
-    return Loops(
-        Loop.of(steady_loop(actuator, column, low, high)),
-        Loop.of(steady_loop(actuator, column, low + quarter, high - quarter)),
-        voltage,
-        Curve.of(curve),
+    major, minor = (
+        Loop.of(steady_loop(actuator, column, *edges))
+        for edges in watched([(low, high), (low + quarter, high - quarter)], part(watch, 0.0, 0.9))
     )
+    voltage, curve = initial_curve(actuator, column, low, high)
+    watch(1.0)
+    return Loops(major, minor, voltage, Curve.of(curve))
 
 
 def steady_loop(

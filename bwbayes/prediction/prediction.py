@@ -13,7 +13,7 @@ its own, see :mod:`bwbayes.prediction.initial_state`.
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -32,6 +32,7 @@ from bwbayes.prediction.initial_state import (
     training_initial_states,
 )
 from bwbayes.record.record import Record, Window
+from bwbayes.watching import Watch, counted, part, unwatched
 
 # Posterior draws in the mixture.
 DRAWS = 1000
@@ -39,6 +40,9 @@ DRAWS = 1000
 # Samples that are simulated and summarized at once: few enough for a core's own cache. Not a power
 # of two: rows of draws that far apart would take each other's place in it.
 PIECE = 400
+
+# Share of a prediction's time that goes into the states that it starts from, about.
+STATES_SHARE = 0.4
 
 
 def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
@@ -54,7 +58,7 @@ def predict_windows(
     record: Record,
     windows: Mapping[str, slice | Sequence[slice]],
     generator: np.random.Generator,
-    watch: Callable[[int], None] = lambda _: None,
+    watch: Watch = unwatched,
 ) -> list[Bands]:
     """Predict windows of the training record: one simulation, one offset.
 
@@ -71,7 +75,7 @@ def predict_windows(
     generator
         Draws the state of the dynamics at the start, where that is unknown.
     watch
-        Is called with a number of samples whenever so many more are done.
+        Called with the share that is done.
     """
     theta = posterior.prior.theta(draws)
     start_states = training_initial_states(posterior, theta, generator)
@@ -97,6 +101,7 @@ def forecast(
     voltage: ArrayLike,
     generator: np.random.Generator,
     name: str = "forecast",
+    watch: Watch = unwatched,
 ) -> Bands:
     """Predict what follows on the training record: its last sample goes on into a planned voltage.
 
@@ -121,8 +126,11 @@ def forecast(
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
     start_states = training_initial_states(posterior, theta, generator)
-    start_states = continue_discrepancy(start_states, posterior.likelihood, theta, generator)
-    return _bands(name, posterior, theta, start_states, longer, after)
+    start_states = continue_discrepancy(
+        start_states, posterior.likelihood, theta, generator, part(watch, 0.0, STATES_SHARE)
+    )
+    predicting = part(watch, STATES_SHARE, 1.0)
+    return _bands(name, posterior, theta, start_states, longer, after, predicting)
 
 
 def predict_record(
@@ -133,7 +141,7 @@ def predict_record(
     generator: np.random.Generator,
     name: str = "prediction",
     window: Window | None = None,
-    watch: Callable[[int], None] = lambda _: None,
+    watch: Watch = unwatched,
 ) -> Bands:
     """Predict another record, or a planned voltage without a measurement.
 
@@ -160,10 +168,13 @@ def predict_record(
     """
     predicted_window = slice(0, record.samples) if window is None else record.window_slice(*window)
     theta = posterior.prior.theta(draws)
-    start_states = estimate_initial_states(posterior, theta, record, start, generator)
+    start_states = estimate_initial_states(
+        posterior, theta, record, start, generator, part(watch, 0.0, STATES_SHARE)
+    )
     if predicted_window.stop <= start_states.scored_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
-    bands = _bands(name, posterior, theta, start_states, record, predicted_window, watch)
+    predicting = part(watch, STATES_SHARE, 1.0)
+    bands = _bands(name, posterior, theta, start_states, record, predicted_window, predicting)
     scored_from = max(start_states.scored_from - predicted_window.start, 0)
     return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
 
@@ -175,7 +186,7 @@ def _bands(
     start: InitialStates,
     record: Record,
     window: slice,
-    watch: Callable[[int], None] = lambda _: None,
+    watch: Watch = unwatched,
 ) -> Bands:
     """Walk through a record from every draw's start, and summarize the mixture over a window."""
     # The same for all predictions: bands differ by what is predicted, not by chance.
@@ -186,17 +197,20 @@ def _bands(
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(theta))
     pending: deque[tuple[int, Future[dict[str, Floating]]]] = deque()
+    more = counted(window.stop, watch)
 
     def put() -> None:
         first, piece = pending.popleft()
         for key, values in piece.result().items():
             joined[key][first : first + values.size] = values
-        watch(values.size)
+        more(values.size)
 
     begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
     with ThreadPoolExecutor(threads) as executor:
         for simulated in start.pieces(record.path.voltage[: window.stop], PIECE):
-            first, begin = max(begin, window.start), begin + simulated.shape[1]
+            first, end = max(begin, window.start), begin + simulated.shape[1]
+            more(min(first, end) - begin)
+            begin = end
             if begin <= first:
                 continue
             inside = simulated[:, first - begin :]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from bwbayes.report.figures import picture_of, save_pictures
 from bwbayes.report.page import render
 from bwbayes.report.report import Picture, Report
 from bwbayes.report.result import Result
+from bwbayes.watching import Watch, counted, unwatched, watched
 
 
 def posterior_tree(
@@ -78,11 +80,13 @@ def posterior_tree(
     return tree
 
 
-def write_bands(path: Path, bands: Sequence[Bands]) -> None:
+def write_bands(path: Path, bands: Sequence[Bands], watch: Watch = unwatched) -> None:
     """Write bands as CSV; of several sets, a first column ``set`` names each.
 
-    Every column has seven digits of its range, however far from zero it lies.
+    Every column has seven digits of its range, however far from zero it lies. ``watch`` is called
+    with the share that is done.
     """
+    more = counted(sum(predicted.time.size for predicted in bands), watch)
     with draft_of(path) as draft, draft.open("w", encoding="utf-8") as file:
         for number, predicted in enumerate(bands):
             names, columns = zip(*predicted.columns(), strict=True)
@@ -98,7 +102,9 @@ def write_bands(path: Path, bands: Sequence[Bands]) -> None:
                 extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
                 formats.append(f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g")
             row = f"{prefix}{','.join(formats)}\n"
-            file.writelines(row % values for values in zip(*columns, strict=True))
+            for rows in batched(zip(*columns, strict=True), 10_000):
+                file.writelines(row % values for values in rows)
+                more(len(rows))
 
 
 def write_summary(path: Path, summary: Mapping[str, object]) -> None:
@@ -117,19 +123,22 @@ def _finite(value: object) -> object:
     return value
 
 
-def save(report: Report, folder: Path, name: str, *, pictures: str = "") -> list[Path]:
+def save(
+    report: Report, folder: Path, name: str, *, pictures: str = "", watch: Watch = unwatched
+) -> list[Path]:
     """Write a report's files to a folder, and return those named after it: JSON, CSV, page.
 
     Pictures as PNG, in a folder below it if ``pictures`` names one, ``NAME.html``, ``NAME.csv`` and
-    ``NAME.json`` if it has such; the JSON last, as the sign that all is there.
+    ``NAME.json`` if it has such; the JSON last, as the sign that all is there. ``watch`` is called
+    with the share of the pictures that is drawn.
 
     Raises InputError: the folder cannot be written.
     """
     numbers, table, page = (folder / f"{name}.{kind}" for kind in ("json", "csv", "html"))
     with refuse_unwritable(folder, "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
-        blocks = (block for block in report.all_blocks() if isinstance(block, Picture))
-        drawn = {block.name: picture_of(block.draw) for block in blocks}
+        blocks = [block for block in report.all_blocks() if isinstance(block, Picture)]
+        drawn = {block.name: picture_of(block.draw) for block in watched(blocks, watch)}
         if drawn:
             save_pictures(drawn, folder / pictures)
         page.write_text(render(report, drawn), encoding="utf-8")

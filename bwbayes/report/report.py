@@ -22,6 +22,7 @@ from rich.table import Table as Grid
 
 from bwbayes.errors import ExitStatus
 from bwbayes.shown import head
+from bwbayes.watching import Watch, unwatched
 
 if TYPE_CHECKING:
     from matplotlib import figure
@@ -365,8 +366,12 @@ class Product(Shown):
         """Return what is saved beside the report, as CSV, by name."""
         return {}
 
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
+    def save(
+        self, folder: str | Path, *, overwrite: bool = False, watch: Watch = unwatched
+    ) -> list[Path]:
         """Write page, table, numbers and records to a folder, and return them.
+
+        ``watch`` is called with the share of the figures that is drawn.
 
         Raises
         ------
@@ -380,7 +385,7 @@ class Product(Shown):
         records = {folder / f"{name}.csv": record for name, record in self.records().items()}
         pages = [folder / f"{self.NAME}.{kind}" for kind in ("json", "csv", "html")]
         refuse_existing([*records, *pages], overwrite=overwrite)
-        files = save(self.report(), folder, self.NAME)
+        files = save(self.report(), folder, self.NAME, watch=watch)
         for path, record in records.items():
             write_record(record, path)
         return [*records, *files]

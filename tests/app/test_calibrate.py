@@ -20,6 +20,7 @@ from bwbayes.prediction.bands import KINDS, LEVELS
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import MODEL
+from tests.app.steps import Steps
 
 # A replicate takes a fraction of a second.
 TEXT = (
@@ -94,6 +95,15 @@ def cut(whole: Path, path: Path, size: int) -> CalibrationFolder:
 def line_ends(whole: Path) -> list[int]:
     content = (whole / "replicates.jsonl").read_bytes()
     return [result.end() for result in re.finditer(b"\n", content)]
+
+
+def test_a_calibration_tells_what_share_of_its_figures_is_drawn(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(whole, tmp_path / "again")
+    steps = Steps.of_commands(monkeypatch)
+    resume(CalibrationFolder.open(tmp_path / "again"), small.quiet(), workers=1)
+    steps.require("figures")
 
 
 def test_summary_and_lines_hold_every_replicate(whole: Path) -> None:

@@ -28,6 +28,7 @@ from bwbayes.report.result import summary
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import CONFIG, record, specimens
+from tests.app.steps import Steps
 
 COUNT = 3
 FILES = ("campaign.json", "campaign.csv", "campaign.html", "figures/parameters.png")
@@ -123,6 +124,15 @@ def test_the_command_says_which_records_were_refused_and_ends_with_2(
     assert "REFUSED: broken: broken.csv:2:" in said.err
     assert "6 records: 3 refused, 3 passed" in said.out
     assert_same_end(whole, tmp_path / "batch")
+
+
+def test_a_campaign_tells_what_share_of_its_combining_is_done(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(whole, tmp_path / "again")
+    steps = Steps.of_commands(monkeypatch)
+    ended(CampaignFolder.open(tmp_path / "again"))
+    steps.require("results", "draws", "population", "figures")
 
 
 def test_a_finished_campaign_fits_nothing_again(

@@ -23,6 +23,7 @@ from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record
 from bwbayes.sampling.storage import ChainFile
 from tests.app.conftest import Type
+from tests.app.steps import Steps
 
 CONFIG = """\
 seed = 3
@@ -100,6 +101,17 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
         comparison.save(folder)
     same = bw.compare(bouc_wen, bouc_wen, future=False, workers=1)
     assert ["bouc-wen 1", "bouc-wen 2"] == list(same.to_pandas().index)
+
+
+def test_a_comparison_tells_what_share_of_its_steps_is_done(
+    fits: tuple[Fit, Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = Steps.of_commands(monkeypatch)
+    fits[0].compare(fits[1], workers=1, folder=tmp_path / "out", progress=False)
+    parts = ("predictions", "earlier training", "later training", "later", "evidence")
+    judged = [f"{name}: {part}" for name in ("bouc-wen", "linear") for part in parts]
+    judged.insert(-1, "linear: training and later")
+    steps.require(*judged, "figures")
 
 
 def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:

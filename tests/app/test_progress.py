@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.fit.fitted import converged
+from bwbayes.app.fit.fitted import converged, finished
 from bwbayes.app.jobs.check import check
+from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
+from bwbayes.app.running.run import redraw
 from bwbayes.inference import map_estimate
 from bwbayes.sampling.diagnostics import Check
 from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
+from tests.app.steps import Steps
 from tests.inference.problems import short_posterior
 
 
@@ -193,27 +196,9 @@ def again(command: str) -> tuple[str, ...]:
 # Every step has a name, and tells what share of it is done
 
 
-class Steps:
-    """Takes note of the shares of each step, in turn."""
-
-    def __init__(self) -> None:
-        self.shares: dict[str, list[float]] = {}
-
-    def __call__(self, step: str, share: float) -> None:
-        """Take note of a share."""
-        self.shares.setdefault(step, []).append(share)
-
-    def require(self, *names: str) -> None:
-        """Require steps of these names alone, whose shares rise to one."""
-        assert names == tuple(self.shares)
-        for shares in self.shares.values():
-            assert 0.0 < shares[0]
-            assert shares == sorted(shares)
-            assert shares[-1] == pytest.approx(1.0, abs=1e-12)
-
-
 JOBS: dict[str, tuple[str, tuple[object, ...], dict[str, object], tuple[str, ...]]] = {
     "predict": ("predict:predict", (), {"signal": "step50", "from_rest": True}, ("predictions",)),
+    "predict after": ("predict:predict", (), {"signal": "step50", "after": True}, ("predictions",)),
     "compensate": (
         "control:compensate",
         ("sine",),
@@ -244,7 +229,26 @@ def test_every_job_tells_what_share_of_its_steps_is_done(copy: RunFolder, job: s
 def test_a_check_tells_what_share_of_its_steps_is_done(tmp_path: Path) -> None:
     steps = Steps()
     check(small.config(), tmp_path, tmp_path / "out", steps)
-    steps.require("MAP estimate", "noise model", "explanations")
+    steps.require("MAP estimate", "noise model", "explanations", "figures")
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_a_run_tells_what_share_is_done_until_its_last_file(copy: RunFolder) -> None:
+    fit, steps = finished(copy), Steps()
+    assemble(fit.problem, fit.chain, fit.outcome, watch=steps)
+    steps.require(
+        "remarks",
+        "predictions",
+        "innovations",
+        "scores",
+        "loops",
+        "explanations",
+        "information gain",
+        "posterior checks",
+    )
+    written = Steps()
+    redraw(copy, written)
+    written.require("files", "figures")
 
 
 @pytest.mark.parametrize("samples", [100, 100_000], ids=["thinned", "whole"])

@@ -157,11 +157,11 @@ def report(folder: Path) -> int:
 
     Example: bwbayes report results/ring_bender
     """
-    with working():
+    with working() as watch:
         from bwbayes.app.running.folder import RunFolder
         from bwbayes.app.running.run import redraw
 
-        redraw(RunFolder.open(folder))
+        redraw(RunFolder.open(folder), watch)
     click.echo(f"wrote {folder / 'report.html'}")
     return 0
 

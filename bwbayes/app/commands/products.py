@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,7 @@ def _saved(
         refuse_existing([out / f"{name}.json"], overwrite=overwrite)
         job = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
         product = job(converged(folder), *arguments, watch=watch, **options)
-        watch("figures and files", 0.0)
-        files = product.save(out, overwrite=overwrite)
+        files = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
         report = product.report()
     status = present(report, files, product.standing, quiet=quiet)
     if quiet and product.shortfall:
@@ -112,7 +112,7 @@ def predict(
             bands = predict_record(fit, other, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None
-        write_prediction(bands, files, fit.standing)
+        write_prediction(bands, files, fit.standing, partial(watch, "files"))
     unmeasured, remarks = bands.measured is None, list[str]()
     if unmeasured and record is not None:
         remarks.append(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -163,7 +164,7 @@ def compare(
     from bwbayes.app.fit.fitted import Fit
     from bwbayes.app.jobs import compare as job
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
-    from bwbayes.app.running.progress import ProgressLine
+    from bwbayes.app.running.progress import ProgressLine, StepProgress
     from bwbayes.report.outputs import refuse_existing
 
     path, scratch = folder_or_scratch(folder, "comparison")
@@ -201,8 +202,8 @@ def compare(
             executor=executor,
         )
     if scratch is None:
-        with ProgressLine(console, "writing the comparison ..."):
-            comparison.save(path, overwrite=True)
+        with StepProgress(console, "writing the comparison ...") as watch:
+            comparison.save(path, overwrite=True, watch=partial(watch, "figures"))
     return comparison
 
 

@@ -14,6 +14,7 @@ import os
 import shutil
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -27,7 +28,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
-from bwbayes.app.running.progress import ProgressLine, batch
+from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
 from bwbayes.calibration.records import OtherRecord
@@ -133,7 +134,7 @@ def resume(
         ):
             entries[result.entry["number"]] = result.entry
             _append(folder, json.dumps(result.entry))
-        with ProgressLine(console, "judging and drawing ..."):
+        with StepProgress(console, "judging and drawing ...") as watch:
             ordered = [entries[number] for number in sorted(entries)]
             plan, packages = problem.plan, versions(problem.posterior.engine)
             calibration = replace(
@@ -152,7 +153,13 @@ def resume(
                 provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
             )
             # Nothing in its files depends on when or how it was computed.
-            save(calibration_report(calibration), folder.path, "calibration", pictures="figures")
+            save(
+                calibration_report(calibration),
+                folder.path,
+                "calibration",
+                pictures="figures",
+                watch=partial(watch, "figures"),
+            )
     return calibration
 
 

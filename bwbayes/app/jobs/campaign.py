@@ -14,6 +14,7 @@ import shutil
 import warnings
 from collections import Counter
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
-from bwbayes.app.running.progress import ProgressLine, batch
+from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
 from bwbayes.errors import InputError, InputWarning, one_line
@@ -123,10 +124,11 @@ def resume(
         ):
             if outcome.refused:
                 refused[outcome.file.name] = outcome.short
-        with ProgressLine(console, "combining the records ..."):
-            campaign = Campaign.of(folder, files, refused)
+        with StepProgress(console, "combining the records ...") as watch:
+            campaign = Campaign.of(folder, files, refused, watch)
             # Nothing in its files depends on when or how it was computed.
-            save(campaign.report(), folder.path, "campaign", pictures="figures")
+            figures = partial(watch, "figures")
+            save(campaign.report(), folder.path, "campaign", pictures="figures", watch=figures)
     return campaign
 
 

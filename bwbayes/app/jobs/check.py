@@ -84,5 +84,5 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
             Section("Priors and MAP estimate", [priors, Text(meaning, note=True)], folded=False),
         ],
     )
-    save(report, out, "check", pictures="figures")
+    save(report, out, "check", pictures="figures", watch=partial(watch, "figures"))
     return report

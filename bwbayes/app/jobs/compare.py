@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
-from bwbayes.app.running.progress import ProgressLine, batch
+from bwbayes.app.running.progress import ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import begin, resume
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.comparison.candidates import Candidate
@@ -42,6 +43,7 @@ from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.prediction.scores import score
 from bwbayes.record import Record
 from bwbayes.sampling.chain import draws, log_densities
+from bwbayes.watching import WatchSteps, unwatched
 
 
 def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:
@@ -90,11 +92,11 @@ def compare(
     candidates = []
     for name, fit in fits.items():
         with (
-            ProgressLine(console, f"judging {name} ..."),
+            StepProgress(console, f"judging {name} ...") as watch,
             one_thread(),
             open_executor(workers, fit.problem.posterior.engine, executor) as pool,
         ):
-            candidate = _candidate(name, fit, pool, future=future)
+            candidate = _candidate(name, fit, pool, watch, future=future)
             standing = fit.standing if fit.converged else None
         candidates.append(replace(candidate, standing=standing))
     with ProgressLine(console, "comparing ..."):
@@ -210,7 +212,9 @@ def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison
     return recommend(candidates, facts)
 
 
-def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidate:
+def _candidate(
+    name: str, fit: Fit, pool: Executor, watch: WatchSteps = unwatched, *, future: bool
+) -> Candidate:
     """Work out all that a comparison knows of a fit, but for its validation."""
     problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
     plain = _description(name, problem, fit.outcome.stop_reason, converged=fit.converged)
@@ -220,12 +224,20 @@ def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidat
     flat = fit.flat_draws
     bands = [
         prediction
-        for prediction in predictions(problem, flat, training=False)
+        for prediction in predictions(
+            problem, flat, partial(watch, f"{name}: predictions"), training=False
+        )
         if prediction.measured is not None
     ]
     windows = {record: problem.held_out(record) for record in problem.records}
     rng = generator(seed, "future")
-    parts = leave_future_out(posterior, problem.plan, flat, windows, rng, pool, future=future)
+
+    def of_this(step: str, share: float) -> None:
+        watch(f"{name}: {step}", share)
+
+    parts = leave_future_out(
+        posterior, problem.plan, flat, windows, rng, pool, future=future, watch=of_this
+    )
     for prediction in bands:
         part = bands_part(prediction)
         if part is not None and problem.validations[prediction.name].record is not None:
@@ -236,7 +248,13 @@ def _candidate(name: str, fit: Fit, pool: Executor, *, future: bool) -> Candidat
         held_out=tuple(bands),
         scores={p.name: score(p, extent) for p in bands},
         parts=parts,
-        evidence=evidence(posterior, sampled, density, generator(seed, "evidence")),
+        evidence=evidence(
+            posterior,
+            sampled,
+            density,
+            generator(seed, "evidence"),
+            partial(of_this, "evidence"),
+        ),
     )
 
 

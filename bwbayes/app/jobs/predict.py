@@ -18,7 +18,7 @@ from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
 from bwbayes.report.outputs import write_bands, write_summary
-from bwbayes.watching import WatchSteps, unwatched
+from bwbayes.watching import Watch, WatchSteps, part, unwatched
 
 
 def predict(
@@ -107,7 +107,8 @@ def predict(
                 "predicted whole"
             )
         if after:
-            return predict_after(problem, fit.flat_draws, voltage, name, of)
+            watching = partial(watch, "predictions")
+            return predict_after(problem, fit.flat_draws, voltage, name, of, watching)
         record = Record(voltage, None, interval, origin=f"{signal} signal")
     elif not isinstance(record, Record | str | Path):
         raise InputError(
@@ -128,14 +129,19 @@ def predict(
     return predict_another(problem, fit.flat_draws, other, name, watching)
 
 
-def write_prediction(prediction: Prediction, files: Sequence[Path], standing: Standing) -> None:
+def write_prediction(
+    prediction: Prediction, files: Sequence[Path], standing: Standing, watch: Watch = unwatched
+) -> None:
     """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
+
+    ``watch`` is called with the share that is done.
 
     Raises InputError: they cannot be written.
     """
     table, numbers, picture = files
     with refuse_unwritable(table):
         table.parent.mkdir(parents=True, exist_ok=True)
-        write_bands(table, [prediction])
+        write_bands(table, [prediction], part(watch, 0.0, 0.8))
         write_summary(numbers, prediction.numbers() | {"run_validation": standing.numbers})
         picture.write_bytes(picture_of(prediction.plot))
+        watch(1.0)

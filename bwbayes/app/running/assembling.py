@@ -36,7 +36,7 @@ from bwbayes.report.result import Result
 from bwbayes.sampling.chain import PHASES, constrain_steps, draws, log_densities, thinning
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import Watch, WatchSteps, unwatched
+from bwbayes.watching import Watch, WatchSteps, counted, unwatched, watched
 
 # What a chain notes it by: (free, free), in unconstrained coordinates.
 VOLTAGE_NOISE = "voltage_noise_covariance"
@@ -58,41 +58,47 @@ def assemble(
     artist = artist or Artist()
     result = _read_draws(problem, chain, outcome)
     flat = result.flat_draws
+    looked_at = counted(3, partial(watch, "remarks"))
     remarks = [
         *version_remarks(chain.attributes().get("versions"), versions(posterior.engine)),
         *problem.remarks,
         *outcome.remarks,
-        *map(str, conflict.conflicts(posterior.prior, flat, problem.defaults)),
-        *map(str, identifiability.undetermined(posterior, chain.point)),
     ]
+    looked_at(1)
+    remarks += map(str, conflict.conflicts(posterior.prior, flat, problem.defaults))
+    looked_at(1)
+    remarks += map(str, identifiability.undetermined(posterior, chain.point))
+    looked_at(1)
     result = replace(result, remarks=tuple(remarks))
     artist.draw(result)
     if not outcome.converged:
         return result
     several = len(records) > 1
     subset = thinned(flat, generator(seed, "draws"))
-    steps = measure_steps(posterior, subset, {**(records if several else {}), **problem.others})
+    others = {**(records if several else {}), **problem.others}
+    steps = measure_steps(posterior, subset, others)
     bands = predictions(problem, flat, partial(watch, "predictions"))
     result = replace(result, bands=bands, steps=steps)
     artist.draw(result)
-    watch("loops", 0.0)
     best = flat[[int(np.argmax(result.log_density))]]
     series = {
         name: innovations.innovations(alone, theta[0], records[name].start)
-        for name, alone, theta in posterior.each(best)
+        for name, alone, theta in watched([*posterior.each(best)], partial(watch, "innovations"))
     }
     starts = {name: record.start for name, record in records.items()}
-    compared = agreement.agreements(posterior, chain.point, starts)
+    compared = agreement.agreements(
+        posterior, chain.point, starts, partial(watch, "consistency of the records")
+    )
     background = Background.of(posterior, flat)
     result = replace(
         result,
         scores={
             band.name: score(band, background.extent)
-            for band in bands
+            for band in watched(bands, partial(watch, "scores"))
             if band.scored(band.measured).any()
         },
         innovations=series,
-        loops=measure_loops(posterior, subset),
+        loops=measure_loops(posterior, subset, partial(watch, "loops")),
         agreement=compared,
     )
     artist.draw(result)
@@ -117,13 +123,19 @@ def assemble(
         for name, texts in said.items():
             remarks += [f"{name}: {text}" if several else str(text) for text in texts]
     remarks += [f"{name}: {note}" for name, verdict in verdicts.items() for note in verdict.notes]
-    watch("information gain", 0.0)
     source = generator(seed, "checks")
+    learned = information_gain(
+        posterior.prior,
+        result.draws,
+        result.log_density,
+        source,
+        partial(watch, "information gain"),
+    )
     return replace(
         result,
         verdicts=verdicts,
         explanations=explanations,
-        learned=information_gain(posterior.prior, result.draws, result.log_density, source),
+        learned=learned,
         replicated={
             dataset.name: check_predictions(
                 posterior,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -49,6 +49,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
 from bwbayes.shown import brief
+from bwbayes.watching import WatchSteps, unwatched, watched
 
 # How a record ended, in the order in which they matter, and the exit status of each.
 STATUSES = {
@@ -112,15 +113,33 @@ class Campaign(Product):
     _scratch: object = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, folder: CampaignFolder, files: Sequence[Path], refused: Mapping[str, str]) -> Self:
-        """Return what came of the records' files; ``refused`` says why, by the name of the file."""
-        rows = tuple(Row.of(folder, file, refused.get(file.name, "")) for file in files)
+    def of(
+        cls,
+        folder: CampaignFolder,
+        files: Sequence[Path],
+        refused: Mapping[str, str],
+        watch: WatchSteps = unwatched,
+    ) -> Self:
+        """Return what came of the records' files; ``refused`` says why, by the name of the file.
+
+        ``watch`` is called with the name of a step and the share of it that is done.
+        """
+        rows = tuple(
+            Row.of(folder, file, refused.get(file.name, ""))
+            for file in watched(files, partial(watch, "results"))
+        )
         names = [row.name for row in rows if row.parameters]
-        specimens = [Specimen.load(name, folder.run(name) / SPECIMEN) for name in names]
+        specimens = [
+            Specimen.load(name, folder.run(name) / SPECIMEN)
+            for name in watched(names, partial(watch, "draws"))
+        ]
         if len(specimens) < FEWEST:
             return cls(folder, rows, f"a population needs {FEWEST} records or more")
         try:
-            return cls(folder, rows, population(specimens, generator(1, "population")))
+            together = population(
+                specimens, generator(1, "population"), partial(watch, "population")
+            )
+            return cls(folder, rows, together)
         except InputError as error:
             return cls(folder, rows, str(error))
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from bwbayes.app.running.workers import processes
 from bwbayes.inference.engine import choose
+from bwbayes.watching import Watch, unwatched, watched
 
 # All else is loaded where it is used: an artist begins before anything is loaded.
 if TYPE_CHECKING:
@@ -60,8 +61,13 @@ class Artist:
             if name not in self.begun:
                 self.begun[name] = self.pool.submit(work)
 
-    def drawn(self, result: Result, folder: Path) -> tuple[dict[str, bytes], PagePlots]:
-        """Wait until all is drawn; write pictures, PNG by name, to a folder; return all."""
+    def drawn(
+        self, result: Result, folder: Path, watch: Watch = unwatched
+    ) -> tuple[dict[str, bytes], PagePlots]:
+        """Wait until all is drawn; write pictures, PNG by name, to a folder; return all.
+
+        ``watch`` is called with the share that is drawn.
+        """
         from bwbayes.report.figures import save_pictures  # noqa: PLC0415
         from bwbayes.report.page import NO_PLOTS  # noqa: PLC0415
 
@@ -69,7 +75,7 @@ class Artist:
         works = _works(result)
         # From the last to the first: whatever is not begun by then is drawn here.
         drawn: dict[str, Any] = {}
-        for name in reversed(works):
+        for name in watched([*reversed(works)], watch):
             if name in self.begun and not self.begun[name].cancel():
                 with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
                     drawn[name] = self.begun[name].result()

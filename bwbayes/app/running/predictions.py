@@ -7,9 +7,9 @@ on the data alone: the same record under another name gets the same bands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ from bwbayes.record.voltage_path import estimate_path
 from bwbayes.report.figures import drawn
 from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
-from bwbayes.watching import Watch, unwatched
+from bwbayes.watching import Watch, part, unwatched
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -137,16 +137,17 @@ def predict_another(
     Raises InputError: a lead-in or window that does not fit into the record.
     """
     assert other.record is not None
+    watch(0.0)
     posterior = problem.posterior
     path = other.record.path
     beyond = beyond_training(posterior, path.voltage, other.record.interval)
     subset = thinned(flat, generator(problem.config.seed, "draws"))
-    more = _of_total(other.record.samples, watch)
-    bands = _of_another(problem, subset, other, name, beyond, more)
+    bands = _of_another(problem, subset, other, name, beyond, part(watch, 0.0, 0.8))
     background = Background.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
     rest = _from_rest_remark(problem, subset, other, bands, beyond)
+    watch(1.0)
     noise = path.remark or planned_noise(other.record)
     remarks = (
         *[noise] * bool(noise),
@@ -202,13 +203,19 @@ def _from_rest_remark(
 
 
 def predict_after(
-    problem: Problem, flat: FloatArray, voltage: FloatArray, name: str, of: str
+    problem: Problem,
+    flat: FloatArray,
+    voltage: FloatArray,
+    name: str,
+    of: str,
+    watch: Watch = unwatched,
 ) -> Prediction:
     """Predict what follows on a training record whose last sample goes on into a planned voltage.
 
     ``voltage`` is (samples,), V, at the record's interval; ``of`` the record's name. All else is as
     in :func:`predict_another`; see :func:`~bwbayes.prediction.prediction.forecast`.
     """
+    watch(0.0)
     seed, record = problem.config.seed, problem.records[of]
     joined = np.concatenate([record.path.voltage, voltage])
     after = slice(record.samples, None)
@@ -217,7 +224,7 @@ def predict_after(
     source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
-    bands = forecast(alone, own_draws, record, voltage, source, name)
+    bands = forecast(alone, own_draws, record, voltage, source, name, watch)
     return Prediction(**vars(bands), remarks=tuple(finding.note for finding in beyond))
 
 
@@ -235,32 +242,23 @@ def predictions(
     posterior, seed = problem.posterior, problem.config.seed
     subset = thinned(flat, generator(seed, "draws"))
     bands: list[Bands] = []
-    total = sum(r.samples for r in (*problem.records.values(), *problem.others.values()))
-    more = _of_total(total, watch)
+    samples = [r.samples for r in (*problem.records.values(), *problem.others.values())]
+    shares = np.cumsum([0, *samples]) / sum(samples)
+    watches = (part(watch, *edges) for edges in pairwise(shares.tolist()))
     for name, alone, own_draws in posterior.each(subset):
+        predicting = next(watches)
         windows = problem.windows(name) if training else problem.held_out(name)
         if windows:
             record = problem.records[name]
             # By content: the same record under another name gets the same bands.
             source = generator(seed, f"predict {record.sha256}")
-            bands += predict_windows(alone, own_draws, record, windows, source, more)
+            bands += predict_windows(alone, own_draws, record, windows, source, predicting)
     for name, held_out in problem.validations.items():
         if held_out.record is not None:
             beyond = problem.extrapolations[name]
-            bands.append(_of_another(problem, subset, held_out, name, beyond, more))
+            bands.append(_of_another(problem, subset, held_out, name, beyond, next(watches)))
+    watch(1.0)
     return tuple(bands)
-
-
-def _of_total(total: int, watch: Watch) -> Callable[[int], None]:
-    """Return what is called with numbers of samples that are done, of a total."""
-    done = 0
-
-    def more(samples: int) -> None:
-        nonlocal done
-        done += samples
-        watch(min(done / total, 1.0))
-
-    return more
 
 
 def _of_another(
@@ -269,14 +267,14 @@ def _of_another(
     other: Validation,
     name: str,
     beyond: Iterable[Finding],
-    more: Callable[[int], None] = lambda _: None,
+    watch: Watch = unwatched,
 ) -> Bands:
     """Return the bands of a record that was not fitted, from the draws of one that was."""
     record = other.record
     assert record is not None
     alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
     source = generator(problem.config.seed, f"predict {record.sha256}")
-    return predict_record(alone, own_draws, record, other.start, source, name, other.judged, more)
+    return predict_record(alone, own_draws, record, other.start, source, name, other.judged, watch)
 
 
 def _reaching(

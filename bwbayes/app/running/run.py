@@ -37,6 +37,7 @@ from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import first_chain, sample
 from bwbayes.sampling.storage import ChainFile
+from bwbayes.watching import WatchSteps, part, unwatched
 
 
 def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
@@ -116,20 +117,22 @@ def resume(
         if answer is not None:
             answer(fit)
         if files and not folder.numbers():
-            with ProgressLine(console, "writing figures and files ..."):
-                write_files(fit, folder, artist)
+            with StepProgress(console, "writing figures and files ...") as watch:
+                write_files(fit, folder, artist, watch)
     return fit
 
 
-def redraw(folder: RunFolder) -> Fit:
+def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Fit:
     """Write the files of a finished run again, from its chain.
+
+    ``watch`` is called with the name of a step and the share of it that is done.
 
     Raises InputError: the run has no draws yet, or another process is writing it.
     """
     with folder.locked(), one_thread():
         folder.require_finished()
         fit = finished(folder)
-        write_files(fit, folder, Artist())
+        write_files(fit, folder, Artist(), watch)
     return fit
 
 
@@ -178,21 +181,28 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def write_files(fit: Fit, folder: RunFolder, artist: Artist) -> None:
-    """Write all files of a run into a folder; the summary last, as the sign that all is done."""
+def write_files(fit: Fit, folder: RunFolder, artist: Artist, watch: WatchSteps = unwatched) -> None:
+    """Write all files of a run into a folder; the summary last, as the sign that all is done.
+
+    ``watch`` is called with the name of a step and the share of it that is done.
+    """
     fit = fit.knowing(folder=folder)
     result, numbers, bands = fit.result, fit.numbers, folder.path / "bands.csv"
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
     artist.draw(result)
+    files = partial(watch, "files")
+    files(0.0)
     with draft_of(folder.path / "posterior.nc") as draft:
         # From memory: HDF5 does not survive a disk that is full.
         draft.write_bytes(bytes(fit.posterior.to_netcdf(engine="h5netcdf")))
+    files(0.3)
     bands.unlink(missing_ok=True)
     if result.bands:
-        write_bands(bands, result.bands)
+        write_bands(bands, result.bands, part(files, 0.3, 0.9))
     save_result(folder.result, fit.problem, fit.chain, result)
-    pictures, plots = artist.drawn(result, figures)
+    files(1.0)
+    pictures, plots = artist.drawn(result, figures, partial(watch, "figures"))
     page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)
