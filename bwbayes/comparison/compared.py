@@ -200,7 +200,8 @@ class Comparison(Product):
         rows = []
         for name, apart in list(self.differences.items())[1:]:  # the first is the best
             model, best = self[name], self[str(self.best)]
-            texts = [f"{'+' * (apart.value > 0)}{with_error(apart.value, apart.error)}"]
+            sign = "+" if apart.value > 0 else ""
+            texts = [f"{sign}{with_error(apart.value, apart.error)}"]
             for part in parts:
                 if part not in model.parts:
                     texts.append(UNKNOWN)

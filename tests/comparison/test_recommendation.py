@@ -164,6 +164,18 @@ def test_tables_fit_eighty_columns() -> None:
     assert 2 == sum("─" in line for line in text.splitlines())
 
 
+@pytest.mark.parametrize("length", [60, 120])
+def test_tables_fit_eighty_columns_whatever_folders_are_called(length: int) -> None:
+    """Also where nothing is scored, so that the evidence, of NumPy's floats, decides alone."""
+    names = [letter * length for letter in "xy"]
+    for scores in (COMMON, None):
+        models = [model(name, scores, np.float64(3 * i)) for i, name in enumerate(names)]
+        comparison = recommend(models)
+        text = as_text(replace(comparison, lines=("best",), caveats=()).report(), 80)
+        assert max(map(len, text.splitlines())) <= 80
+        assert "\u2026" not in text
+
+
 @pytest.mark.parametrize(("holds", "status"), [(False, "VALIDATION FAILED"), (None, "Validation")])
 def test_what_does_not_hold_is_said_before_what_is_recommended(
     holds: bool | None, status: str
