@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.record.io.own_times import with_own_times
 from bwbayes.record.io.questions import columns_error
 from bwbayes.record.io.recognition import (
     bare_name,
@@ -169,6 +170,8 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     """
     chosen = {q: series_named(source, name, q) for q, name in naming.columns.items()}
     by_unit = _recognize(source, chosen, naming)
+    if "voltage" in needed:
+        chosen = with_own_times(source, chosen, naming)
     timed = [series for quantity, series in chosen.items() if quantity != "time"] or source.series
     has_rate = naming.fs is not None or all(series.clock for series in timed)
     missing = [q for q in needed if q not in chosen and not (q == "time" and has_rate)]

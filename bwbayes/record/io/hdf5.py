@@ -34,6 +34,7 @@ from bwbayes.record.io.series import (
     notes_of,
     pass_over_object,
     vectors,
+    with_units_beside,
 )
 from bwbayes.record.record import Record
 
@@ -57,9 +58,10 @@ def read_hdf5(path: Path) -> Source:
                     raise ValueError("a list in it has no end")
                 at = data.find(mark, at + 1)
     notes: dict[str, dict[str, str]] = {}
+    texts: dict[str, str] = {}
     with _open(path, remark=True) as file:
-        series = tuple(_series(path, file, notes, set()))
-    return Source(path, series, notes)
+        series = tuple(_series(path, file, notes, texts, set()))
+    return Source(path, with_units_beside(series, texts), notes)
 
 
 def write_hdf5(record: Record, path: Path) -> None:
@@ -99,9 +101,13 @@ def record_notes(record: Record) -> dict[str, str | float]:
 
 
 def _series(
-    path: Path, group: Any, notes: dict[str, dict[str, str]], passed: set[int]
+    path: Path,
+    group: Any,
+    notes: dict[str, dict[str, str]],
+    texts: dict[str, str],
+    passed: set[int],
 ) -> Iterator[Series]:
-    """Yield the series of a group and of those below it, each once; collect their notes.
+    """Yield the series of a group and of those below it, each once; collect notes and texts.
 
     Links to other files, and numbers stored in other files, are passed over unopened: a stranger's
     file could name any file or device of this machine. So is what MATLAB keeps for itself (``#``).
@@ -124,12 +130,16 @@ def _series(
         if "MATLAB_object_decode" in item.attrs:
             pass_over_object(path, name, _note(item.attrs, "MATLAB_class"))
             continue
-        if name in NOTES and is_text:
+        if is_text:
             codes = np.asarray(item[()], dtype="<u2")
-            notes[prefix][name] = codes.tobytes().decode("utf-16-le", errors="replace")
+            text = codes.tobytes().decode("utf-16-le", errors="replace")
+            if name in NOTES:
+                notes[prefix][name] = text
+            else:
+                texts[f"{prefix}{name}"] = text
         elif name in NOTES and name.endswith("_s") and item.size and item.dtype.kind in "iuf":
             notes[prefix][name] = note(item[()])
-        elif not is_text:
+        else:
             stated = [key for key in item.attrs if key.lower() in RATES]
             notes[f"{prefix}{name}"] = {key: _note(item.attrs, key) for key in stated}
             unit = next((_note(item.attrs, k) for k in item.attrs if k.lower()[:4] == "unit"), "")
@@ -139,7 +149,7 @@ def _series(
             yield from vectors(prefix, name, item.shape, item.dtype, load, unit, columns)
     for item in items.values():
         if isinstance(item, h5py.Group) and h5py.h5o.get_info(item.id).addr not in passed:
-            yield from _series(path, item, notes, passed)
+            yield from _series(path, item, notes, texts, passed)
 
 
 def _columns(

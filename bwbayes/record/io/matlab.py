@@ -12,8 +12,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -27,14 +26,13 @@ from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.series import (
     MAXIMUM_SAMPLES,
     NOTES,
-    Clock,
     Series,
     Source,
     note,
     pass_over_object,
     vectors,
+    with_units_beside,
 )
-from bwbayes.record.io.units import scale_of
 from bwbayes.record.record import Record
 
 MatVersion = Literal["5", "7.3"]
@@ -79,10 +77,8 @@ def read_mat(path: Path) -> Source:
             pass_over_object(path, name, class_name)
         elif inner[1][1]:  # without a name is what MATLAB keeps of its objects
             series += _series("", matrix, order, texts)
-    arrays = {one.name: one for one in series}
-    described = tuple(_described(one, arrays, texts) for one in series)
     notes = {name: text for name, text in texts.items() if name in NOTES}
-    return Source(path, described, {"": notes})
+    return Source(path, with_units_beside(series, texts), {"": notes})
 
 
 def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
@@ -110,29 +106,6 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     content.seek(0)
     content.write(header)
     path.write_bytes(content.getvalue())
-
-
-def _described(series: Series, arrays: Mapping[str, Series], texts: Mapping[str, str]) -> Series:
-    """Return a series with the unit and the clock that the other fields of its struct state.
-
-    As a ``timeseries`` that is saved as a struct has them, Time, Data and DataInfo.Units, or the
-    channels of dSPACE, Data and Unit.
-    """
-    struct, leaf = series.group, series.label.partition("[")[0]
-    if not struct or leaf not in ("Time", "Data"):
-        return series
-    words = ("Unit", "Units", "DataInfo.Units") if leaf == "Data" else ("TimeInfo.Units",)
-    unit = next((texts[struct + word] for word in words if struct + word in texts), "")
-    times, clock = arrays.get(f"{struct}Time"), None
-    scale = scale_of(texts.get(f"{struct}TimeInfo.Units", "s"), "time")
-    if leaf == "Data" and scale and times and times.size == series.size > 1:
-        factor, power = scale
-        seconds = factor * times.numbers("").astype(np.float64) * 10.0**power
-        interval = float(seconds[-1] - seconds[0]) / (seconds.size - 1)
-        uniform = seconds[0] + interval * np.arange(seconds.size)
-        if interval > 0 and np.abs(seconds - uniform).max() <= 0.01 * interval:
-            clock = Clock(interval, float(seconds[0]))
-    return replace(series, unit=unit, clock=clock)
 
 
 def _series(path: str, matrix: bytes, order: str, texts: dict[str, str]) -> Iterator[Series]:

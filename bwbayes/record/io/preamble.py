@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from bwbayes.record.io.series import RATES, Clock, Source
+from bwbayes.record.io.units import QUANTITIES, unit_in
 
 
 def stated_above(lines: Sequence[str]) -> tuple[dict[str, str], dict[str, list[str]]]:
@@ -33,11 +34,20 @@ def clock_above(
     return Clock(1 / rate) if rate and is_confirmed else None
 
 
-def with_units(units: list[str], preamble: Mapping[str, list[str]]) -> list[str]:
+def with_units(
+    names: Sequence[str], units: Sequence[str], preamble: Mapping[str, list[str]]
+) -> list[str]:
     """Return the columns' units, with those that an oscilloscope's preamble states for channels.
 
-    The time stands before the channels, if there is one column more than units.
+    The time stands before the channels, if there is one column more than units. A name that stands
+    twice gets a number behind its unit, which is taken here.
     """
+    units = [
+        unit or next((u for q in QUANTITIES if (u := unit_in(name, q))), "")
+        if names.count(name) > 1
+        else unit
+        for name, unit in zip(names, units, strict=True)
+    ]
     channels = [unit for unit in preamble.get("vertical_units", []) if unit]
     time = preamble.get("horizontal_units", [""])[:1]
     stated = [*(time if len(channels) == len(units) - 1 else []), *channels]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -171,6 +171,26 @@ def vectors(
     elif len(sides) <= 1 or dtype.kind not in "iuf":
         size = int(np.prod(sides, dtype=np.int64))
         yield Series(f"{group}{leaf}", size, lambda: np.ravel(load()), unit, group)
+
+
+def with_units_beside(series: Sequence[Series], texts: Mapping[str, str]) -> tuple[Series, ...]:
+    """Return the series of a MATLAB file with the units that texts beside them state.
+
+    The texts are by their paths. Fields of a struct with one series, but for its times, state the
+    unit of that: ``units`` or, as a timeseries saved as a struct, ``DataInfo.Units``; ``TimeInfo``
+    has that of ``Time``.
+    """
+    by_path = {path.replace("/", ".").lower(): text for path, text in texts.items()}
+    described = []
+    for each in series:
+        struct, is_time = each.group.replace("/", ".").lower(), each.label == "Time"
+        words = ("timeinfo.units",) if is_time else ("unit", "units", "datainfo.units")
+        beside = {s.label.partition("[")[0] for s in series if s.group == each.group and s.size > 1}
+        stated = [by_path[struct + word] for word in words if struct + word in by_path]
+        is_alone = bool(struct) and len(beside - {"Time", "time"}) <= 1
+        unit = stated[0] if stated and not each.unit and (is_time or is_alone) else each.unit
+        described.append(replace(each, unit=unit))
+    return tuple(described)
 
 
 def note(value: Any) -> str:

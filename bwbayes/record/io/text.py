@@ -99,7 +99,7 @@ def text_source(
     names, units, header = find_header(path, lines, layout)
     above = lines[: layout.first if header is None else header]
     notes, preamble = stated_above(above)
-    units = with_units(units, preamble)
+    units = with_units(names, units, preamble)
     scope_clock, settings = settings_in(names, units)
     notes |= settings
     # As data recorders of PI write them.
@@ -235,7 +235,8 @@ def _samples(
     while len(samples) > 1:
         first, last = (cells_of(line, separator) for _, line in (samples[0], samples[-1]))
         is_short = len(last) < fields and not is_cut
-        if not is_short and (re.search(r"\d", last[0]) or not re.search(r"\d", first[0])):
+        begin = next(filter(None, last), "")
+        if not is_short and (re.search(r"\d", begin) or not re.search(r"\d", first[0])):
             break
         is_cut |= is_short
         samples.pop()
