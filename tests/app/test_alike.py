@@ -243,3 +243,39 @@ def test_compensate_and_design_read_a_file_alike(
     ) == pytest.approx(20.0, rel=0.01)
     said = bwbayes("design", copy.path, "--drive", renamed)
     assert 0 == said.status, said.err
+
+
+@pytest.mark.usefixtures("copy")
+@pytest.mark.parametrize(
+    ("command", "flag", "other"),
+    [
+        ("compensate", "--reference", ("sine", "--amplitude", "9", "--frequency", "1")),
+        ("design", "--drive", ("--parameter", "beta")),
+    ],
+)
+def test_a_reference_or_drive_is_told_its_columns_and_units_as_a_record_is(
+    bwbayes: Type, tmp_path: Path, command: str, flag: str, other: tuple[str, ...]
+) -> None:
+    """Below another table, with names and units that say nothing; what is open is asked for."""
+    time = np.arange(200) / 50
+    columns = np.stack([time, 30 * np.sin(4 * time), 15 * np.sin(4 * time)], axis=1)
+    above = ["p,q,r", "1,1,1", "2,1,1", "3,1,1", "4,1,1", ""]
+    for folder, header, factor in (
+        ("plain", ["time_s,voltage_V,displacement_um"], 1.0),
+        ("odd", [*above, "a,b,c"], 1e3),
+    ):
+        (tmp_path / folder).mkdir()
+        rows = [",".join(f"{factor * value:.9f}" for value in row) for row in columns]
+        (tmp_path / folder / "drive.csv").write_text("\n".join([*header, *rows, ""]))
+    naming = ["--table", "2"]
+    asked = bwbayes(command, "copy", flag, "odd/drive.csv", *naming)
+    asked.assert_refused(f"copy and correct: bwbayes {command} copy {flag} odd/drive.csv --table 2")
+    for named in ("time=a", "voltage=b", "displacement=c"):
+        naming += ["--column", named]
+    for unit in ("time=ms", "voltage=mV", "displacement=nm"):
+        naming += ["--unit", unit]
+    plain = bwbayes(command, "copy", flag, "plain/drive.csv", "--out", "plain")
+    odd = bwbayes(command, "copy", flag, "odd/drive.csv", *naming, "--out", "odd")
+    assert 2 != plain.status == odd.status
+    assert plain.out == odd.out.replace("odd/", "plain/")
+    bwbayes(command, "copy", *other, *naming).assert_refused(f"give {flag}, or remove them")

@@ -156,5 +156,6 @@ def test_a_unit_in_a_field_of_its_struct_is_that_of_a_series(
                 file[f"{name}/values"] = numbers[np.newaxis]
                 _text_of(file[name], word, stated)
     record, _ = quiet(path)
+    assert record.displacement is not None
     np.testing.assert_allclose(record.displacement, displacement_at(time), rtol=1e-12)
     np.testing.assert_array_equal(record.voltage, values["u"][0])

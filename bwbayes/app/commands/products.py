@@ -11,6 +11,7 @@ import click
 
 from bwbayes.app.commands.shared import (
     FILE,
+    column_options,
     command_as_typed,
     folder_argument,
     naming_options,
@@ -18,6 +19,7 @@ from bwbayes.app.commands.shared import (
     overwrite_option,
     present,
     quiet_option,
+    reading_of,
     show_report,
     working,
 )
@@ -42,7 +44,10 @@ def _saved(
         # What takes long is refused at once, and every single file when it is saved.
         refuse_existing([out / f"{name}.json"], overwrite=overwrite)
         job = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
-        product = job(converged(folder), *arguments, watch=watch, **options)
+        try:
+            product = job(converged(folder), *arguments, watch=watch, **options)
+        except ColumnsError as error:
+            raise error.in_command(command_as_typed()) from None
         files = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
         report = product.report()
     status = present(report, files, product.standing, quiet=quiet)
@@ -143,7 +148,8 @@ def predict(
 @click.option(
     "--reference", type=FILE, help="A file with time and displacement, in place of SHAPE."
 )
-@options_of("bwbayes.app.jobs.control:compensate", "watch", smoothed="smooth")
+@column_options
+@options_of("bwbayes.app.jobs.control:compensate", "reading", "watch", smoothed="smooth")
 @click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
 @overwrite_option
 @quiet_option
@@ -162,6 +168,7 @@ def compensate(
     requested = shape or reference
     if requested is None or (shape and reference):
         raise InputError("compensate: give either a shape or --reference")
+    options["reading"] = reading_of(options, reference, "--reference")
     out = out or folder / "compensation" / Path(requested).stem
     return _saved("control", "compensate", folder, out, requested, **options)
 
@@ -172,7 +179,8 @@ def compensate(
 @click.option(
     "--drive", type=FILE, help="Or the drive whose band is to be narrow: a record or a signal."
 )
-@options_of("bwbayes.app.jobs.design:design", "watch")
+@column_options
+@options_of("bwbayes.app.jobs.design:design", "reading", "watch")
 @click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
 @overwrite_option
 @quiet_option
@@ -189,6 +197,7 @@ def design(
     target = parameter or drive
     if target is None or (parameter and drive):
         raise InputError("design: give either a parameter or a drive")
+    options["reading"] = reading_of(options, drive, "--drive")
     return _saved("design", "design", folder, out or folder / "design", target, **options)
 
 

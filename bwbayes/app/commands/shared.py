@@ -175,6 +175,11 @@ def naming_options(command: AnyCommand) -> AnyCommand:
         type=FILE,
         help="The file with the displacement, if the record's has the voltage alone.",
     )
+    return column_options(other(command))
+
+
+def column_options(command: AnyCommand) -> AnyCommand:
+    """Add the options that say what of one file is meant, as a naming has it."""
     table = click.option("--table", metavar="N", help="One of several tables: number or sheet.")
     fs = click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column.")
     units = click.option(
@@ -194,7 +199,20 @@ def naming_options(command: AnyCommand) -> AnyCommand:
         callback=_pairs,
         help="The column of time, voltage or displacement: a name, or a number from 1 on.",
     )
-    return columns(units(fs(table(other(command)))))
+    return columns(units(fs(table(command))))
+
+
+def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, Any]:
+    """Take what :func:`column_options` say out of a command's options.
+
+    Raises InputError: they say something, and the command is given no ``file``.
+    """
+    reading = {key: options.pop(key) for key in ("columns", "units", "fs", "table")}
+    if file is None and any(value not in (None, {}) for value in reading.values()):
+        context = click.get_current_context()
+        problem = "--column, --unit, --fs and --table are for a file"
+        raise InputError(f"{context.info_name}: {problem}; give {flag}, or remove them")
+    return reading
 
 
 def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:

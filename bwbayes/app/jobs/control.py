@@ -66,6 +66,7 @@ def compensate(
     current: float | None = None,
     capacitance: float | None = None,
     nearest: bool = False,
+    reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Compensation:
     """Return the voltage for a displacement, and its predicted error.
@@ -117,6 +118,9 @@ def compensate(
         The actuator's capacitance, F.
     nearest
         If limits are exceeded, return the nearest feasible command.
+    reading
+        How the reference's file is read, as keyword arguments of ``read_record``: columns, units,
+        fs, table; default: as the training record was, if its columns are the same.
     watch
         Called with the name of a step and the share of it that is done.
 
@@ -139,7 +143,7 @@ def compensate(
     options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
     options = {name: value for name, value in options.items() if value is not None}
     read_as = next(iter(problem.config.records.values())).read_as
-    desired = _reference(reference, problem.record.interval, options, read_as)
+    desired = _reference(reference, problem.record.interval, options, read_as, reading)
     alone = next(iter(problem.posterior.each(fit.flat_draws)))
     command_from = partial(
         compensated,
@@ -188,12 +192,16 @@ def _from_rest_remark(waited: Compensation, rested: Compensation) -> list[str]:
 
 
 def _reference(
-    requested: Any, interval: float, options: Mapping[str, Any], read_as: dict[str, Any] | None
+    requested: Any,
+    interval: float,
+    options: Mapping[str, Any],
+    read_as: dict[str, Any] | None,
+    reading: Mapping[str, Any] | None,
 ) -> Reference:
     """Return a reference: one that is made already, a shape, a file's, or displacements.
 
     ``interval`` is that of samples where nothing says it, s; ``read_as`` how the record's file was
-    read. Refused are options that it cannot have.
+    read, and ``reading`` what the user says of this one. Refused are options that it cannot have.
     """
     shapes = ", ".join(SHAPES)
     if isinstance(requested, str) and requested in SHAPES:
@@ -216,7 +224,7 @@ def _reference(
         if isinstance(requested, str) and not path.suffix and not path.exists():
             hint = suggestion(requested, SHAPES)
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
-        alike = options_alike(path, read_as)
+        alike = options_alike(path, read_as, reading)
         alike.pop("voltage_is", None)
         values, interval = read_reference(path, Naming(**alike))
         return Reference(values, interval, path.stem, smoothed)

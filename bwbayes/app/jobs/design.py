@@ -51,6 +51,7 @@ def design(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Design:
     """Rank signals by what they would leave of an sd, or of a band's width; the best first.
@@ -74,6 +75,9 @@ def design(
         Its largest current, A; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    reading
+        How the drive's file is read, as keyword arguments of ``read_record``: columns, units, fs,
+        table; default: as the training record was, if its columns are the same.
     watch
         Called with the name of a step and the share of it that is done.
 
@@ -99,7 +103,7 @@ def design(
         quantity = parameter = target
     elif isinstance(target, Path):
         read_as = problem.config.records[record].read_as
-        quantity, drive = _drive(target, records[record].interval, read_as), str(target)
+        quantity, drive = _drive(target, records[record].interval, read_as, reading), str(target)
     else:
         quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
     promises = rank(
@@ -186,11 +190,16 @@ def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
     }
 
 
-def _drive(path: Path, interval: float, read_as: dict[str, Any] | None) -> FloatArray:
+def _drive(
+    path: Path,
+    interval: float,
+    read_as: dict[str, Any] | None,
+    reading: Mapping[str, Any] | None,
+) -> FloatArray:
     """Return the voltage of a signal's name or of a record's file, at an interval."""
     if str(path) in signal_names():
         return signal(str(path)).sample(1 / interval)[1]
-    record = read_record(path, need_displacement=False, **options_alike(path, read_as))
+    record = read_record(path, need_displacement=False, **options_alike(path, read_as, reading))
     if np.isclose(record.interval, interval, rtol=1e-6):
         return record.voltage
     samples = np.arange(0.0, record.duration, interval) / record.interval

@@ -117,8 +117,8 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
-        alike = options_alike(record, problem.config.records[of].read_as, table)
-        alike |= {"displacement_file": displacement_file}
+        reading = {"table": table, "displacement_file": displacement_file}
+        alike = options_alike(record, problem.config.records[of].read_as, reading)
         record = read_record(record, need_displacement=False, **alike)
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold

@@ -7,6 +7,7 @@ it came from is noted, with the names of all of them: a file that has no others 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,24 +41,25 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
 
 
 def options_alike(
-    path: str | Path, noted: dict[str, Any] | None, table: int | str | None = None
+    path: str | Path, noted: dict[str, Any] | None, reading: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.
 
     None of one that has other columns than the record had. It may lack some, as a planned voltage
-    lacks the displacement. Of a file with several tables the ``table`` says which one.
+    lacks the displacement. What the user says of the ``reading``, such arguments too, comes first:
+    with columns, units or a rate nothing that was noted counts.
 
     Raises InputError: the file cannot be read.
     """
-    chosen = {} if table is None else {"table": table}
-    if noted is None:
-        return chosen
-    names = {item.name for item in _content(Path(path), table).series}
+    said = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    if noted is None or said.keys() & {"columns", "units", "fs"}:
+        return said
+    names = {item.name for item in _content(Path(path), said.get("table")).series}
     if not names <= {*noted.get("all_columns", ())}:
-        return chosen
+        return said
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
     options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
-    return options | chosen | {"columns": columns}
+    return options | said | {"columns": columns}
 
 
 def _content(path: Path, table: int | str | None) -> Source:
