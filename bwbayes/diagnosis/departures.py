@@ -143,8 +143,10 @@ class Standardized:
         ``span`` are the lowest and the highest voltage of training, V, ``extent`` is the range of
         its readings, um.
         """
-        # A band that misses most of the readings has failed, unless that is likely luck.
-        limit = DOUBT if self._covered(95) < 0.5 else ALARM
+        # A band that misses most of the readings has failed, unless they are off by so little that
+        # luck may do it if all of them are worth one independent reading.
+        single = scipy.stats.f.sf(np.mean(self.z**2), 1, self.noise_size)
+        limit = DOUBT if self._covered(95) < 0.5 and single < DOUBT else ALARM
         reasons = [
             *self._reversed(span),
             *(text for text, chance in self.chances() if chance < limit),

@@ -240,9 +240,10 @@ def assess(
     reasons = standard.reasons(background.fitted, background.extent)
     width = (standard.excess_width,) if bands.training and standard.excess_width else ()
     verdict = Verdict(bands.name, bands.training, True, notes=width, separate=bands.separate)
-    # What bands hold after has done no harm.
+    # What bands hold after, as far as these readings tell, has done no harm.
     lead, doubted = bands.lead_in, verdict
-    if lead is not None and lead.p_value < LEAD_IN_ALARM:
+    off = bool(reasons or standard.chances())
+    if lead is not None and lead.p_value < LEAD_IN_ALARM and off:
         span = f"{clock(lead.start, bands.interval)} to {clock(lead.stop, bands.interval)}"
         p_value = f"p = {lead.p_value:.2g}" if lead.p_value >= 0.001 else "p < 0.001"
         note = f"the lead-in of {span} s does not fit the model ({p_value})"

@@ -4,6 +4,9 @@ The closed form that everything else here leans on: a specimen's parameter y is 
 N(μ, τ²), and its record says N(m; y, s²). Given the spread τ all else is normal, so the only
 integral is one over τ, done on a grid.
 
+A specimen may be an outlier, with the probability ε. Then y is drawn from a Cauchy distribution
+around μ that is ten times as wide, whose tails allow it anywhere.
+
 Source: A. Gelman et al., Bayesian Data Analysis, third edition, section 5.4.
 """
 
@@ -15,6 +18,19 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
+
+# ε, the probability of a specimen to be an outlier, and how many times as wide these are spread.
+ODD, WIDER = 0.2, 10.0
+
+
+def population_density(z: FloatArray) -> FloatArray:
+    """Density of a specimen at z = (y − μ)/τ: (1 − ε) N(z; 0, 1) + ε c/(π (c² + z²)), c = 10."""
+    square = z * z
+    density: FloatArray = np.exp(-0.5 * square)
+    density *= (1 - ODD) / np.sqrt(2 * np.pi)
+    square += WIDER**2
+    density += ODD * WIDER / np.pi / square
+    return density
 
 
 @dataclass(frozen=True)
@@ -51,6 +67,24 @@ class NormalLikelihoods:
         with np.errstate(divide="ignore"):
             logs = np.where(weight > 0, np.log(weight / (2 * np.pi)), 0.0)
         return 0.5 * (logs - weight * (self.mean[:, np.newaxis] - mean) ** 2)
+
+    def outlying(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
+        """Log density (specimens, n) of each record as :meth:`marginal`'s, if it is an outlier.
+
+        The convolution of a normal and a Cauchy distribution is Voigt's profile.
+        """
+        precision = self.precision[:, np.newaxis]
+        sd = np.maximum(precision, 1e-300) ** -0.5
+        away = self.mean[:, np.newaxis] - mean
+        density = scipy.special.voigt_profile(away, sd, WIDER * np.broadcast_to(spread, away.shape))
+        logs: FloatArray = np.where(precision > 0, np.log(np.maximum(density, 1e-300)), 0.0)
+        return logs
+
+    def mixed(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
+        """Log density (specimens, n) of each record, which may be an outlier."""
+        sound, odd = self.marginal(mean, spread), self.outlying(mean, spread)
+        logs: FloatArray = np.logaddexp(np.log1p(-ODD) + sound, np.log(ODD) + odd)
+        return logs
 
     def weight(self, spread: FloatArray) -> FloatArray:
         """1/(s² + τ²), (specimens, n)."""

@@ -1,10 +1,11 @@
 """Population mean and spread of each parameter, shrunk specimens, and the specimen to come.
 
 Each parameter by itself: specimens' coordinates y are drawn from N(μ, τ²), of which little is known
-beforehand. The posterior of μ and τ comes from the draws of the specimens' own posteriors, with
-their prior divided out,
+beforehand, or are outliers (:func:`~bwbayes.population.normal.population_density`), which neither
+inflate the spread nor are pulled to the mean. The posterior of μ and τ comes from the draws of the
+specimens' own posteriors, with their prior divided out,
 
-    p(data of i | μ, τ) ∝ 1/S Σ_s N(y_is; μ, τ²) / π_i(y_is),
+    p(data of i | μ, τ) ∝ 1/S Σ_s p(y_is; μ, τ) / π_i(y_is),
 
 so nothing is sampled again. Populations are proposed from the closed form for normal likelihoods
 (:mod:`bwbayes.population.normal`), then, if need be, from a Student distribution around what that
@@ -28,7 +29,14 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
+from bwbayes.population.normal import (
+    ODD,
+    Hyperprior,
+    NormalLikelihoods,
+    left_out,
+    population_density,
+    spreads,
+)
 from bwbayes.population.specimen import Specimen, likelihoods, shared
 from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
@@ -48,12 +56,11 @@ DRAWS = 1000
 class SpecimenEstimate:
     """One specimen's parameter among the others.
 
-    ``lower``, ``median`` and ``upper`` are the 95% interval with the population for a prior (of an
-    outlier, which no population is a prior for, that of the record alone), and
+    ``lower``, ``median`` and ``upper`` are the 95% interval with the population for a prior, and
     ``own_lower``, ``own_median``, ``own_upper`` that of the record alone, both in the parameter's
     unit. ``p`` is how likely the record would be as far off, either way, from the population that
     all others show; ``outlier`` whether that is so unlikely that a sound campaign has one such
-    among all specimens and parameters once in twenty; it is left out of the population.
+    among all specimens and parameters once in twenty.
     ``pareto_k`` judges the reweighting, and ``normal`` tells whether the specimen's likelihood was
     taken for normal because of it.
     """
@@ -227,19 +234,16 @@ def _population_of(
     draws = [(specimen.draws[:, i], specimen.log_prior[:, i]) for specimen, i in pairs]
     p, inside = _inside(normal, prior, tests)
     outlier = ~inside | (p * tests < OFF)
-    kept = np.flatnonzero(inside)
-    mean, spread, kept_normal, kept_shapes, k = _populations(
-        [draws[i] for i in kept.tolist()], normal.only(inside), prior, generator
-    )
-    is_normal, shapes = np.zeros(len(draws), dtype=np.bool_), np.zeros(len(draws))
-    is_normal[kept], shapes[kept] = kept_normal, kept_shapes
+    mean, spread, is_normal, shapes, k = _populations(draws, normal, inside, prior, generator)
+    sound, odd = normal.marginal(mean, spread), normal.outlying(mean, spread)
+    is_odd = scipy.special.expit(np.log(ODD) - np.log1p(-ODD) + odd - sound)
+    is_odd = generator.uniform(size=is_odd.shape) < is_odd
     scale = np.exp if logarithmic else np.positive
     among = {}
     for i, (specimen, (y, log_prior)) in enumerate(zip(specimens, draws, strict=True)):
-        if outlier[i]:
-            shrunk = y
-        elif is_normal[i]:
+        if is_normal[i]:
             shrunk = normal.shrunk(i, mean, spread, generator)
+            shrunk[is_odd[i]] = generator.choice(y, np.count_nonzero(is_odd[i]))
         else:
             # From its own draws; a quarter of the populations are enough for a prior.
             by_population, _ = _weights(y, log_prior, mean[::4], spread[::4])
@@ -287,6 +291,7 @@ def _inside(
 def _populations(
     draws: Sequence[tuple[FloatArray, FloatArray]],
     normal: NormalLikelihoods,
+    inside: BoolArray,
     prior: Hyperprior,
     generator: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, float]:
@@ -295,19 +300,20 @@ def _populations(
     Returns means and spreads, (DRAWS,) each; which specimens are taken for normal, and the Pareto k
     of their draws reweighted to a typical population, (specimens,) each; Pareto k of the weights.
     """
-    posterior = spreads(normal, prior)
+    sound = normal.only(inside)
+    posterior = spreads(sound, prior)
     mean, spread = posterior.draw(generator, DRAWS)
     shapes, effective = np.empty((2, len(draws)))
     for i, (y, log_prior) in enumerate(draws):
         z = (y - np.median(mean)) / np.median(spread)
-        weights, shapes[i] = smoothed_weights(-0.5 * z**2 - log_prior)
+        weights, shapes[i] = smoothed_weights(np.log(population_density(z)) - log_prior)
         effective[i] = 1 / np.sum(weights**2)
     is_normal = ~((shapes <= LARGEST_PARETO_K) & (effective >= 50))
-    proposed = prior.log_density(mean, spread) + np.sum(normal.marginal(mean, spread), axis=0)
+    proposed = prior.log_density(mean, spread) + np.sum(sound.marginal(mean, spread), axis=0)
     k = 0.0
     for _ in range(4):
         # Log p(data of i | μ, τ), each up to a constant of its own.
-        logs = normal.marginal(mean, spread)
+        logs = normal.mixed(mean, spread)
         for i in np.flatnonzero(~is_normal).tolist():
             by_draw, largest = _weights(*draws[i], mean, spread)
             logs[i] = largest + np.log(np.sum(by_draw, axis=0))
@@ -337,16 +343,15 @@ def _populations(
 def _weights(
     y: FloatArray, log_prior: FloatArray, mean: FloatArray, spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """N(y_s; μ, τ²)/π(y_s), (draws, n), over its largest of each population, and log of that."""
-    weights = y[:, np.newaxis] - mean
-    weights /= spread
-    weights *= weights
-    weights *= -0.5
-    weights -= log_prior[:, np.newaxis]
+    """p(y_s | μ, τ)/π(y_s), (draws, n), over its largest of each population, and log of that.
+
+    The logarithm is up to a constant.
+    """
+    weights = population_density((y[:, np.newaxis] - mean) / spread)
+    weights *= np.exp(np.min(log_prior) - log_prior)[:, np.newaxis]
     largest = np.max(weights, axis=0)
-    weights -= largest
-    np.exp(weights, out=weights)
-    return weights, largest - np.log(spread)
+    weights /= largest
+    return weights, np.log(largest / spread)
 
 
 def _interval(values: FloatArray) -> dict[str, float]:

@@ -68,7 +68,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     text = f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
     moves = [Text(text, on="screen")]
     if result.outcome.converged and result.verdicts and not result.standing.headline:
-        moves.append(Text(f"validation passed {_scope(result)}", on="screen"))
+        moves.append(Text(f"validation passed {drives_like(result.facts)}", on="screen"))
     shown = ("record", "fitted", "model", "noise")
     about = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
     held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
@@ -91,7 +91,7 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
         if result.verdicts:
             is_held_out = any(not verdict.training for verdict in result.verdicts.values())
             data = "held-out data" if is_held_out else "the training data"
-            headline += f"; validation passed on {data}, {_scope(result)}"
+            headline += f"; validation passed on {data}, {drives_like(result.facts)}"
         return [Banner("good", headline, blocks=_results(result), on="page")]
     meaning = (
         "the readings do not tell whether the bands hold"
@@ -112,9 +112,9 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
     return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
 
 
-def _scope(result: Result) -> str:
+def drives_like(facts: Mapping[str, str]) -> str:
     """Return what a validation that passed speaks for: no other drives than those of training."""
-    return f"for drives like the training record's ({result.facts['drive']})"
+    return f"for drives like the training record's ({facts['drive']})"
 
 
 def _not_converged(result: Result, numbers: Mapping[str, Any]) -> Banner:

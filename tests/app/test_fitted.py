@@ -17,6 +17,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.running import run
+from bwbayes.diagnosis.validation import Standing
 from bwbayes.record import Record, read_record
 from bwbayes.report.outputs import write_bands
 from bwbayes.report.words import digits
@@ -114,6 +115,16 @@ def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
     assert said.startswith(repr(fit).splitlines()[0])
     assert page.count("<table>") == 3
     assert '<th scope="col">Mean</th>' in page
+
+
+@pytest.mark.parametrize("holds", [True, False, None])
+def test_the_heading_says_for_which_drives_validation_passed(
+    opened: Fit, holds: bool | None
+) -> None:
+    heading = opened.knowing(standing=Standing(holds)).heading
+    drives = f" for drives like the training record's ({opened.problem.facts['drive']})"
+    assert heading.endswith(f"validation passed{drives}") == bool(holds)
+    assert (drives in heading) == bool(holds)
 
 
 def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:

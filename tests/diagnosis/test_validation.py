@@ -296,6 +296,11 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
     verdict = judged(replace(bands, lead_in=lead), background)
     assert verdict.holds is True
     assert () == verdict.notes
+    # Too short to tell, but covered: that it does not fit is not said either.
+    few = made(np.random.default_rng(1), length=3, memory=1.0)
+    verdict = judged(replace(bands_of(few), lead_in=lead), Background(1.0, 0.0, FITTED))
+    assert verdict.holds is None
+    assert () == verdict.notes
     assert bands.measured is not None
     shifted = replace(bands, measured=bands.measured + 5 * float(record.sds["sensor"].mean()))
     fitting = replace(lead, p_value=0.01)

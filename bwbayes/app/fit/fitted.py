@@ -354,12 +354,15 @@ class Fit(Shown):
 
     @property
     def heading(self) -> str:
-        """Its name, and how it ended."""
+        """Its name, how it ended, and for which drives."""
+        from bwbayes.report.run import drives_like
+
         name = self.problem.config.name or ", ".join(
             r.origin for r in self.problem.records.values()
         )
         if self.converged:
-            return f"{name}: converged, validation {self.standing.status}"
+            scope = f" {drives_like(self.problem.facts)}" if self.standing.holds else ""
+            return f"{name}: converged, validation {self.standing.status}{scope}"
         return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
 
     def report(self) -> Report:

@@ -291,7 +291,7 @@ class Campaign(Product):
             heading=f"Campaign: {name}",
             banners=[
                 Banner(worst, f"{len(self.rows)} records", [counts]),
-                *[Banner("note", "Off the population and left out of it", items=outliers)]
+                *[Banner("note", "Off the population, and without weight in it", items=outliers)]
                 * bool(outliers),
             ],
             blocks=[
