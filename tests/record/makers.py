@@ -24,6 +24,7 @@ from tests.record.instruments import (
 )
 
 MAKERS: dict[str, Writer] = {}
+MICRONS = {"displacement": "1 um"}
 COUNTS = np.rint(DISPLACEMENT / 1e-5).astype(np.int32)  # exact, as it has five decimals
 
 
@@ -261,3 +262,45 @@ def _(folder: Path) -> Written:
         for name, text in parts.items():
             archive.writestr(name, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}')
     return Written(folder / "a.xlsx")
+
+
+def _lines(path: Path, head: list[str], rows: Any) -> Path:
+    path.write_text("\n".join([*head, *rows, ""]), encoding="utf-8")
+    return path
+
+
+@_maker("Keysight BenchLink, milliseconds behind a colon")
+def _(folder: Path) -> Written:
+    stamps = np.datetime64("2026-12-03T14:05:58", "us") + np.rint(1e6 * TIME).astype("m8[us]")
+    texts = [f"{t:%m/%d/%Y %H:%M:%S}:{t.microsecond // 1000:03d}" for t in stamps.tolist()]
+    rows = enumerate(zip(texts, VOLTAGE, DISPLACEMENT, strict=True), start=1)
+    cells = [f"{i},{t},{v:+.8E},0,{d:+.8E},0" for i, (t, v, d) in rows]
+    head = ["Scan,Time,101 <HV> (VDC),Alarm 101,102 <Gauge> (VDC),Alarm 102"]
+    columns = {"voltage": "101 <HV> (VDC)", "displacement": "102 <Gauge> (VDC)"}
+    return Written(_lines(folder / "a.csv", head, cells), columns, {"voltage": "V"} | MICRONS)
+
+
+@_maker("a table drawn with bars and dashes")
+def _(folder: Path) -> Written:
+    rows = [f"| {t:.3f} | {v:.4f} | {d:.5f} |" for t, v, d in zip(*COLUMNS, strict=True)]
+    head = ["| t (s) | U (V) | x (um) |", "|-------|------:|:------:|"]
+    return Written(_lines(folder / "a.md", head, rows))
+
+
+@_maker("spreadsheet, French, blanks between thousands and typeset minus signs")
+def _(folder: Path) -> Written:
+    def number(value: float) -> str:
+        return f"{value:,.2f}".replace(",", " ").replace(".", ",").replace("-", "\u2212")
+
+    rows = [
+        f"{t:.3f};{number(1e3 * v)};{number(1e3 * d)}".replace(".", ",")
+        for t, v, d in zip(*COLUMNS, strict=True)
+    ]
+    return Written(_lines(folder / "a.csv", ["temps [s];tension [mV];position [nm]"], rows))
+
+
+@_maker("NumPy, dates")
+def _(folder: Path) -> Written:
+    stamps = np.datetime64("2026-03-03", "us") + np.rint(1e6 * TIME).astype("m8[us]")
+    np.savez(folder / "a.npz", time=stamps, voltage_V=VOLTAGE, displacement_um=DISPLACEMENT)
+    return Written(folder / "a.npz")

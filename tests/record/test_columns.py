@@ -212,6 +212,31 @@ def test_a_sensors_volts_are_asked_for_with_their_sensitivity(tmp_path: Path) ->
         read_record(write(tmp_path / "a.csv", values))
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        *("{} /10\u207b\u2076 {}", "{} (10^-6 {})", "{} (x10-6 {})", "{} 1e-6 {}", "{} [1E-3 {}]"),
+        *("{} x10 ({})", "{} \u00d7100 [{}]", "{}/10 ({})", "{} 1:20 [{}]", "{} *1000 / {}"),
+    ],
+)
+@pytest.mark.parametrize("unit_in_row", [False, True])
+def test_a_factor_in_a_name_leaves_open_what_its_numbers_stand_for(
+    tmp_path: Path, form: str, unit_in_row: bool
+) -> None:
+    """It may be of the unit or of the numbers; a sensitivity from the user settles it."""
+    name = form.format("stage", "um")
+    rows = [f"{t},{v},{d}" for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)]
+    head = [f"t,U,{name}", "s,V,um"] if unit_in_row else [f"t (s),U (V),{name}"]
+    (tmp_path / "a.csv").write_text("\n".join([*head, *rows, ""]))
+    with pytest.raises(ColumnsError) as caught:
+        read_record(tmp_path / "a.csv")
+    assert "--unit displacement='? " in str(caught.value.in_command("bwbayes run a.csv"))
+    said: Any = {"columns": {"displacement": name}, "units": {"displacement": "10 um"}}
+    displacement = read_record(tmp_path / "a.csv", **said).displacement
+    assert displacement is not None
+    np.testing.assert_allclose(displacement.tolist(), [10 * value for value in DISPLACEMENT])
+
+
 @given(
     st.sampled_from(["unix_time", "Unix Timestamp", "epoch"]),
     st.sampled_from([("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)]),

@@ -184,7 +184,9 @@ def split_header(line: str, layout: Layout) -> list[str]:
         cells = [cell.strip().strip('"') for cell in fields]
         more = any(cells[layout.fields :]) and (number > 0 or layout.separator == " ")
         filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
-        is_name = any(filled) and not any(_NUMBER.fullmatch(cell) for cell in filled)
+        # A rule of dashes, as below the names of tables that are drawn, is none.
+        is_name = any(re.search(r"\w", cell) for cell in filled)
+        is_name &= not any(_NUMBER.fullmatch(cell) for cell in filled)
         if len(cells) >= needed and not more and is_name:
             return cells
     return []

@@ -12,7 +12,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.series import Series
-from bwbayes.record.io.units import QUANTITIES, unit_in, unit_in_brackets, unit_scale
+from bwbayes.record.io.units import QUANTITIES, factor_in, unit_in, unit_in_brackets, unit_scale
 
 # In the names of displacements that are asked for, not measured.
 _DEMANDS = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
@@ -77,7 +77,7 @@ def counts_samples(series: Series) -> bool:
 
 def foreign_unit(series: Series, quantity: str) -> str:
     """Return the unit that a file states for a series, if it is none of the quantity."""
-    stated = series.unit or unit_in_brackets(series.label) or ""
+    stated = series.unit or unit_in_brackets(series.label) or factor_in(series.label)
     others = [unit for q in QUANTITIES if (unit := unit_of(series.label, series.unit, q))]
     # A number in brackets is that of a matrix's column.
     stated = "" if stated.isdecimal() else stated
@@ -94,7 +94,9 @@ def beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Serie
 
 
 def unit_of(label: str, unit: str, quantity: str) -> str | None:
-    """Return the unit that a file states for a series, if it is one of the quantity."""
+    """Return the unit that a file states for a series, if it is one of the quantity, and sure."""
+    if factor_in(label):
+        return None
     return unit if unit_scale(unit, quantity) else unit_in(label, quantity)
 
 

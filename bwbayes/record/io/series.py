@@ -274,7 +274,10 @@ def read_numpy(path: Path) -> Source:
         one
         for name, values in arrays.items()
         if name not in notes
-        for one in vectors("", name, values.shape, values.dtype, partial(in_seconds, values))
+        for one in vectors(
+            *("", name, values.shape, values.dtype, partial(in_seconds, values)),
+            unit="s" if values.dtype.kind in "mM" else "",
+        )
     ]
     return Source(path, tuple(series), {"": notes})
 

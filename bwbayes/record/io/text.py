@@ -48,6 +48,7 @@ type Marks = tuple[str, str | None]
 """The mark of decimals in numbers, and that of thousands, if there is one."""
 
 _OTHER_MARKS = "['\u2019\u00a0\u2009\u202f]"
+_BLANKS = r"[+-]?[1-9]\d{0,2}(?: \d{3})+(?:[.,]\d*)?"
 
 
 def read_text(path: Path, table: int | str | None = None) -> Source:
@@ -205,6 +206,13 @@ def _decoded(path: Path) -> str:
     text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
     # What C writes where there is no number, and marks of thousands but points and commas.
     text = re.sub(r"-?1\.#(INF|IND|QNAN|SNAN)\d*", "nan", text)
+    # The minus of typesetting, and milliseconds behind a colon as data loggers of Keysight's.
+    text = re.sub(r"\u2212(?=[\d.,])", "-", text)
+    text = re.sub(r"(?<=\d:\d\d:\d\d):(?=\d{3}(?!\d))", ".", text)
+    # A blank is such a mark where semicolons or tabs separate the cells, and one is a number by it.
+    if re.search(rf"{_BLANKS}[;\t]|[;\t]{_BLANKS}(?![^\n])", text):
+        cell = rf"(?<![^;\t\n]){_BLANKS}(?![^;\t\n])"
+        text = re.sub(cell, lambda number: number[0].replace(" ", ""), text)
     if re.search(_OTHER_MARKS, text) is None:
         return text
     thousands = rf"(?<![\d.,])\d{{1,3}}({_OTHER_MARKS}\d{{3}})+(?!\d)"

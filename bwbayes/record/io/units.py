@@ -31,6 +31,11 @@ _OTHERS = {
         **dict.fromkeys(("in", "inch", "inches"), 25_400.0),
     },
 }
+# A power of ten, a ratio, or a factor of ten, hundred or the like: "10^-6", "1:20", "x10", "/100".
+_FACTOR = re.compile(
+    r"(?<![\w.])(?:10\s*\^|10[\u207b\u207a\u2070\u00b9\u00b2\u00b3\u2074-\u2079]|10?[eE][-+]?\d)"
+    r"|(?<![\d.:])1:\d+(?![\d:])|(?:(?<!\w)[xX*]|[\u00d7\u00b7/*])\s*10+(?!\d|\s*[\w.])"
+)
 # What else stands where units do, in lower case.
 _FOREIGN = (
     *("%", "-", "1", "#", "a.u.", "count", "counts", "digit", "digits", "lsb", "bit", "bits"),
@@ -62,6 +67,7 @@ def is_time_form(text: str) -> bool:
 
 def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
+    unit = re.sub("(?<=V) ?(?:DC|dc)$", "", unit)  # as voltmeters write
     base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
     written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
     if written:
@@ -110,6 +116,15 @@ def unit_in(name: str, quantity: str) -> str | None:
         if power_of(unit, quantity) is None and not is_marked:
             return None
     return unit if unit_scale(unit, quantity) else None
+
+
+def factor_in(name: str) -> str:
+    """Return a factor in a column's name, which may be of its unit or of its numbers, or "".
+
+    As ``x / 10⁻⁶ m``, ``U x10 (V)``, ``monitor 1:100 [V]``: what 1 in it stands for is open.
+    """
+    factor = _FACTOR.search(name)
+    return factor[0].strip() if factor else ""
 
 
 def unit_in_brackets(name: str) -> str | None:
