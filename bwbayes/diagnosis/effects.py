@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import accumulate
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.diagnosis.laplace import Effect, LocalFit, Simulate, climb
+from bwbayes.diagnosis.laplace import Effect, LocalFit, climb
 from bwbayes.diagnosis.loopfit import find_delay
 from bwbayes.diagnosis.record_checks import late_fix, settle_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
@@ -28,19 +27,12 @@ SIZE = 0.1
 
 def _add(shape: Callable[[FloatArray], FloatArray], starts: FloatArray) -> Effect:
     """Add ``shape(sizes)`` (samples,), um, to the displacement."""
-    return Effect(lambda simulate, u, sizes: simulate(u) + shape(sizes)[: u.size], starts)
+    return Effect(starts, read=lambda moved, sizes: moved + shape(sizes)[: moved.shape[1]])
 
 
 def add_shapes(shapes: FloatArray, size: float) -> Effect:
     """Add shapes (shapes, samples), each of a size whose prior sd is given, um."""
     return _add(lambda sizes: size * (sizes @ shapes), np.zeros((1, len(shapes))))
-
-
-def _replace_voltage(
-    voltage: Callable[[FloatArray, FloatArray], FloatArray], starts: FloatArray
-) -> Effect:
-    """Drive the actuator with ``voltage(recorded, sizes)`` (samples,), V."""
-    return Effect(lambda simulate, u, sizes: simulate(voltage(u, sizes)), starts)
 
 
 def drift(scene: Scene) -> Iterator[Explanation]:
@@ -116,10 +108,10 @@ def moving_gain(scene: Scene) -> Iterator[Explanation]:
     """Try x (1 + a t/T)."""
     along = scene.time / scene.duration
 
-    def scaled(simulate: Simulate, voltage: FloatArray, sizes: FloatArray) -> FloatArray:
-        return np.asarray(simulate(voltage) * (1 + SIZE * sizes[0] * along[: voltage.size]))
+    def scaled(moved: FloatArray, sizes: FloatArray) -> FloatArray:
+        return np.asarray(moved * (1 + SIZE * sizes[0] * along[: moved.shape[1]]))
 
-    fit = scene.extended(Effect(scaled, np.zeros((1, 1))))
+    fit = scene.extended(Effect(np.zeros((1, 1)), read=scaled))
     text = f"gain that changes by {100 * SIZE * fit.sizes[0]:.2g}% along the record (temperature)"
     yield scene.explained("moving gain", text, "measure at a constant temperature", fit)
 
@@ -140,20 +132,20 @@ def backlash(scene: Scene) -> Iterator[Explanation]:
     """Try a play between actuator and sensor, of a twentieth of the range each way or so."""
     scale = 0.05 * scene.extent
 
-    def followed(simulate: Simulate, voltage: FloatArray, sizes: FloatArray) -> FloatArray:
+    def followed(moved: FloatArray, sizes: FloatArray) -> FloatArray:
         # A sample later the sensor is where it was, held between low and high. To be held twice is
         # to be held once, between other limits: these are found for 1, 2, 4 ... samples at a time.
-        moved, play = simulate(voltage), scale * abs(sizes[0])
+        play = scale * abs(sizes[0])
         low, high = moved - play, moved + play
         held = 1
-        while held < voltage.size:
+        while held < moved.shape[1]:
             before, later = slice(None, -held), slice(held, None)
             limits = [np.clip(end[:, before], low[:, later], high[:, later]) for end in (low, high)]
             low[:, later], high[:, later] = limits
             held *= 2
         return np.clip(moved[:, :1], low, high)
 
-    fit = scene.extended(Effect(followed, np.array([[0.3], [1.0]])))
+    fit = scene.extended(Effect(np.array([[0.3], [1.0]]), read=followed))
     text = f"backlash of {2 * scale * abs(fit.sizes[0]):.2g} um in the mount"
     yield scene.explained("backlash", text, "tighten the mount, or preload it", fit)
 
@@ -170,7 +162,7 @@ def delay(scene: Scene) -> Iterator[Explanation]:
         clock = scene.interval * np.arange(voltage.size)
         return np.asarray(np.interp(clock - scale * sizes[0], clock, voltage))
 
-    fit = scene.extended(_replace_voltage(shifted, np.array([[-1.0], [0.0], [1.0]])))
+    fit = scene.extended(Effect(np.array([[-1.0], [0.0], [1.0]]), drive=shifted))
     yield _late(scene, scale * float(fit.sizes[0]), fit)
     record, limit = scene.posterior.only, min(0.55 * scene.turn_time, 0.2 * scene.duration)
     kept = np.full(record.displacement.size, np.nan)
@@ -210,7 +202,7 @@ def saturation(scene: Scene) -> Iterator[Explanation]:
         return np.clip(voltage, *limits(sizes))
 
     starts = np.array([[0.0, 0.5], [0.5, 0.0], [0.5, 0.5]])
-    fit = scene.extended(_replace_voltage(clipped, starts))
+    fit = scene.extended(Effect(starts, drive=clipped))
     lower, upper = limits(fit.sizes)
     text = f"amplifier that saturates at {lower:.4g} and {upper:.4g} V"
     fix = "record the amplifier's output voltage, or drive inside its range"
@@ -225,14 +217,19 @@ def slew_limit(scene: Scene) -> Iterator[Explanation]:
         return float(fastest * np.exp(-0.7 * abs(sizes[0])))
 
     def limited(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
-        step = limit(sizes) * scene.interval
+        step, reached = limit(sizes) * scene.interval, float(voltage[0])
+        followed = []
+        for wanted in voltage.tolist():
+            if wanted > reached + step:
+                reached += step
+            elif wanted < reached - step:
+                reached -= step
+            else:
+                reached = wanted
+            followed.append(reached)
+        return np.array(followed)
 
-        def follow(reached: float, wanted: float) -> float:
-            return min(max(wanted, reached - step), reached + step)
-
-        return np.array([*accumulate(voltage.tolist(), follow)])
-
-    fit = scene.extended(_replace_voltage(limited, np.array([[0.3], [1.0], [2.0]])))
+    fit = scene.extended(Effect(np.array([[0.3], [1.0], [2.0]]), drive=limited))
     text = f"amplifier that follows no faster than {limit(fit.sizes):.3g} V/s"
     fix = "record the amplifier's output voltage, or drive more slowly"
     yield scene.explained("slew limit", text, fix, fit)

@@ -9,6 +9,7 @@ keep them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,8 +58,8 @@ def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
     Only the first of them where the discrepancy takes up too little for any other to be worth more
     than :data:`LIMIT`, unless one of these is, so that all compete where a cause is named. Where
     the discrepancy is smooth, they are fitted beside a rough one first, then those beside the
-    smooth one that gained anything; each counts as the better fit. ``watch`` is called with the
-    share that is done.
+    smooth one that are worth more than the limit there; each counts as the better fit. ``watch`` is
+    called with the share that is done.
     """
     best: dict[str, Explanation] = {}
     if scene.posterior.only.is_followed(scene.fit.displacement):
@@ -73,8 +74,12 @@ def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
         ):
             break
         found = [] if rough is None else list(kind(rough))
-        if rough is None or any(explanation.nats + rough.lead > 0 for explanation in found):
-            found += kind(scene)
+        lead = 0.0 if rough is None else rough.lead
+        worth = frozenset(cause.kind for cause in found if cause.nats + lead > LIMIT)
+        if rough is None:
+            found = list(kind(scene))
+        elif worth:
+            found += kind(replace(scene, kinds=worth))
         for explanation in sorted(found, key=lambda explanation: explanation.nats):
             best[explanation.kind] = explanation
         watch((number + 1) / len(kinds))

@@ -14,38 +14,66 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.likelihood import batches
+from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.posterior import Posterior
 
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
 
+# Rounds from every start, and how many times what a round gained all later ones may gain.
+FIRST_ROUNDS, AHEAD = 2, 10.0
+
+# Steps in the noise's coordinates a round: of states side by side, and of one alone.
+NOISE_STEPS = 2, 6
+
 # Parts of a step that are tried.
 FRACTIONS = 0.5 ** np.arange(8)
 
-# What simulates a voltage (samples,): displacements (models, samples), um, from rest.
-Simulate = Callable[[FloatArray], FloatArray]
+
+def _same(series: FloatArray, _: FloatArray) -> FloatArray:
+    return series
 
 
 @dataclass(frozen=True)
 class Effect:
     """An addition to a model, with sizes whose priors are standard normal.
 
-    ``apply(simulate, voltage, sizes)`` returns the displacement (models, samples), um, of models
-    that all have these sizes (sizes,); ``starts`` (starts, sizes) are those to climb from.
+    The actuator is driven by ``drive(voltage, sizes)`` (samples,), V, and what it does, (models,
+    samples), um, is read as ``read(displacement, sizes)``, um, with one vector of sizes (sizes,);
+    ``starts`` (starts, sizes) are those to climb from.
     """
 
-    apply: Callable[[Simulate, FloatArray, FloatArray], FloatArray]
     starts: FloatArray
+    drive: Callable[[FloatArray, FloatArray], FloatArray] = _same
+    read: Callable[[FloatArray, FloatArray], FloatArray] = _same
+
+    def displacement(
+        self, likelihood: Likelihood, model: FloatArray, voltage: FloatArray, sizes: FloatArray
+    ) -> FloatArray:
+        """Displacement (models, samples), um, of models (models, parameters of the actuator).
+
+        Each has sizes of its own, (models, sizes). What they share is worked out once.
+        """
+        moved = np.empty((len(model), voltage.size))
+        distinct, which = np.unique(sizes, axis=0, return_inverse=True)
+        groups = [np.flatnonzero(which.ravel() == number) for number in range(len(distinct))]
+        together = [np.arange(len(model))] if self.drive is _same else groups
+        for rows in together:
+            driven = self.drive(voltage, sizes[rows[0]])
+            for batch in batches(rows.size, voltage.size):
+                moved[rows[batch]] = likelihood.simulate(model[rows[batch]], driven)
+        for rows in groups if self.read is not _same else ():
+            moved[rows] = self.read(moved[rows], sizes[rows[0]])
+        return moved
 
 
-NONE = Effect(lambda simulate, voltage, _: simulate(voltage), np.zeros((1, 0)))
+NONE = Effect(np.zeros((1, 0)))
 
 
 @dataclass(frozen=True)
@@ -94,8 +122,9 @@ class LocalFit:
         record = self.posterior.only
         likelihood = self.posterior.likelihood
         model = likelihood.table.actuator(self.posterior.prior.theta(self.free[np.newaxis]))
-        simulate = partial(likelihood.simulate, model)
-        missed = record.displacement - self.effect.apply(simulate, record.voltage, self.sizes)[0]
+        sizes = self.sizes[np.newaxis]
+        missed = record.displacement
+        missed = missed - self.effect.displacement(likelihood, model, record.voltage, sizes)[0]
         inside = np.concatenate([missed[window] for window in windows])
         return float(np.sqrt(np.nanmean(inside**2))) if np.isfinite(inside).any() else np.nan
 
@@ -105,13 +134,24 @@ def climb(
 ) -> LocalFit:
     """Fit from the best of coordinates (places, free) of a posterior of one record nearby.
 
-    Two rounds from each of them, with each of an effect's starts, tell which one leads. The climb
-    ends where it gains so little that it would never reach a log density of ``least``.
+    Two rounds from each of them, with each of an effect's starts, side by side, tell which one
+    leads. The climb ends where it gains so little that it would never reach a log density of
+    ``least``.
     """
-    target = _Target(posterior, effect, least)
+    target = _Target(posterior, effect)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
-    climbed = [target.climb(target.at(start), 2) for start in starts]
-    return target.fitted(target.climb(max(climbed, key=lambda state: state.density), ROUNDS))
+    states = target.at(np.stack(starts))
+    possible = [state for state in states if np.isfinite(state.density)]
+    for number in range(1, ROUNDS + FIRST_ROUNDS + 1) if possible else ():
+        ahead = target.round(possible)
+        # One that leads after some rounds goes on alone.
+        best = int(np.argmax([state.density for state in ahead]))
+        gain = ahead[best].density - possible[best].density
+        possible = ahead if number < FIRST_ROUNDS else [ahead[best]]
+        missing = least - ahead[best].density
+        if len(possible) == 1 and gain < max(GAIN, missing / AHEAD):
+            break
+    return target.fitted(max(possible or states, key=lambda state: state.density))
 
 
 @dataclass(frozen=True)
@@ -129,7 +169,6 @@ class _Target:
 
     posterior: Posterior
     effect: Effect
-    least: float = -np.inf
 
     @property
     def free(self) -> int:
@@ -157,18 +196,10 @@ class _Target:
         """Displacement (models, readings), um, of θ and coordinates that are possible."""
         likelihood = self.posterior.likelihood
         readings = likelihood.readings
-        voltage = likelihood.voltage[: readings.samples]
-        moved = np.empty((len(theta), readings.rows.size))
-        # An effect is worked out once for all models that have the same sizes.
-        distinct, which = np.unique(coordinates[:, self.free :], axis=0, return_inverse=True)
-        for number, sizes in enumerate(distinct):
-            models = np.flatnonzero(which.ravel() == number)
-            for batch in batches(models.size, voltage.size):
-                rows = models[batch]
-                model = likelihood.table.actuator(theta[rows])
-                simulate = partial(likelihood.simulate, model)
-                moved[rows] = self.effect.apply(simulate, voltage, sizes)[:, readings.where]
-        return moved
+        model, voltage = likelihood.table.actuator(theta), likelihood.voltage[: readings.samples]
+        sizes = coordinates[:, self.free :]
+        moved = self.effect.displacement(likelihood, model, voltage, sizes)
+        return moved[:, readings.where]
 
     def density(
         self, theta: FloatArray, log_prior: FloatArray, displacement: FloatArray
@@ -194,40 +225,49 @@ class _Target:
             density[possible] += likelihood.score(theta, moved[:0], moved).log_density
         return np.where(np.isfinite(density), density, -np.inf)
 
-    def at(self, coordinates: FloatArray) -> _State:
-        """Return the state at the coordinates (free + sizes,)."""
-        theta, density = self.prior(coordinates[np.newaxis])
-        moved = np.zeros((1, self.posterior.likelihood.readings.rows.size))
-        if np.isfinite(density).all():
-            moved = self.displacement(theta, coordinates[np.newaxis])
-            density = self.density(theta, density, moved[0])
-        return _State(coordinates, float(density[0]), moved[0])
+    def at(self, coordinates: FloatArray) -> list[_State]:
+        """Return the states at coordinates (states, free + sizes)."""
+        theta, density = self.prior(coordinates)
+        possible = np.isfinite(density)
+        moved = np.zeros((len(coordinates), self.posterior.likelihood.readings.rows.size))
+        if possible.any():
+            theta = theta[possible]
+            moved[possible] = self.displacement(theta, coordinates[possible])
+            score = self.posterior.likelihood.score(theta, moved[:0], moved[possible])
+            density[possible] += score.log_density
+        density = np.where(np.isfinite(density), density, -np.inf)
+        return [_State(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
 
-    def climb(self, state: _State, rounds: int) -> _State:
-        """Climb for so many rounds at most, as long as these may reach ``least``."""
-        for _ in range(rounds if np.isfinite(state.density) else 0):
-            before, state = state.density, self._step_noise(state)
-            # In the physical coordinates and the sizes, by Fisher scoring.
-            slope, curvature = self._physical_bend(state)
-            step = np.zeros(state.coordinates.size)
-            step[self.physical] = np.linalg.solve(curvature, slope)
-            tried = (self.at(state.coordinates + fraction * step) for fraction in FRACTIONS)
-            state = next((ahead for ahead in tried if ahead.density > state.density), state)
-            if state.density < before + max(GAIN, (self.least - state.density) / ROUNDS):
+    def round(self, states: Sequence[_State]) -> list[_State]:
+        """Climb a round from states side by side: in the noise's coordinates, then in the others.
+
+        In these by Fisher scoring.
+        """
+        states = [self._step_noise(state, NOISE_STEPS[len(states) == 1]) for state in states]
+        slopes, curvatures = self._physical_bend(states)
+        steps = np.zeros((len(states), states[0].coordinates.size))
+        steps[:, self.physical] = np.linalg.solve(curvatures, slopes[..., np.newaxis])[..., 0]
+        left = [*range(len(states))]
+        for fraction in FRACTIONS:
+            tried = np.stack([states[i].coordinates + fraction * steps[i] for i in left])
+            for i, ahead in zip([*left], self.at(tried), strict=True):
+                if ahead.density > states[i].density:
+                    states[i] = ahead
+                    left.remove(i)
+            if not left:
                 break
-        return state
+        return states
 
     def fitted(self, state: _State) -> LocalFit:
         """Put the evidence at a mode together."""
         log_evidence, covariance = state.density, np.eye(state.coordinates.size)
         # What the record does not tell keeps its prior; the noise's bend is a finite difference.
-        parts = (
-            (self.physical, self._physical_bend, 1.0),
-            (self.noise, self._noise_bend, 1e-2),
-        )
         # A model that is possible at none of its starts has no evidence, and no curvature.
-        for rows, bend, flattest in parts if np.isfinite(state.density) else ():
-            curvature = bend(state)[1]
+        parts: list[tuple[IntArray, FloatArray, float]] = []
+        if np.isfinite(state.density):
+            parts.append((self.physical, self._physical_bend([state])[1][0], 1.0))
+            parts.append((self.noise, self._noise_bend(state)[1], 1e-2))
+        for rows, curvature, flattest in parts:
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
             covariance[np.ix_(rows, rows)] = (vectors / values) @ vectors.T
@@ -242,29 +282,34 @@ class _Target:
             state.displacement,
         )
 
-    def _physical_bend(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Slope and curvature of the log density in the physical coordinates."""
+    def _physical_bend(self, states: Sequence[_State]) -> tuple[FloatArray, FloatArray]:
+        """Slopes and curvatures of the log density of states in the physical coordinates."""
         step = 1e-4  # a simulation has no noise but rounding
-        steps = step * np.eye(state.coordinates.size)[self.physical]
-        sides = state.coordinates + np.concatenate([steps, -steps])
-        theta, log_prior = self.prior(np.concatenate([state.coordinates[np.newaxis], sides]))
-        possible = np.isfinite(log_prior[1:])
-        moved = np.tile(state.displacement, (len(sides), 1))
-        moved[possible] = self.displacement(theta[1:][possible], sides[possible])
-        forth, back = np.split(moved, 2)
-        width = step * np.maximum(np.sum(possible.reshape(2, -1), axis=0), 1)
-        slopes, here = (forth - back) / width[:, np.newaxis], state.displacement[np.newaxis]
-        score = self.posterior.likelihood.score(theta[:1], slopes, here)
-        slope = score.pull[0] - state.coordinates[self.physical]
-        return slope, score.information[0] + np.eye(len(steps))
+        coordinates = np.stack([state.coordinates for state in states])
+        steps = step * np.eye(coordinates.shape[1])[self.physical]
+        sides = coordinates[:, np.newaxis] + np.concatenate([steps, -steps])
+        theta, _ = self.prior(coordinates)
+        flat = sides.reshape(-1, coordinates.shape[1])
+        theta_sides, log_prior = self.prior(flat)
+        possible = np.isfinite(log_prior)
+        here = np.stack([state.displacement for state in states])
+        moved = np.repeat(here, 2 * len(steps), axis=0)
+        moved[possible] = self.displacement(theta_sides[possible], flat[possible])
+        forth, back = np.split(moved.reshape(*sides.shape[:2], -1), 2, axis=1)
+        width = np.sum(possible.reshape(len(states), 2, -1), axis=1)
+        slopes = (forth - back) / (step * np.maximum(width, 1))[..., np.newaxis]
+        score = self.posterior.likelihood.score(theta, slopes, here)
+        return score.pull - coordinates[:, self.physical], score.information + np.eye(len(steps))
 
-    def _step_noise(self, state: _State) -> _State:
+    def _step_noise(self, state: _State, count: int) -> _State:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
-        for _ in range(6 if self.noise.size else 0):
+        for _ in range(count if self.noise.size else 0):
             slope, curvature = self._noise_bend(state)
             values, vectors = np.linalg.eigh(curvature)
             step = vectors @ (vectors.T @ slope / np.maximum(np.abs(values), 1.0))
             step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
+            if slope @ step <= GAIN / 4:
+                break
             steps = FRACTIONS[:, np.newaxis] * step
             gains = self._noise_gains(state, steps)
             best = int(np.argmax(gains))

@@ -76,7 +76,8 @@ def operator(scene: Scene) -> Iterator[Explanation]:
     # Compiled ones, each of another family, and plays of any weights, which follow loops that no
     # formula has.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
-        if scene.study is None or HYSTERESIS[name] is present:
+        kind = f"operator {name}"
+        if scene.study is None or HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
         spec = scene.study.spec.with_parts(hysteresis=name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
@@ -85,7 +86,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
         fix = _lines(scene.study.spec, spec)
-        yield scene.explained(f"operator {name}", text, fix, fit, spec=spec)
+        yield scene.explained(kind, text, fix, fit, spec=spec)
 
 
 def smooth(scene: Scene) -> Iterator[Explanation]:
@@ -107,7 +108,8 @@ def _changed(
 
     ``facts`` are other fields of the explanation.
     """
-    if scene.study is None:
+    kind = kind or text
+    if scene.study is None or not scene.looks_for(kind):
         return
     spec = scene.study.spec.with_parts(**changes)
     posterior = scene.rebuilt(scene.study.with_model(spec, stated))
@@ -121,7 +123,7 @@ def _changed(
     fix = _lines(scene.study.spec, spec)
     if stated:
         fix += f", with what is known of {', '.join(stated)} in [parameters]"
-    yield scene.explained(kind or text, text, fix, fit, spec=spec, stated=stated, **facts)
+    yield scene.explained(kind, text, fix, fit, spec=spec, stated=stated, **facts)
 
 
 def prior(scene: Scene) -> Iterator[Explanation]:

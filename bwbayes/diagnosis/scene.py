@@ -103,6 +103,8 @@ class Scene:
         The study of the record, which gives other models, if these are asked.
     before
         What explanations are compared with, if it is another fit.
+    kinds
+        Kinds of other models that are fitted; all of them if None.
     """
 
     fit: LocalFit
@@ -113,6 +115,7 @@ class Scene:
     begin: float = 0.0
     study: Study | None = None
     before: LocalFit | None = None
+    kinds: frozenset[str] | None = None
 
     @classmethod
     def of(
@@ -255,6 +258,10 @@ class Scene:
         """RMSE and error of the readings held out, um, of what explanations are compared with."""
         before = self.before or self.fit
         return before.rmse, before.error(self.held_out)
+
+    def looks_for(self, kind: str) -> bool:
+        """Whether another model of a kind is fitted."""
+        return self.kinds is None or kind in self.kinds
 
     def clock(self, time: float) -> str:
         """Write a time since the first reading as one of the record, s."""

@@ -67,8 +67,10 @@ class LeastSquares:
         """Sum of squares (models,)."""
         return np.sum(self.residuals(coordinates) ** 2, axis=1)
 
-    def optima(self, starts: FloatArray) -> FloatArray:
+    def optima(self, starts: FloatArray, least: float = 1e-8) -> FloatArray:
         """Return the coordinates (starts, free) of the optima that starts (starts, free) lead to.
+
+        The last step is one that takes less than the ``least`` part of the sum of squares away.
 
         By Levenberg and Marquardt's steps, all starts side by side: to simulate a record for many
         models takes hardly longer than for one. Lengths are in spreads; the damping follows how
@@ -103,7 +105,7 @@ class LeastSquares:
             descent = costs[moving] - cost
             descends = descent > 0  # not where the place is impossible
             settled = np.linalg.norm(step, axis=1) < 1e-8
-            settled |= descends & (descent < 1e-8 * costs[moving])
+            settled |= descends & (descent < least * costs[moving])
             worse, better, step = moving[~descends], moving[descends], step[descends]
             damping[worse] *= growth[worse]
             growth[worse] *= 2.0

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 # Prior draws that are tried, and the best of them that each least squares starts from.
 DRAWS, STARTS = 128, 5
 
+# Part of the sum of squares that least squares leaves where a climb goes on from it.
+NEARBY = 1e-4
+
 # Samples of a record in which modes are looked for, and prior draws that tell whether a longer one
 # can be thinned to so many.
 SAMPLES, PROBES = 20_000, 8
@@ -98,14 +101,22 @@ def valleys(
 ) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
 
-    From so many starts: a few find the best of them, if not all.
+    From so many starts: a few find the best of them, if not all. A long record is looked at until
+    its voltage has been nearly everywhere, and :data:`SAMPLES` on.
 
     Raises
     ------
     InputError
         As :func:`fit`.
     """
-    return np.stack(_places(posterior, generator, starts)[0])
+    known = posterior.only
+    covered = np.maximum.accumulate(known.voltage) - np.minimum.accumulate(known.voltage)
+    everywhere = int(np.searchsorted(covered, 0.9 * covered[-1]))
+    last = max(everywhere, int(known.readings.rows[0])) + SAMPLES
+    if known.readings.samples > last:
+        windows = (slice(w.start, min(w.stop, last)) for w in known.training if w.start < last)
+        posterior = posterior.altered(training=tuple(windows))
+    return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
 
 
 def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
@@ -129,6 +140,7 @@ def _places(
     generator: np.random.Generator,
     starts: int = STARTS,
     watch: Watch = unwatched,
+    least: float = 1e-8,
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Return places (free,) to climb from; of prior draws, the noise and the covariance."""
     prior = posterior.prior
@@ -141,7 +153,7 @@ def _places(
     for steps in watched((False, True), watch):
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
-        optima += _valleys(least_squares, least_squares.optima(draws[order[:starts]]))
+        optima += _valleys(least_squares, least_squares.optima(draws[order[:starts]], least))
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
     # A place that least squares allows may still have no density: the noise is another one there.
@@ -185,7 +197,7 @@ def _with_noise(
     density = np.empty(0)
     for _ in range(4):
         best = np.concatenate([best, np.hstack([physical, noise])])
-        density = np.concatenate([density, posterior.log_density(best[-len(noise) :])])
+        density = np.concatenate([density, _noise_densities(posterior, best[-len(noise) :])])
         order = np.argsort(-density, kind="stable")[:retained]
         best, density = best[order], density[order]
         if not size:
@@ -195,6 +207,27 @@ def _with_noise(
         noise = chosen + np.std(top, axis=0) * generator.standard_normal(noise.shape)
     winner: FloatArray = best[0]
     return winner
+
+
+def _noise_densities(posterior: Posterior, places: FloatArray) -> FloatArray:
+    """Log density (places,) at places (places, free) that differ in their noise parameters alone.
+
+    Where a record has few readings for its samples, these are simulated once for all.
+    """
+    likelihoods = posterior.likelihoods
+    if any(2 * known.readings.rows.size > known.readings.samples for known in likelihoods):
+        return posterior.log_density(places)
+    free, density = posterior.prior.constrain(places)
+    possible = np.isfinite(density)
+    theta = posterior.prior.theta(free[possible])
+    of_records = zip(posterior.datasets, likelihoods, strict=True)
+    for dataset, likelihood in of_records if possible.any() else ():
+        models, readings = posterior.table.of(theta, dataset.name), likelihood.readings
+        actuator = likelihood.table.actuator(models[:1])
+        moved = likelihood.simulate(actuator, dataset.voltage[: readings.samples])
+        shared = np.broadcast_to(moved[:, readings.where], (len(models), readings.rows.size))
+        density[possible] += likelihood.score(models, shared[:0], shared).log_density
+    return np.where(np.isfinite(density), density, -np.inf)
 
 
 def _valleys(least_squares: LeastSquares, places: FloatArray) -> list[FloatArray]:
