@@ -204,6 +204,31 @@ def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Fit)
             assert told is (expected and record is planned)
 
 
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
+@pytest.mark.parametrize(("held", "said"), [(True, True), (False, False)])
+def test_a_lead_in_that_is_only_a_hold_is_said_to_tell_little(
+    opened: Fit, held: bool, said: bool
+) -> None:
+    """With the length of one that moves; nothing where the state is known."""
+    first = opened.problem.record
+    assert first.displacement is not None
+    hold = round(1.0 / first.interval)
+    voltage, readings = (
+        np.concatenate([np.full(hold, values[40]), values[40:]])
+        for values in (first.path.voltage, first.displacement)
+    )
+    record = bw.Record.from_arrays(voltage, readings, interval=first.interval)
+    lead_in = 0.8 if held else 2.0
+    remarks = opened.predict(record, lead_in=lead_in).remarks
+    told = [remark for remark in remarks if "is only a hold" in remark]
+    assert said == bool(told)
+    if told:
+        longer = float(told[0].partition("take --lead-in ")[2])
+        assert 1.0 < longer < 3.0
+    rested = opened.predict(record, lead_in=lead_in, from_rest=True).remarks
+    assert not [remark for remark in rested if "is only a hold" in remark]
+
+
 def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path) -> None:
     made = stopped(folder)
     line = "not converged: step limit 25 reached; intervals are withheld; resume with"

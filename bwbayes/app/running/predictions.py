@@ -149,9 +149,11 @@ def predict_another(
     rest = _from_rest_remark(problem, subset, other, bands, beyond)
     watch(1.0)
     noise = path.remark or planned_noise(other.record)
+    held = _held_lead_in_remark(problem, other, bands)
     remarks = (
         *[noise] * bool(noise),
         *[rest] * bool(rest),
+        *[held] * bool(held),
         *(finding.note for finding in beyond),
     )
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
@@ -199,6 +201,29 @@ def _from_rest_remark(
     return (
         f"the record starts at 0 V, perhaps from rest: the 95% sensor band is {unknown}; "
         f"{known} if the actuator was demagnetized and nothing moved, which --from-rest declares"
+    )
+
+
+def _held_lead_in_remark(problem: Problem, other: Validation, bands: Bands) -> str:
+    """Say that a lead-in whose voltage stays where it is tells little, where it is to tell a state.
+
+    A twentieth of the range is hardly a motion; one of a quarter shows by how much loops open.
+    """
+    record, lead = other.record, bands.lead_in
+    assert record is not None
+    known = other.start.from_rest or problem.config.model.hysteresis == "linear"
+    if lead is None or known or not other.start.own_offset:
+        return ""
+    voltage, extent = record.path.voltage, float(np.ptp(record.path.voltage))
+    first, last = np.searchsorted(record.time, [lead.start, lead.stop]).tolist()
+    if np.ptp(voltage[first:last]) >= 0.05 * extent:
+        return ""
+    moved = np.abs(voltage[first:] - voltage[first]) > 0.25 * extent
+    length = float(record.time[first + int(np.argmax(moved))]) - lead.start
+    longer = f"; take --lead-in {2 * length:.2g}" if 2 * length < record.duration / 2 else ""
+    return (
+        f"the lead-in of {record.clock(lead.start)} to {record.clock(lead.stop)} s is only a hold, "
+        f"which tells little: what earlier drives have left looks like an offset there{longer}"
     )
 
 
