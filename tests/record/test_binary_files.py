@@ -472,3 +472,22 @@ def test_time_series_of_a_matlab_struct_are_put_together_by_their_times(
     np.testing.assert_array_equal(record.voltage, VOLTAGE[late:n])
     assert record.displacement is not None
     np.testing.assert_allclose(record.displacement, DISPLACEMENT[late:n])
+
+
+@pytest.mark.parametrize("name", ["gain", "Scale", "offset", "calibration"])
+@pytest.mark.parametrize("factor", [0.0, 1.0, 0.01])
+def test_an_attribute_that_may_scale_the_numbers_is_said_not_to(
+    tmp_path: Path, name: str, factor: float
+) -> None:
+    """Unless it changes nothing, whatever is meant by it; the numbers stay as they are."""
+    write_record(Record(VOLTAGE, DISPLACEMENT, 1.0), tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["voltage_V"].attrs[name] = factor
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        record = read_record(tmp_path / "a.h5")
+    remarks = [str(warning.message) for warning in caught]
+    is_neutral = factor == 0 or (factor == 1 and name != "offset")
+    assert len(remarks) == (not is_neutral)
+    assert all(f"voltage_V: attribute {name} = {factor:g} is not applied" in r for r in remarks)
+    np.testing.assert_array_equal(record.voltage, VOLTAGE)

@@ -237,6 +237,33 @@ def test_a_factor_in_a_name_leaves_open_what_its_numbers_stand_for(
     np.testing.assert_allclose(displacement.tolist(), [10 * value for value in DISPLACEMENT])
 
 
+@pytest.mark.parametrize("named", ["um", "nm", "mm"])
+@pytest.mark.parametrize("stated", ["um", "nm", "mm", "\u339b"])
+def test_a_unit_that_a_name_and_a_row_state_differently_is_asked_for(
+    tmp_path: Path, named: str, stated: str
+) -> None:
+    """Also where it is one character, as micrometers are in some alphabets."""
+    rows = [f"{t},{v},{d}" for t, v, d in zip(TIME, VOLTAGE, DISPLACEMENT, strict=True)]
+    head = [f"t (s),U (V),x ({named})", f"s,V,{stated}"]
+    (tmp_path / "a.csv").write_text("\n".join([*head, *rows, ""]), encoding="utf-8")
+    if power_of(named, "displacement") == power_of(stated, "displacement"):
+        assert read_record(tmp_path / "a.csv").samples == len(TIME)
+        return
+    with pytest.raises(ColumnsError, match=f"how many .m is 1 {stated} of 'x \\({named}\\)'"):
+        read_record(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("command", ["command (V)", "Command [mV]"])
+def test_a_command_is_taken_for_the_voltage_unless_an_output_may_be_there(
+    tmp_path: Path, command: str
+) -> None:
+    values = {"time_s": TIME, command: VOLTAGE, "x (um)": DISPLACEMENT}
+    assert read_record(write(tmp_path / "a.csv", values)).samples == len(TIME)
+    values["monitor (V)"] = VOLTAGE
+    with pytest.raises(ColumnsError, match="which column is the voltage"):
+        read_record(write(tmp_path / "a.csv", values))
+
+
 @given(
     st.sampled_from(["unix_time", "Unix Timestamp", "epoch"]),
     st.sampled_from([("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)]),
@@ -404,7 +431,7 @@ def test_a_number_far_from_all_readings_that_is_repeated_is_a_missing_one(
     inside = (VOLTAGE[rows] >= np.delete(VOLTAGE, rows).min()) & (
         VOLTAGE[rows] <= np.delete(VOLTAGE, rows).max()
     )
-    assume(inside.all())
+    assume(np.mean(inside) > 0.5)
     displacement = np.round(DISPLACEMENT, 4)
     displacement[rows] = mark
     arrays: dict[str, Any] = {"voltage": VOLTAGE, "displacement": displacement, "interval": 0.01}

@@ -200,7 +200,14 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         if unit
     }
     names = {q: column.name for q, column in columns.items()}
-    others = [s.name for s in source.series if s.name not in names.values()]
+    has_clocks = "time" not in chosen and naming.fs is None
+    others = [
+        s.name
+        for s in source.series
+        if s.name not in names.values()
+        # Times that became clocks are not ignored.
+        and not (has_clocks and likeness(s.label, s.unit, "time") is not None)
+    ]
     if others and source.lines:
         shown = ", ".join(others[:10]) + ", ..." * (len(others) > 10)
         _warn(f"{path}:{max(source.lines[0] - 1, 1)}: ignored columns: {shown}")
@@ -259,6 +266,9 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
                 and not (rank == 2 and quantity == "displacement" and is_demand(s))
                 and not (quantity == "time" and s.clock and not finite(s).size)
             ]
+            if rank == 1 and quantity == "voltage" and any(map(is_demand, candidates)):
+                # A command, unless an output may be there too.
+                candidates += [s for s in long if likeness(s.label, s.unit, quantity) == 2]
             if quantity in settled or not candidates:
                 continue
             settled.add(quantity)

@@ -24,7 +24,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.record.io.series import (
     NOTES,
     RATES,
@@ -40,6 +40,11 @@ from bwbayes.record.record import Record
 
 # Attributes with the names, or units, of a matrix's columns.
 _NAMES = re.compile("column|channel|field|header|^names?$|^labels?$|^unit")
+# Attributes that may scale or shift raw numbers, nobody knows how, and what changes nothing.
+_FACTORS = {
+    **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
+    **dict.fromkeys(("sensitivity", "offset", "bias"), (0.0,)),
+}
 # What netCDF stores in a dimension that has no numbers, in its attribute NAME.
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
@@ -229,7 +234,16 @@ def _open(path: Path, *, remark: bool = False) -> Any:
 
 def _loaded(path: Path, name: str) -> Any:
     with _open(path) as file:
-        return _unpacked(file[name][()], file[name].attrs)
+        attributes = file[name].attrs
+        for key in attributes:
+            if key.lower() in _FACTORS and attributes.get_id(key).dtype.kind in "iuf":
+                factor = np.ravel(attributes[key])
+                if factor.size == 1 and factor[0] not in _FACTORS[key.lower()]:
+                    fact = f"attribute {key} = {factor[0]:g} is not applied"
+                    advice = f"if 1 stands for that, say so as a unit, '{factor[0]:g} V'"
+                    remark = one_line(f"{path}: {name.strip('/')}: {fact}; {advice}")
+                    warnings.warn(remark, InputWarning, stacklevel=6)
+        return _unpacked(file[name][()], attributes)
 
 
 def _unpacked(values: Any, attributes: Any) -> Any:

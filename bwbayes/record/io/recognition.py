@@ -95,9 +95,11 @@ def beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Serie
 
 def unit_of(label: str, unit: str, quantity: str) -> str | None:
     """Return the unit that a file states for a series, if it is one of the quantity, and sure."""
-    if factor_in(label):
+    named = unit_in(label, quantity)
+    scale = unit_scale(unit, quantity)
+    if factor_in(label) or (named and scale and unit_scale(named, quantity) != scale):
         return None
-    return unit if unit_scale(unit, quantity) else unit_in(label, quantity)
+    return unit if scale else named
 
 
 def finite(series: Series) -> FloatArray:

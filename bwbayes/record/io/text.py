@@ -203,11 +203,11 @@ def _decoded(path: Path) -> str:
             raise InputError(
                 f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV"
             ) from None
-    text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
+    text = text.replace("\ufeff", "").replace("\r\n", "\n").replace("\r", "\n")
     # What C writes where there is no number, and marks of thousands but points and commas.
     text = re.sub(r"-?1\.#(INF|IND|QNAN|SNAN)\d*", "nan", text)
     # The minus of typesetting, and milliseconds behind a colon as data loggers of Keysight's.
-    text = re.sub(r"\u2212(?=[\d.,])", "-", text)
+    text = re.sub(r"(?<![\w.])[\u2010-\u2013\u2212\uff0d](?=[\d.,])", "-", text)
     text = re.sub(r"(?<=\d:\d\d:\d\d):(?=\d{3}(?!\d))", ".", text)
     # A blank is such a mark where semicolons or tabs separate the cells, and one is a number by it.
     if re.search(rf"{_BLANKS}[;\t]|[;\t]{_BLANKS}(?![^\n])", text):

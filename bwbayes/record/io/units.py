@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from unicodedata import normalize
 
 from bwbayes.arrays import FloatArray
 
@@ -67,7 +68,8 @@ def is_time_form(text: str) -> bool:
 
 def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
-    unit = re.sub("(?<=V) ?(?:DC|dc)$", "", unit)  # as voltmeters write
+    # As voltmeters write, and in one character, as some alphabets have units.
+    unit = re.sub("(?<=V) ?(?:DC|dc)$", "", normalize("NFKC", unit))
     base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
     written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
     if written:
