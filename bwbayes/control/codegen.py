@@ -89,6 +89,9 @@ class _Printer(ast.NodeTransformer):
         assert isinstance(tree, ast.FunctionDef)
         body = [f"    {line}" for line in self.block(tree.body)]
         declared = list(self.declarations(tree))
+        used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        unused = {argument.arg for argument in tree.args.args} - used - {*bindings}
+        body = [*(f"    (void){name};" for name in sorted(unused)), *body]
         lines = [self.head(tree), "{", *declared, *[""] * bool(declared), *body, "}", ""]
         comment = (
             to_ascii(inspect.getdoc(function) or "").replace("\n", "\n * ").replace(" * \n", " *\n")

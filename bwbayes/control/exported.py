@@ -24,6 +24,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.codegen import c_functions, to_ascii, to_c_number
 from bwbayes.control.sampled import (
     SampledModel,
+    SampledStage,
     advance,
     require_inverse,
     resolution,
@@ -96,6 +97,7 @@ class Exported:
                 "gain": list(actuator.gain.terms) if actuator.gain else [],
                 "dynamics": actuator.dynamics,
                 "creep_times_s": list(actuator.creep.times) if actuator.creep else [],
+                "stages": [stage.name for stage in actuator.stages],
             },
             "parameters": {
                 declaration.name: {
@@ -156,6 +158,7 @@ class Exported:
         remembered = step.demagnetized()[0].tolist()
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
         parts += ["polynomial gain"] * bool(actuator.gain) + ["creep"] * bool(actuator.creep)
+        parts += [stage.name for stage in actuator.stages]
         tables = {"parameters": step.parameters[0], "curve": model.curve[:, 0]}
         tables["taps"] = model.taps[:, :, 0]
         sections = len(tables["taps"])
@@ -176,7 +179,27 @@ class Exported:
             remembered=remembered,
             functions=c_functions(functions, shapes, "actuator_", {"move": type(step).move}),
             close=resolution(self.limits),
+            inputs=[*map(self._stage_in_c, model.inputs[0])],
+            outputs=[*map(self._stage_in_c, model.outputs[0])],
         )
+
+    def _stage_in_c(self, sampled: SampledStage) -> dict[str, Any]:
+        """Return what the template says of a stage before or behind the model's core."""
+        stage, numbers, at_rest = sampled
+        name = re.sub(r"\W", "_", stage.name)
+        size = max(stage.remembers, 1)  # C has no empty arrays
+        shapes = {"parameters": (len(numbers),), "memory": (size,), "after": (size,)}
+        functions: list[Callable[..., Any]] = [stage.settle, stage.move]
+        functions += [stage.undo] * (self.without_inverse is None)
+        return {
+            "name": name,
+            "what": to_ascii(type(stage).__doc__ or "").split("\n\n")[0],
+            "parameters": [*map(to_c_number, numbers[:, 0])],
+            "size": size,
+            "settles": not stage.rate_independent,
+            "at_rest": float(at_rest[0]),
+            "functions": c_functions(functions, shapes, f"actuator_{name}_"),
+        }
 
     @property
     def _called(self) -> str:

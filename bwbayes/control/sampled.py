@@ -9,11 +9,13 @@ These functions take the model in arrays: ``move`` and ``parameters`` of the hys
 ``curve``, the coefficients of 1, u, u² and u³ that the gain adds, and κ/U, by which the creep's
 drive w (1 + κ |u| / U) grows; and ``taps`` of each section, b₀, b₁, b₂, a₁, a₂ and the gain, then b
 of the sample that a voltage acts on first, and how its two states carry over to that sample. A
-state is ``memory``, the ``initial`` drive of each section, um, and two ``filters`` of each.
+state is ``memory``, the ``initial`` drive of each section, um, and two ``filters`` of each. Stages
+before and behind all that (:mod:`bwbayes.model.stage`) bring functions of the same kind.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -25,9 +27,11 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.declaration import Values
 from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.linear import Taps
 from bwbayes.model.operator import Span
+from bwbayes.model.stage import Clock, Stage
 from bwbayes.model.step import HysteresisStep
 from bwbayes.prediction.loops import steady_loop
 from bwbayes.shown import brief
@@ -115,13 +119,52 @@ class SteppedState(NamedTuple):
 
     ``memory`` (any, models) is that of the hysteresis, ``voltage`` (models,) the last one, V,
     ``rest`` (sections, models) the drives at the start, um, and ``filters`` (sections, 2, models)
-    the states of the recursions.
+    the states of the recursions; ``inputs`` and ``outputs`` (any, models) are the memories of the
+    stages before and behind.
     """
 
     memory: FloatArray
     voltage: FloatArray
     rest: FloatArray
     filters: FloatArray
+    inputs: tuple[FloatArray, ...] = ()
+    outputs: tuple[FloatArray, ...] = ()
+
+
+class SampledStage(NamedTuple):
+    """A stage of the models, what its functions take as ``numbers``, and its value at zero volts.
+
+    ``numbers`` (any, models); ``at_rest`` (models,) is what goes in there, V or um.
+    """
+
+    stage: Stage
+    numbers: FloatArray
+    at_rest: FloatArray
+
+    @classmethod
+    def row(
+        cls, stages: Sequence[Stage], column: Values, clock: Clock, at_rest: FloatArray
+    ) -> tuple[tuple[SampledStage, ...], FloatArray]:
+        """Return stages in a row, and what comes out behind them at rest at zero volts."""
+        row = []
+        for stage in stages:
+            numbers = stage.numbers(column, clock)
+            row.append(cls(stage, numbers.T, at_rest))
+            at_rest, _ = stage.settled(numbers, at_rest)
+        return tuple(row), at_rest
+
+    def settled(self, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what comes out (models,) once they went to a value and settled, and the memory."""
+        memory = np.empty((self.stage.remembers, value.size))
+        if not self.stage.rate_independent:
+            return self.stage.settle(self.numbers, value, memory), memory
+        self.stage.settle(self.numbers, self.at_rest, memory)
+        return self.moved(memory, value)
+
+    def moved(self, memory: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what comes out (models,) at a sample with a value, and the memory after it."""
+        after = np.empty_like(memory)
+        return self.stage.move(self.numbers, memory, value, after), after
 
 
 @dataclass(frozen=True)
@@ -196,33 +239,65 @@ class SampledModel:
         """What all functions of a sample begin with: ``move``, ``parameters`` and ``curve``."""
         return type(self.step).move, self.step.parameters.T, self.curve
 
-    def begin(self, voltage: FloatArray) -> SteppedState:
-        """Return the state of actuators that have settled at a voltage (models,), V."""
+    @cached_property
+    def inputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
+        """The stages before the hysteresis, and the voltage behind them at rest, (models,), V."""
+        actuator, zero = self.actuator, np.zeros(self.models)
+        return SampledStage.row(actuator.inputs, self.column, actuator.clock, zero)
+
+    @cached_property
+    def outputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
+        """The stages behind the dynamics, and what comes out of them at rest, (models,), um."""
+        actuator, level = self.actuator, self._settle(self.inputs[1])[2]
+        return SampledStage.row(actuator.outputs, self.column, actuator.clock, level)
+
+    def _settle(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Let hysteresis, dynamics and creep come to rest at a voltage (models,), V.
+
+        Returns the memory, the drives there, and the displacement (models,), um.
+        """
         memory, initial = self.step.demagnetized().T, np.empty(self.taps[:, 0].shape)
         after = np.empty_like(memory)
         settle(*self.hysteresis, memory, voltage, after, initial)
-        return SteppedState(after, voltage, initial, np.zeros((len(initial), 2, self.models)))
+        return after, initial, np.asarray(np.sum(self.taps[:, 5] * initial, axis=0))
 
-    @cached_property
+    def begin(self, voltage: FloatArray) -> SteppedState:
+        """Return the state of actuators that have settled at a voltage (models,), V."""
+        driven, inputs = voltage, []
+        for stage in self.inputs[0]:
+            driven, memory = stage.settled(driven)
+            inputs.append(memory)
+        after, initial, moved = self._settle(driven)
+        outputs = []
+        for stage in self.outputs[0]:
+            moved, memory = stage.settled(moved)
+            outputs.append(memory)
+        filters = np.zeros((len(initial), 2, self.models))
+        return SteppedState(after, voltage, initial, filters, tuple(inputs), tuple(outputs))
+
+    @property
     def zero(self) -> FloatArray:
-        """What dynamics and creep make of the drive at zero volts, where 0 um is, (models,), um."""
-        return np.asarray(np.sum(self.taps[:, 5] * self.begin(np.zeros(self.models)).rest, axis=0))
+        """The displacement of demagnetized models at rest at zero volts, where 0 um is, (models,)."""
+        return self.outputs[1]
 
     def displacement(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,), um, that a held voltage has led to."""
-        return np.sum(self.taps[:, 5] * (state.rest + state.filters[:, 0]), axis=0) - self.zero
+        moved = np.sum(self.taps[:, 5] * (state.rest + state.filters[:, 0]), axis=0)
+        return _passed(self.outputs[0], state.outputs, moved)[0] - self.zero
 
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:
         """Return the displacement (models,), um, at a sample with this voltage, and the state.
 
         If the voltage is held, the displacement is that just before it changes.
         """
-        memory, _, initial, filters = state
+        memory, _, initial, filters, *_ = state
         after, filtered = np.empty_like(memory), np.empty_like(filters)
-        displacement = advance(
-            *self.hysteresis, self.taps, memory, initial, filters, voltage, after, filtered
+        driven, inputs = _passed(self.inputs[0], state.inputs, voltage)
+        moved = advance(
+            *self.hysteresis, self.taps, memory, initial, filters, driven, after, filtered
         )
-        return displacement - self.zero, SteppedState(after, voltage, initial, filtered)
+        moved, outputs = _passed(self.outputs[0], state.outputs, moved)
+        return moved - self.zero, SteppedState(after, voltage, initial, filtered, inputs, outputs)
 
     def inverse(
         self,
@@ -238,12 +313,15 @@ class SampledModel:
         outside of the limits gets the limit. The search starts at a ``guess``, by default the last
         voltage, and ends at a ``tolerance``, V, by default the last bits.
         """
-        memory, last, initial, filters = state
-        begin, aim = last if guess is None else guess, displacement + self.zero
+        memory, last, initial, filters, *_ = state
+        begin = last if guess is None else guess
+        aim = _undone(self.outputs[0], state.outputs, displacement + self.zero)
         close, after = tolerance or resolution(limits), np.empty_like(memory)
         model = *self.hysteresis, self.taps
         with np.errstate(divide="ignore", invalid="ignore"):
             voltage = search(*model, memory, initial, filters, begin, aim, *limits, close, after)
+        if self.inputs[0]:
+            voltage = within(_undone(self.inputs[0], state.inputs, voltage), *limits)
         return voltage, self.forward(state, voltage)[1]
 
     def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
@@ -263,7 +341,8 @@ class SampledModel:
         Without dynamics and creep, between limits, V.
         """
         loop = steady_loop(self.actuator, self.column, *limits, points=3)
-        at_zero = self.begin(np.zeros(self.models)).rest[0, 0]
+        # At rest nothing of the sections but the drive counts, and without creep.
+        at_zero = self._settle(self.inputs[1])[1][0, 0]
         return Span(float(loop.falling[0, 0] - at_zero), float(loop.rising[0, -1] - at_zero))
 
     def frequency_response(self, angles: FloatArray) -> FloatArray:
@@ -275,6 +354,8 @@ class SampledModel:
         top, bottom = (np.polynomial.polynomial.polyval(np.exp(-1j * angles), row) for row in taps)
         responses = top / bottom
         total: Any = np.einsum("ms,msf->mf", self.sections.gains, responses)
+        for stage, numbers, _ in (*self.inputs[0], *self.outputs[0]):
+            total = total * stage.response(numbers.T, angles)
         return np.asarray(total)
 
     @property
@@ -304,6 +385,26 @@ class SampledModel:
         return reduce(add, systems)  # side by side
 
 
+def _passed(
+    row: Sequence[SampledStage], memories: Sequence[FloatArray], value: FloatArray
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Let a value (models,) pass stages in a row; return what comes out, and their memories."""
+    after = []
+    for stage, memory in zip(row, memories, strict=True):
+        value, reached = stage.moved(memory, value)
+        after.append(reached)
+    return value, tuple(after)
+
+
+def _undone(
+    row: Sequence[SampledStage], memories: Sequence[FloatArray], value: FloatArray
+) -> FloatArray:
+    """Return the value (models,) that has to go into stages in a row for one to come out."""
+    for (stage, numbers, _), memory in zip(reversed(row), reversed(memories), strict=True):
+        value = stage.undo(numbers, memory, value)
+    return value
+
+
 def require_inverse(model: SampledModel, limits: Span) -> None:
     """Refuse models that have no inverse a sample at a time.
 
@@ -313,6 +414,8 @@ def require_inverse(model: SampledModel, limits: Span) -> None:
         The displacement may turn back while the voltage goes on, or the dynamics between samples
         are such that the voltage would swing ever wider from sample to sample.
     """
+    for stage in model.actuator.stages:
+        stage.require_inverse()
     lowest = float(model.slopes(limits)[0].min())
     if not lowest > 0:
         raise InputError(

@@ -309,7 +309,7 @@ class Scene:
         shift = 0.0
         if fit.posterior is self.posterior:
             # The largest shift of the actuator's parameters, in sds of both fits together.
-            of_record = self.posterior.only.table.of_scope("record")
+            of_record = self.posterior.only.table.of_scope("record", "event")
             rows = [
                 row
                 for row, name in enumerate(self.posterior.names)

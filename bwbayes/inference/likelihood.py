@@ -271,8 +271,7 @@ class Likelihood:
             offsets = np.ones((len(model), int(self.offset_sd > 0), readings.rows.size))
             parts = [residual, offsets]
             if not self.from_rest:
-                sections = self.actuator.sections(self.actuator.columns(model))
-                parts.append(sections.free_responses(readings.samples)[..., readings.where])
+                parts.append(self.free_responses(model)[..., readings.where])
             parts.append(every[batch])
             series = np.concatenate(parts, axis=1)
             white, log_determinant = self.whiten(noise, series)
@@ -280,6 +279,25 @@ class Likelihood:
             results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
         products, determinants = zip(*results, strict=True)
         return np.concatenate(products), np.concatenate(determinants)
+
+    def free_responses(self, model: FloatArray) -> FloatArray:
+        """Displacement (models, unknowns, samples) for a um of each unknown of the dynamics.
+
+        Of models (models, parameters of the actuator), up to the last reading. Stages behind the
+        dynamics need not be linear: then it is the slope where nothing is off rest.
+        """
+        samples = self.readings.samples
+        if not self.actuator.outputs:
+            return self.actuator.sections(self.actuator.columns(model)).free_responses(samples)
+        voltage, unknowns = self.voltage[:samples], self.actuator.unknowns
+        at_rest = self.simulate(model, voltage)
+        size = 1e-6 * float(np.ptp(at_rest))  # small beside any stage, large beside rounding
+        responses = np.empty((len(model), unknowns, samples))
+        for unknown in range(unknowns):
+            unrest = np.zeros((len(model), unknowns))
+            unrest[:, unknown] = size
+            responses[:, unknown] = (self.simulate(model, voltage, unrest) - at_rest) / size
+        return responses
 
     def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.

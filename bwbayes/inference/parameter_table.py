@@ -97,7 +97,7 @@ class ParameterTable:
         """The columns of θ, in their order."""
         columns = []
         for declared in self.declarations:
-            by_record = declared.scope == "record" and declared.name not in self.shared
+            by_record = declared.scope != "actuator" and declared.name not in self.shared
             if len(self.records) > 1 and (by_record or declared.name in self.per_record):
                 for record in self.records:
                     columns.append(Column(f"{declared.name}[{record}]", declared, record))
@@ -121,9 +121,9 @@ class ParameterTable:
         names = self.actuator_part.parameters
         return tuple(column.name for column in self.layout if column.declaration.name in names)
 
-    def of_scope(self, scope: Scope) -> tuple[str, ...]:
-        """Return the names of parameters of the actuator, or of one record."""
-        return tuple(c.name for c in self.layout if c.declaration.scope == scope)
+    def of_scope(self, *scopes: Scope) -> tuple[str, ...]:
+        """Return the names of parameters of the actuator, of one record, or of its events."""
+        return tuple(c.name for c in self.layout if c.declaration.scope in scopes)
 
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
         """Return the columns (models,) of θ (models, parameters) by name."""

@@ -31,7 +31,7 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.record import Record
 from bwbayes.shown import brief
@@ -219,14 +219,15 @@ class Study:
         said = self.stated.get(column.name, self.stated.get(name))
         if said is not None:
             return said
-        if name == "initial":
+        at_rest = 0.0 if name == "initial" else column.declaration.at_rest
+        if column.declaration.scope == "record" and at_rest is not None:
             names = [column.record] if column.record else [*self.records]
             rested = [self.records[record].from_rest for record in names]
             if all(rested):
-                return Stated(fixed=0.0)
+                return Stated(fixed=at_rest)
             if any(rested):
                 raise InputError(
-                    "model.shared: initial cannot be shared by records of which some start from "
+                    f"model.shared: {name} cannot be shared by records of which some start from "
                     "rest and some do not; remove it"
                 )
         return Stated()
@@ -269,6 +270,8 @@ def every_declaration() -> Iterator[Declaration]:
         yield from dynamics().parameters
     for noise in NOISES.values():
         yield from noise(interval=1.0).declarations
+    for stage in STAGES.values():
+        yield from stage().parameters
     creep = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
     yield from (*PolynomialGain().parameters, *creep.parameters, OFFSET)
 

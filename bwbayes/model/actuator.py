@@ -2,7 +2,8 @@
 
 It is put together from parts. A hysteresis operator makes the drive w of the voltage's path, to
 which a polynomial gain may add; linear dynamics follow the drive (equations (6) to (8) of the
-paper), creep may add to what they do, and the sensor adds its offset. An
+paper), creep may add to what they do, and the sensor adds its offset. Further stages may stand
+before all that and behind it (:mod:`bwbayes.model.stage`). An
 :class:`Actuator` says which parts there are, what the voltage does between samples, and how long
 those are apart; the parameters come as the columns of a matrix θ, in the order in which the parts
 declare them. A long record can be walked through in pieces: the :class:`State` at the end of one
@@ -12,7 +13,7 @@ piece starts the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, get_args
@@ -29,6 +30,7 @@ from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
+from bwbayes.model.stage import Advance, Clock, Side, Stage, begin_stages, pass_stages
 from bwbayes.shown import brief
 
 OFFSET = Declaration(
@@ -48,7 +50,8 @@ class State:
 
     ``hysteresis`` is the operator's memory; ``rest`` are the drives at the record's first sample,
     at which dynamics and creep were at rest, (models,) each, um; ``filter`` are the states of their
-    recursions, (models, taps - 1) each.
+    recursions, (models, taps - 1) each; ``inputs`` and ``outputs`` are the memories of the stages
+    before and behind.
     """
 
     __repr__ = brief
@@ -56,6 +59,8 @@ class State:
     hysteresis: Any
     rest: tuple[FloatArray, ...]
     filter: tuple[FloatArray, ...]
+    inputs: tuple[FloatArray, ...] = ()
+    outputs: tuple[FloatArray, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,8 @@ class Actuator:
     span
         The voltages that drives before a record may have had, V; by default those of the voltage
         that is simulated.
+    stages
+        What else is on the way from the command to the reading, in the order of the way.
 
     Raises
     ------
@@ -97,6 +104,7 @@ class Actuator:
     gain: PolynomialGain | None = None
     creep: Creep | None = None
     span: Span | None = None
+    stages: tuple[Stage, ...] = ()
 
     def __post_init__(self) -> None:
         made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
@@ -114,7 +122,7 @@ class Actuator:
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
-        parts = (self.hysteresis, self.gain, self.filter, self.creep)
+        parts = (self.hysteresis, self.gain, self.filter, self.creep, *self.stages)
         return (*(d for part in parts if part is not None for d in part.parameters), OFFSET)
 
     @cached_property
@@ -184,10 +192,15 @@ class Actuator:
         self.check(column)
         sections = self.sections(column)
         if state is None:
-            memory = self.begin(column, path, from_rest=from_rest)
+            inputs = self.begin_inputs(column, path, from_rest=from_rest)
+        else:
+            inputs = state.inputs
+        driven, inputs = self.pass_inputs(column, path, inputs)
+        if state is None:
+            memory = self.begin(column, driven, from_rest=from_rest, span=self.range_of(path))
         else:
             memory = state.hysteresis
-        drive, hysteresis = self.drive(column, path, memory)
+        drive, hysteresis = self.drive(column, driven, memory)
         drives = [drive]
         if self.creep is not None:
             crept = self.creep.drive(column, drive, path)
@@ -200,15 +213,104 @@ class Actuator:
         for drive, before in zip(drives, equilibrium, strict=True):
             np.subtract(drive, before[:, np.newaxis], out=drive)
         result = sections.run(drives, filtered)
-        level = sum(gain * before for gain, before in zip(sections.gains, equilibrium, strict=True))
-        result += (level + column["offset"])[:, np.newaxis]
-        return result, State(hysteresis, equilibrium, filtered)
+        levels = zip(sections.gains, equilibrium, strict=True)
+        level: FloatArray = sum((gain * w for gain, w in levels), start=np.zeros(len(models)))
+        if not self.outputs:
+            result += (level + column["offset"])[:, np.newaxis]
+            return result, State(hysteresis, equilibrium, filtered, inputs)
+        result += level[:, np.newaxis]
+        if state is None:
+            behind = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
+        else:
+            behind = state.outputs
+        result, outputs = pass_stages(self.outputs, column, result, behind, self.clock)
+        result += column["offset"][:, np.newaxis]
+        return result, State(hysteresis, equilibrium, filtered, inputs, outputs)
+
+    @property
+    def static(self) -> Actuator:
+        """The same, as far as only the path of the voltage counts, not its pace."""
+        stages = tuple(stage for stage in self.stages if stage.rate_independent)
+        return replace(self, dynamics="none", hold="first", creep=None, stages=stages)
+
+    @property
+    def clock(self) -> Clock:
+        """How its samples follow each other."""
+        return Clock(self.interval, self.hold)
+
+    @cached_property
+    def inputs(self) -> tuple[Stage, ...]:
+        """The stages before the hysteresis."""
+        return self._on("input")
+
+    @cached_property
+    def outputs(self) -> tuple[Stage, ...]:
+        """The stages behind dynamics and creep."""
+        return self._on("output")
+
+    def _on(self, side: Side) -> tuple[Stage, ...]:
+        return tuple(stage for stage in self.stages if stage.side == side)
+
+    def begin_inputs(
+        self, column: Values, path: FloatArray, *, from_rest: bool
+    ) -> tuple[FloatArray, ...]:
+        """Return the memories of the stages before the hysteresis at a record's first voltage."""
+        models = column["offset"].size
+        rest = np.zeros(models) if from_rest else None
+        return begin_stages(self.inputs, column, np.full(models, path[0]), self.clock, rest)
+
+    def begin_outputs(
+        self, column: Values, first: FloatArray, *, from_rest: bool
+    ) -> tuple[FloatArray, ...]:
+        """Return the memories of the stages behind the dynamics at a first displacement (models,).
+
+        Displacements are in um, without the offset.
+        """
+        rest = self.level_at_rest(column) if from_rest else None
+        return begin_stages(self.outputs, column, first, self.clock, rest)
+
+    def level_at_rest(self, column: Values) -> FloatArray:
+        """Return the displacement (models,), um, of demagnetized models at rest at zero volts.
+
+        Before the stages behind the dynamics, and without the offset.
+        """
+        zero = np.zeros(1)
+        drive = self.drive(column, zero, self.begin(column, zero, from_rest=True))[0]
+        level: FloatArray = drive[:, 0].copy()
+        if self.creep is not None:
+            crept = self.creep.drive(column, drive, zero)[:, 0]
+            level += crept * sum(column[name] for name in self.creep.names)
+        return level
+
+    def pass_inputs(
+        self,
+        column: Values,
+        path: FloatArray,
+        memories: tuple[FloatArray, ...],
+        advance: Advance = Stage.advance,
+    ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+        """Return what the stages before the hysteresis make of a path (samples,), V.
+
+        The path itself without any, else (models, samples); and their memories after it.
+        """
+        if not self.inputs:
+            return path, ()
+        every = np.broadcast_to(path, (column["offset"].size, path.size))
+        return pass_stages(self.inputs, column, every, memories, self.clock, advance)
 
     def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
-        """Return what hysteresis and gain make of a path (samples,), V, (models, samples), um.
+        """Return what hysteresis and gain make of a path, V, (models, samples), um.
 
-        And the operator's memory after it.
+        The path is (samples,), or (models, samples) if each model has its own; beside the drive
+        comes the operator's memory after it, in the second case one for each model.
         """
+        if path.ndim == 2:
+            parts = [
+                self.drive(values, own, before)
+                for values, own, before in zip(each_model(column), path, memory, strict=True)
+            ]
+            drives, memories = zip(*parts, strict=True)
+            return np.concatenate(drives), memories
         drive, after = self.hysteresis.advance(column, path, memory)
         if self.gain is not None:
             drive += self.gain.displacement(column, path)
@@ -218,9 +320,24 @@ class Actuator:
         """Return the columns (models,) of θ (models, parameters) by name."""
         return dict(zip(self.parameters, theta.T, strict=True))
 
-    def begin(self, column: Mapping[str, FloatArray], path: FloatArray, *, from_rest: bool) -> Any:
-        """Return the operator's memory at the first sample of a record."""
-        span = self.range_of(path)
+    def begin(
+        self,
+        column: Mapping[str, FloatArray],
+        path: FloatArray,
+        *,
+        from_rest: bool,
+        span: Span | None = None,
+    ) -> Any:
+        """Return the operator's memory at the first sample of a record; paths as in :meth:`drive`.
+
+        ``span`` of earlier drives; by default that of :meth:`range_of` the path.
+        """
+        span = span or self.range_of(path)
+        if path.ndim == 2:
+            return tuple(
+                self.begin(values, own, from_rest=from_rest, span=span)
+                for values, own in zip(each_model(column), path, strict=True)
+            )
         return self.hysteresis.begin(column, float(path[0]), span, from_rest=from_rest)
 
     def within(self, voltage: FloatArray) -> Actuator:
@@ -237,6 +354,8 @@ class Actuator:
         self.filter.check(column)
         for part in (self.gain, self.creep):
             check(part.parameters if part else (), column, ("creep_growth",))
+        for stage in self.stages:
+            stage.check(column)
         check((OFFSET,), column)
 
     def sections(self, column: Values) -> Sections:
@@ -248,3 +367,9 @@ class Actuator:
         lags = self.creep.recursions(models, self.interval, self.hold)
         strengths = (column[name] for name in self.creep.names)
         return Sections((dynamics, *lags), (np.ones(models), *strengths))
+
+
+def each_model(column: Values) -> Iterator[dict[str, FloatArray]]:
+    """Yield the columns of one model after the other, (1,) each."""
+    for row in range(next(iter(column.values())).size):
+        yield {name: values[row : row + 1] for name, values in column.items()}

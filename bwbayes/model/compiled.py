@@ -31,6 +31,7 @@ from numba.extending import (
 from bwbayes.model import elementwise
 from bwbayes.model.elementwise import anywhere, gone, look_up, select
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
+from bwbayes.model.stage import Stage
 from bwbayes.model.step import HysteresisStep
 
 # What is called at each sample allocates nothing: to count who holds an array would take longer
@@ -54,7 +55,7 @@ WHOLE = 1.5 * 2.0**52
 class FormulaType(types.Type):
     """The type of what brings a formula, by its class and a digest of the formula's sources.
 
-    A step brings its ``move``, an operator that remembers extrema its ``everett``. What is kept on
+    A step and a stage bring their ``move``, an operator that remembers extrema its ``everett``. What is kept on
     disk knows the ``kind``, the class, by its name alone: one of a module of the user's own need
     not be there when others are looked up beside it.
     """
@@ -71,8 +72,9 @@ class FormulaType(types.Type):
 
 
 @typeof_impl.register(HysteresisStep)
+@typeof_impl.register(Stage)
 @typeof_impl.register(RemembersExtrema)
-def _type_of(formula: HysteresisStep | RemembersExtrema, _: Any) -> FormulaType:
+def _type_of(formula: HysteresisStep | RemembersExtrema | Stage, _: Any) -> FormulaType:
     kind: Any = type(formula)
     # To read the sources takes longer than a short record: a class does so once.
     if "_numba_type_" not in vars(kind):

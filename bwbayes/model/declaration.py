@@ -25,7 +25,7 @@ from bwbayes.shown import brief
 Values = Mapping[str, FloatArray]
 """Columns (models,) of parameters by name."""
 
-Scope = Literal["actuator", "record"]
+Scope = Literal["actuator", "record", "event"]
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,15 @@ class Declaration:
         What to say where the posterior presses against the lower or upper of these bounds, or of
         the default prior's where there are none.
     scope
-        Whether it belongs to the actuator, or to one record alone (its start, its offset).
+        Whether it belongs to the actuator, to one record alone (its start, its offset), or to an
+        event in one record, which no other has.
     loop
         Whether it shapes the loop.
     aliases
         Other names that people give it.
+    at_rest
+        What a parameter of one record is where that starts from rest, and one of an event where
+        that has not happened; None if this says nothing.
     unit_given
         The unit, where it depends on what is stated of other parameters.
     without_default
@@ -126,6 +130,7 @@ class Declaration:
     scope: Scope = "actuator"
     loop: bool = False
     aliases: tuple[str, ...] = ()
+    at_rest: float | None = None
     unit_given: Callable[[Mapping[str, float | Distribution]], str] | None = None
     without_default: str = ""
 

@@ -81,19 +81,19 @@ class PolynomialGain:
         )
 
     def scaled(self, voltage: FloatArray) -> FloatArray:
-        """Return x (samples,) of voltages (samples,), V."""
+        """Return x of voltages of any shape, V."""
         half = self.reference.half
         return (voltage - self.reference.middle) / half if half > 0 else np.zeros_like(voltage)
 
     def displacement(self, column: Values, voltage: FloatArray) -> FloatArray:
-        """Return q₂ x² + q₃ x³ (models, samples), um, along voltages (samples,), V.
+        """Return q₂ x² + q₃ x³ (models, samples), um, along voltages, V.
 
-        A reference without any width has none.
+        These are (samples,), or (models, samples). A reference without any width has none.
         """
         x = self.scaled(voltage)
         columns = [(column[name], TERMS[name].power) for name in TERMS if name in self.terms]
         return sum(
-            (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.size))
+            (q[:, np.newaxis] * x**power for q, power in columns), start=np.zeros((1, x.shape[-1]))
         )
 
     def powers(self, column: Values) -> FloatArray:

@@ -1,7 +1,8 @@
 """The actuator read backwards: for a displacement over time, the voltage that gives it.
 
-The offset is taken off, creep and dynamics are undone, and what is left, the drive, is what
-hysteresis and nonlinearity must make. The drive turns where the voltage does, and along a branch
+The offset is taken off, what stands behind the dynamics is undone, then creep and dynamics, and
+what is left, the drive, is what hysteresis and nonlinearity must make; what stands before them is
+undone last. The drive turns where the voltage does, and along a branch
 between two turns both go one way: each sample asks for one root of one rising curve, and one walk
 along the curve serves all samples. It asks of an operator only to simulate, one model at a time.
 
@@ -36,6 +37,7 @@ from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Recursion
 from bwbayes.model.operator import UNIT
 from bwbayes.model.reversals import monotone_stretches
+from bwbayes.model.stage import undo_stages
 
 Curve = Callable[[FloatArray], FloatArray]
 
@@ -123,15 +125,19 @@ class _Single:
 
     def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
         """Return the voltage (samples,) for a displacement."""
-        drive, interval = displacement - self.column["offset"][0], self.actuator.interval
+        actuator, interval = self.actuator, self.actuator.interval
+        rest = actuator.level_at_rest(self.column) if self.from_rest else None
+        drive = (displacement - self.column["offset"][0])[np.newaxis]
+        drive = undo_stages(actuator.outputs, self.column, drive, actuator.clock, rest)[0]
         span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
         size = peak / self.slope if self.slope > 0 else 1.0
         # Beyond so many times what a straight line would need no voltage is looked for.
         extent = 30.0 * max(size, abs(span.low), abs(span.high))
         if nearest:
             low, high = max(limits.low, -extent), min(limits.high, extent)
-            return self._undo(drive, Limits(low, high, limits.rate))
-        voltage = self._undo(drive, Limits(-extent, extent))
+            voltage = self._undo(drive, Limits(low, high, limits.rate))
+            return np.clip(self._command(voltage), low, high)
+        voltage = self._command(self._undo(drive, Limits(-extent, extent)))
         edges = np.abs(voltage) >= extent
         if edges.any():
             sample = int(np.argmax(edges))
@@ -145,6 +151,13 @@ class _Single:
                 "limits, or say `nearest=True` for the nearest command"
             )
         return voltage
+
+    def _command(self, voltage: FloatArray) -> FloatArray:
+        """Return the command (samples,), V, that makes a voltage at the hysteresis."""
+        rest = np.zeros(1) if self.from_rest else None
+        actuator, path = self.actuator, voltage[np.newaxis]
+        command = undo_stages(actuator.inputs, self.column, path, actuator.clock, rest)
+        return np.asarray(command[0])
 
     def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:
         """Undo dynamics and creep, then hysteresis and nonlinearity.

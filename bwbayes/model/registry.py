@@ -24,6 +24,9 @@ from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
+from bwbayes.model.stage import Stage
+from bwbayes.model.stages.backlash import Backlash
+from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
@@ -51,6 +54,11 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
     "none": NoDynamics,
     "lag": Lag,
     "second-order": SecondOrder,
+}
+
+# Stages before and behind the hysteresis, in the order of the signal's way.
+STAGES: Mapping[str, Callable[..., Stage]] = {
+    stage.name: stage for stage in (AmplifierLag, Backlash, SensorLag)
 }
 
 

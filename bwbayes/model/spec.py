@@ -19,7 +19,8 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import HYSTERESIS, OPTIONS, made
+from bwbayes.model.registry import HYSTERESIS, OPTIONS, STAGES, made
+from bwbayes.model.stage import Stage
 
 
 class Extent(NamedTuple):
@@ -56,6 +57,8 @@ class ModelSpec:
         The model of the residual.
     options
         Of the operator, by name.
+    stages
+        Further stages; those of the package stand in the order of :data:`STAGES`, others come last.
     """
 
     hysteresis: str = "bouc-wen"
@@ -66,6 +69,7 @@ class ModelSpec:
     hold: Hold | str = "auto"
     noise: str = "discrepancy"
     options: Mapping[str, Any] = field(default_factory=dict)
+    stages: tuple[str, ...] = ()
 
     def with_parts(self, **changes: Any) -> Self:
         """Return the spec with other parts; another operator has options of its own."""
@@ -97,7 +101,21 @@ class ModelSpec:
             PolynomialGain(self.gain, extent.span) if self.gain else None,
             creep,
             extent.span,
+            tuple(made("model.stages", name, STAGES, {}, Stage) for name in self._in_order),
         )
+
+    def with_stage(self, name: str) -> Self:
+        """Return the spec with a further stage."""
+        return replace(self, stages=(*self.stages, name))
+
+    @property
+    def _in_order(self) -> list[str]:
+        """The further stages in the order of the signal's way."""
+        order = [*STAGES]
+        repeated = [name for name in self.stages if self.stages.count(name) > 1]
+        if repeated:
+            raise InputError(f"model.stages: {repeated[0]!r} is there twice; leave one out")
+        return sorted(self.stages, key=lambda name: order.index(name) if name in order else len(order))
 
     def explicit(self, actuator: Actuator) -> Self:
         """Return the spec with all that it left open as an actuator of it has it, but the hold.
@@ -135,4 +153,5 @@ class ModelSpec:
             parts.append(f"{' and '.join(self.gain)} gain")
         if self.creep:
             parts.append("creep that grows with the voltage" if self.creep_growth else "creep")
+        parts += self.stages
         return f"{', '.join(parts)}, dynamics {self.dynamics}, {self.hold} hold"

@@ -191,6 +191,7 @@ def estimate_initial_states(
         # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
         training.extent if own_offset else 0.0,
     )
+    theta, redrawn = _of_new_record(posterior, theta, start, generator)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
     if window is None:
@@ -205,10 +206,60 @@ def estimate_initial_states(
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator, part(watch, 0.0, 0.5))
+    start_theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
     informed = _informed(histories, start_theta, record, window, generator)
     if not start.after:
         return informed
     return continue_discrepancy(informed, whole, theta, generator, part(watch, 0.5, 1.0))
+
+
+def _of_new_record(
+    posterior: Posterior, theta: FloatArray, start: Start, generator: np.random.Generator
+) -> tuple[FloatArray, list[str]]:
+    """Give draws θ what stages do not know of a record that was not fitted, from its prior.
+
+    What happened once does not happen again. Beside θ come the names of what was drawn.
+    """
+    table, redrawn = posterior.only.table, list[str]()
+    for parameter in posterior.prior.parameters:
+        declared, name = parameter.declared, parameter.name
+        stands = declared.at_rest if declared.scope == "event" or start.from_rest else None
+        if name in ("initial", "offset") or declared.scope == "actuator":
+            continue
+        if stands is not None:
+            theta = table.replaced(theta, name, np.full(len(theta), stands))
+        elif parameter.fixed is None:
+            theta = table.replaced(theta, name, parameter.draw(generator, len(theta)))
+            redrawn.append(name)
+    return theta, redrawn
+
+
+def _choose_by_lead_in(
+    posterior: Posterior,
+    histories: Histories,
+    theta: FloatArray,
+    names: list[str],
+    generator: np.random.Generator,
+    tries: int = 16,
+) -> FloatArray:
+    """Let the lead-in choose every draw's unknowns of stages, of so many from their prior."""
+    if not names:
+        return theta
+    table, parameters = posterior.only.table, posterior.prior.parameters
+    candidates = [theta]
+    for _ in range(tries - 1):
+        other = theta
+        for parameter in (p for p in parameters if p.name in names):
+            other = table.replaced(other, parameter.name, parameter.draw(generator, len(theta)))
+        candidates.append(other)
+    densities = [
+        histories.each(other, lambda likelihood, rows: (likelihood.log_density(rows),))[0]
+        for other in candidates
+    ]
+    density = np.nan_to_num(np.stack(densities), nan=-np.inf, posinf=-np.inf)
+    weight = np.cumsum(np.exp(density - np.maximum(density.max(axis=0), -1e300)), axis=0)
+    chosen = np.sum(weight < uniform(generator, len(theta)) * weight[-1], axis=0)
+    return np.stack(candidates)[chosen, np.arange(len(theta))]
 
 
 def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:

@@ -186,7 +186,7 @@ def steady_loop(
 ) -> Traced:
     """Drive models from the demagnetized state up and down until the loop closes.
 
-    Of the ``actuator`` operator and gain count alone; ``column`` has columns (models,) of its
+    Of the ``actuator`` counts what has no pace, and no offset; ``column`` has columns (models,) of its
     parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points`` is the odd number
     of voltages along a branch.
 
@@ -195,18 +195,19 @@ def steady_loop(
     InputError
         ``low`` is not below ``high``, or an even number of points.
     """
-    voltage, column = _voltages(low, high, points), _demagnetized(column)
-    memory = actuator.begin(column, np.zeros(1), from_rest=True)
+    voltage = _voltages(low, high, points)
+    actuator, theta = _still(actuator, column)
+    _, state = actuator.advance(theta, np.zeros(1), from_rest=True)
     # After two cycles, then after twice as many each time, a thousand at most.
     cycles, closed = 2, False
     while not closed and cycles <= 1024:
         # Between two turns nothing needs to be sampled: what is exact is so for any step.
-        moved, memory = actuator.hysteresis.advance(column, np.tile([high, low], cycles), memory)
+        moved, state = actuator.advance(theta, np.tile([high, low], cycles), state)
         changed = np.abs(moved[:, -2:] - moved[:, -4:-2])
         closed = bool(np.all(changed <= 1e-9 * np.abs(moved[:, -2:-1] - moved[:, -1:])))
         cycles *= 2
-    rising, memory = actuator.drive(column, voltage, memory)
-    falling, _ = actuator.drive(column, voltage[::-1], memory)
+    rising, state = actuator.advance(theta, voltage, state)
+    falling, _ = actuator.advance(theta, voltage[::-1], state)
     return Traced(voltage, rising, falling[:, ::-1], closed)
 
 
@@ -220,12 +221,11 @@ def initial_curve(
     :func:`steady_loop`.
     """
     voltage = _voltages(min(low, 0.0), max(high, 0.0), points)
-    column = _demagnetized(column)
-    curves = [np.empty((column["offset"].size, 0))] * 2
+    actuator, theta = _still(actuator, column)
+    curves = [np.empty((len(theta), 0))] * 2
     for number, side in enumerate((voltage[voltage < 0][::-1], voltage[voltage >= 0])):
         if side.size:
-            virgin = actuator.begin(column, np.zeros(1), from_rest=True)
-            curves[number], _ = actuator.drive(column, side, virgin)
+            curves[number] = actuator.displacement(theta, side, from_rest=True)
     return voltage, np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
 
 
@@ -286,8 +286,11 @@ def _voltages(low: float, high: float, points: int) -> FloatArray:
     return np.linspace(low, high, points)
 
 
-def _demagnetized(column: Values) -> dict[str, FloatArray]:
-    return {**column, "initial": np.zeros_like(column["initial"])}
+def _still(actuator: Actuator, column: Values) -> tuple[Actuator, FloatArray]:
+    """Return the actuator without pace, and θ (models, parameters) demagnetized and unmoved."""
+    still, zeros = actuator.static, np.zeros_like(column["initial"])
+    values = {**column, "initial": zeros, "offset": zeros}
+    return still, np.stack([values[name] for name in still.parameters], axis=1)
 
 
 def _at_zero(voltage: FloatArray, branch: FloatArray) -> FloatArray:

@@ -144,7 +144,7 @@ def _responses(
     without creep, and what creep adds to it.
     """
     voltage = np.array([0.0, height])
-    still = replace(actuator, dynamics="none", hold="first", creep=None)
+    still = actuator.static
     theta = np.stack([column[name] for name in still.parameters], axis=1)
     drive = still.displacement(theta, voltage, from_rest=True)
     settled = drive[:, 1] - drive[:, 0]

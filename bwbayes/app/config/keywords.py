@@ -27,7 +27,7 @@ from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfi
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.gain import TERMS
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES
 from bwbayes.record.record import Record
 
 
@@ -168,6 +168,7 @@ def _changes(name: str) -> dict[str, Any]:
         raise InputError(f"models: {operator!r} is unknown; {suggestion(operator, HYSTERESIS)}")
     changes: dict[str, Any] = dict.fromkeys(OPTIONS)
     changes |= {"hysteresis": operator, "gain": [], "creep": False, "creep_growth": False}
+    changes["stages"] = []
     try:
         stated = tomllib.loads(f"options = {{ {options} }}")["options"]
     except (ValueError, RecursionError):
@@ -183,9 +184,11 @@ def _changes(name: str) -> dict[str, Any]:
             changes["gain"] = [*changes["gain"], word]
         elif word == "creep":
             changes["creep"] = True
+        elif word in STAGES:
+            changes["stages"] = [*changes["stages"], word]
         elif word in DYNAMICS or word in NOISES:
             changes["dynamics" if word in DYNAMICS else "noise"] = word
         else:
-            words = [*TERMS, "creep", *DYNAMICS, *NOISES]
+            words = [*TERMS, "creep", *DYNAMICS, *STAGES, *NOISES]
             raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, words)}")
     return changes

@@ -23,7 +23,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
 from bwbayes.model.gain import TERMS, PolynomialGain
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, made
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES, made
 from bwbayes.record.true_values import RING_BENDER
 from bwbayes.record.waveforms import signal_names
 
@@ -35,6 +35,7 @@ PARTS: Mapping[str, Mapping[str, Maker]] = {
     "gain": {name: partial(PolynomialGain, (name,)) for name in TERMS},
     "creep": {"creep": partial(Creep, (0.1, 1.0, 10.0), growing=True)},
     "dynamics": DYNAMICS,
+    "stages": STAGES,
     "noise": {name: partial(maker, interval=1e-3) for name, maker in NOISES.items()},
 }
 
@@ -43,6 +44,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "hysteresis": (*HYSTERESIS, "or module:Class"),
     "gain": tuple(TERMS),
     "dynamics": (*DYNAMICS, "or module:Class"),
+    "stages": (*STAGES, "or module:Class"),
     "noise": ("auto", *NOISES, "or module:Class"),
     "prior": (*(f"{n}({', '.join(a)})" for n, a in FAMILIAR.items()), "or one of scipy.stats"),
     "signal": signal_names(),
@@ -189,7 +191,8 @@ def _parameter(numbered: Sequence[Declaration], of: str) -> Iterator[str]:
     until = "" if last is declared else f", and so on to: {last.description}"
     yield _wrapped(f"{names} ({unit}): {declared.description}{until}", "  ")
     limits = declared.stated_bounds or ("positive" if declared.positive else "")
-    scope = "of each record" if declared.scope == "record" else f"of the {of}"
+    scopes = {"record": "of each record", "event": "of an event in one record"}
+    scope = scopes.get(declared.scope, f"of the {of}")
     facts = ", ".join(fact for fact in (scope, limits) if fact)
     default, condition = declared.default(Context(RING_BENDER)), ""
     if default is None:

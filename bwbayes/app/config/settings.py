@@ -183,6 +183,8 @@ class ActuatorConfig(ConfigTable):
     """Whether the creep grows with the voltage; needs creep."""
     dynamics: str = key("lag", example='"second-order"')
     """The linear dynamics behind the hysteresis."""
+    stages: Texts = key([], example='["backlash"]')
+    """What else is between command and reading; see `bwbayes models`."""
     passive: bool | None = key(None, example="false")
     """For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true)."""
     thresholds: int | list[float] | None = key(
@@ -205,6 +207,7 @@ class ActuatorConfig(ConfigTable):
             self.creep_growth,
             self.dynamics,
             options={name: value for name, value in options.items() if value is not None},
+            stages=tuple(self.stages),
         )
 
 

@@ -49,7 +49,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
-    if noise.states > LANE_STATES:
+    if noise.states > LANE_STATES or actuator.stages:
         return likelihood.products_of_series(theta, np.empty((0, likelihood.readings.rows.size)))
     voltage = likelihood.voltage[: likelihood.readings.samples]
     offset = int(likelihood.offset_sd > 0)

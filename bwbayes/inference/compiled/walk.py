@@ -1,12 +1,16 @@
 """The displacement on the compiled engine: models that walk along a voltage, piece by piece.
 
 What the likelihood does sample by sample, without its noise: the same stages, gain and dynamics,
-for ``LANES`` models side by side.
+for ``LANES`` models side by side. Where stages before the hysteresis give each model a voltage of
+its own, hysteresis and gain are worked out one model after the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +18,13 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
+from bwbayes.inference.compiled.passes import advance_stage, drive_of_own
 from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
-from bwbayes.model.actuator import Actuator
+from bwbayes.model.actuator import Actuator, each_model
+from bwbayes.model.declaration import Values
+from bwbayes.model.operator import Operator
+from bwbayes.model.operators.extremum_memory import RemembersExtrema
+from bwbayes.model.stage import pass_stages
 
 
 def walk(
@@ -33,12 +42,45 @@ def walk(
     :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the ``voltage`` (samples,) is known
     up to the end.
     """
-    operator = actuator.hysteresis
     column = actuator.columns(theta)
     actuator.check(column)
-    memory = actuator.begin(column, voltage, from_rest=from_rest)
-    compiled, advance = prepared(operator, column, voltage, memory), advance_of(operator)
-    stage = compiled or given(advance(operator, column, voltage[:1], memory)[0])
+    if not actuator.stages:
+        return _walk_core(actuator, column, voltage, unrest, from_rest)
+    # The offset comes last.
+    inner = replace(actuator, stages=actuator.inputs)
+    core = _walk_core(inner, column | {"offset": np.zeros(len(theta))}, voltage, unrest, from_rest)
+    memories: tuple[FloatArray, ...] | None = None
+
+    def onwards(last: int) -> FloatArray:
+        nonlocal memories
+        moved = core(last)
+        if memories is None:
+            memories = actuator.begin_outputs(column, moved[:, 0], from_rest=from_rest)
+        moved, memories = pass_stages(
+            actuator.outputs, column, moved, memories, actuator.clock, advance_stage
+        )
+        return moved + column["offset"][:, np.newaxis]
+
+    return onwards
+
+
+def _walk_core(
+    actuator: Actuator,
+    column: Values,
+    voltage: FloatArray,
+    unrest: FloatArray | None,
+    from_rest: bool,
+) -> Callable[[int], FloatArray]:
+    """Walk along the way up to creep and dynamics."""
+    operator, compiled = actuator.hysteresis, None
+    if actuator.inputs:
+        advance, memory = _of_own(actuator, column, voltage, from_rest)
+        actuator = replace(actuator, gain=None)  # it is in the drive
+    else:
+        advance = partial(advance_of(operator), operator, column)
+        memory = actuator.begin(column, voltage, from_rest=from_rest)
+        compiled = prepared(operator, column, voltage, memory)
+    stage = compiled or given(advance(voltage[:1], memory)[0])
     sections = actuator.sections(column)
     named = physics(actuator, sections, column, stage.rest, voltage)
     models = by_rows(named, STATE // LANES)
@@ -53,12 +95,12 @@ def walk(
 
     def onwards(last: int) -> FloatArray:
         nonlocal memory, now
-        displacement = np.empty((len(theta), last - now))
+        displacement = np.empty((column["offset"].size, last - now))
         piece, begin, plan = slice(0, None), now, stage.plan
         if compiled is None:
             # The drive of this piece is known, and what goes with it begins where it does.
             piece, begin = slice(now, last), 0
-            drive, memory = advance(operator, column, voltage[piece], memory)
+            drive, memory = advance(voltage[piece], memory)
             plan = np.ascontiguousarray(drive)
         _walk(
             stage.kind, groups, plan, curve[piece], lags, growth[piece], state, known[piece], begin,
@@ -68,6 +110,41 @@ def walk(
         return displacement
 
     return onwards
+
+
+def _of_own(
+    actuator: Actuator, column: Values, voltage: FloatArray, from_rest: bool
+) -> tuple[Callable[[FloatArray, Any], tuple[FloatArray, Any]], Any]:
+    """Return what makes the drive along the next voltages, of models with voltages of their own.
+
+    And what it remembers at the first sample: the stages' memories, and the operator's.
+    """
+    operator = actuator.hysteresis
+    inputs = actuator.begin_inputs(column, voltage, from_rest=from_rest)
+    first, _ = actuator.pass_inputs(column, voltage[:1], inputs)
+    span = actuator.range_of(voltage)
+    memory = actuator.begin(column, first, from_rest=from_rest, span=span)
+    step = None
+    # Those that remember extrema have another memory than their step has.
+    if type(operator).step is not Operator.step and not isinstance(operator, RemembersExtrema):
+        step = operator.step(column)
+    if step is not None:
+        steps = (operator.step(values) for values in each_model(column))
+        remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
+        memory = np.concatenate(remembered)
+
+    def advance(path: FloatArray, memories: Any) -> tuple[FloatArray, Any]:
+        inputs, memory = memories
+        driven, inputs = actuator.pass_inputs(column, path, inputs, advance_stage)
+        if step is None:
+            drive, memory = actuator.drive(column, driven, memory)
+        else:
+            drive, memory = drive_of_own(step, memory, driven)
+            if actuator.gain is not None:
+                drive += actuator.gain.displacement(column, driven)
+        return drive, (inputs, memory)
+
+    return advance, (inputs, memory)
 
 
 @compile_cached()

@@ -1,0 +1,223 @@
+"""Stages of the signal path before and behind the hysteresis: from command to reading, in a row.
+
+A :class:`Stage` on the input side changes the voltage on its way to the actuator, one on the output
+side what the sensor sees of the displacement:
+
+    command > input stages > hysteresis, nonlinearity > dynamics, creep > output stages > + offset
+
+It is one class in one file. It declares its parameters, and says what it does with a sample:
+``settle`` at the first one, ``move`` at each of the next, and ``undo``, which is ``move`` the other
+way round, for commands. Each is written once: NumPy moves all models at once with it, compiled it
+moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
+(:mod:`bwbayes.control.codegen`); so it is made of what :mod:`bwbayes.model.elementwise` says.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.declaration import Declaration, Values, check
+from bwbayes.model.linear import ComplexArray, Hold
+from bwbayes.shown import brief
+
+Side = Literal["input", "output"]
+
+
+class Clock(NamedTuple):
+    """How samples follow each other: every ``interval`` s, with a ``hold`` in between."""
+
+    interval: float
+    hold: Hold
+
+
+class Stage(ABC):
+    """A stage, for a batch of models: values (models, samples) in, values out.
+
+    In V on the input side, in um on the output side. Its ``name`` is what a config calls it.
+    """
+
+    __repr__ = brief
+
+    name: ClassVar[str]
+    side: ClassVar[Side]
+    rate_independent: ClassVar[bool] = False
+    """Whether only the path of its values counts, not their pace: then it shapes loops."""
+    has_inverse: ClassVar[bool] = True
+    """Whether :meth:`undo` is there."""
+    remembers: ClassVar[int] = 0
+    """How many numbers it remembers from sample to sample."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Its parameters."""
+
+    @abstractmethod
+    def numbers(self, column: Values, clock: Clock) -> FloatArray:
+        """Return what ``move`` needs to know of models, (models, any), from columns (models,)."""
+
+    @staticmethod
+    @abstractmethod
+    def settle(parameters: Any, value: Any, after: Any) -> Any:
+        """Return what comes out once the stage is at rest at a value, and write its memory.
+
+        Of one model, whose parameters and memory are numbers in a row, or of all, (any, models).
+        """
+
+    @staticmethod
+    @abstractmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:
+        """Return what comes out at a sample with this value, and write the memory ``after`` it."""
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:
+        """Return the value with which ``move`` gives this one at the next sample."""
+        raise NotImplementedError
+
+    def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what comes out (models,) at rest at a value (models,), and the memory there."""
+        memory = np.empty((self.remembers, value.size))
+        return np.asarray(self.settle(numbers.T, value, memory)), memory.T
+
+    def begin(self, column: Values, numbers: FloatArray, first: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Return the memory (models, any) before a first value (models,), not from rest.
+
+        As it would be at rest there, if no parameter of a record's own (in ``column``) says more.
+        """
+        return self.settled(numbers, first)[1]
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError that names the parameter where a model is outside of the domain."""
+        check(self.parameters, column)
+
+    def advance(
+        self, numbers: FloatArray, memory: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what comes out (models, samples) of values, and the memory after them.
+
+        All models take one sample together. The memory that is given stays as it is.
+        """
+        result, rows = np.empty(values.shape), numbers.T
+        now, after = memory.T.copy(), np.empty(memory.T.shape)
+        for sample in range(values.shape[1]):
+            result[:, sample] = self.move(rows, now, values[:, sample], after)
+            now, after = after, now
+        return result, now.T.copy()
+
+    def inverse(self, numbers: FloatArray, memory: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the values (models, samples) with which these come out.
+
+        Raises
+        ------
+        InputError
+            The stage has no inverse.
+        """
+        self.require_inverse()
+        result, rows = np.empty(values.shape), numbers.T
+        now, after = memory.T.copy(), np.empty(memory.T.shape)
+        for sample in range(values.shape[1]):
+            result[:, sample] = self.undo(rows, now, values[:, sample])
+            self.move(rows, now, result[:, sample], after)
+            now, after = after, now
+        return result
+
+    def response(self, numbers: FloatArray, angles: FloatArray) -> ComplexArray | float:  # noqa: ARG002
+        """Return how the stage passes small oscillations on, (models, frequencies), complex.
+
+        ``angles`` (frequencies,) are per sample, rad. By default they pass unchanged.
+        """
+        return 1.0
+
+    def require_inverse(self) -> None:
+        """Raise an InputError if no command can undo the stage."""
+        if not self.has_inverse:
+            raise InputError(f"inverse: no command undoes the stage {self.name}")
+
+
+Advance = Callable[
+    [Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
+]
+"""What runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
+
+
+def begin_stages(
+    stages: Sequence[Stage],
+    column: Values,
+    first: FloatArray,
+    clock: Clock,
+    rest: FloatArray | None = None,
+) -> tuple[FloatArray, ...]:
+    """Return the memories of stages in a row just before a record's first value (models,).
+
+    ``rest`` (models,) is the value at zero volts, where the actuator was at rest, if it came
+    straight from there; otherwise what was before is not known.
+    """
+    memories = []
+    for stage in stages:
+        numbers = stage.numbers(column, clock)
+        if rest is None:
+            memory = stage.begin(column, numbers, first)
+        else:
+            rested, at_rest = stage.settled(numbers, rest)
+            # What has no pace has come along the whole path from there.
+            memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
+            rest = rested
+        memories.append(memory)
+        first = stage.advance(numbers, memory, first[:, np.newaxis])[0][:, 0]
+    return tuple(memories)
+
+
+def undo_stages(
+    stages: Sequence[Stage],
+    column: Values,
+    values: FloatArray,
+    clock: Clock,
+    rest: FloatArray | None = None,
+) -> FloatArray:
+    """Return the values (models, samples) with which these come out behind stages in a row.
+
+    ``rest`` as in :func:`begin_stages`.
+
+    Raises
+    ------
+    InputError
+        A stage that has no inverse.
+    """
+    at_rest = []
+    for stage in stages:
+        stage.require_inverse()
+        at_rest.append(rest)
+        if rest is not None:
+            rest = stage.settled(stage.numbers(column, clock), rest)[0]
+    for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
+        numbers, first = stage.numbers(column, clock), values[:, 0].copy()
+        memories = begin_stages((stage,), column, first, clock, rested)
+        # What comes out first hangs on what goes in first.
+        for _ in range(40):
+            out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
+            first = first + (values[:, 0] - out[:, 0])
+            memories = begin_stages((stage,), column, first, clock, rested)
+        values = stage.inverse(numbers, memories[0], values)
+    return values
+
+
+def pass_stages(
+    stages: Sequence[Stage],
+    column: Values,
+    values: FloatArray,
+    memories: Sequence[FloatArray],
+    clock: Clock,
+    advance: Advance = Stage.advance,
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Let values (models, samples) pass stages in a row; return what comes out, and the memories."""
+    after = []
+    for stage, memory in zip(stages, memories, strict=True):
+        values, reached = advance(stage, stage.numbers(column, clock), memory, values)
+        after.append(reached)
+    return values, tuple(after)

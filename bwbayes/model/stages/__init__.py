@@ -1,0 +1,1 @@
+"""Stages before and behind the hysteresis, one in each file."""

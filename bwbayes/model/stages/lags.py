@@ -1,0 +1,110 @@
+"""What follows with a lag: an amplifier its command, a sensor the displacement.
+
+Both are first-order, τ y′ + y = x. The actuator's own lag is a part of its dynamics; a slow
+amplifier stands before the hysteresis, which then sees a voltage that is smoother than the command,
+and a slow sensor, with its filter, behind everything.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values, check, lognormal
+from bwbayes.model.linear import ComplexArray, first_order_lag
+from bwbayes.model.stage import Clock, Side, Stage
+
+
+class _Lag(Stage):
+    """A first-order lag. The memory is y and x.
+
+    Of an x that is held, what comes out is the mean of y until the next sample.
+    """
+
+    remembers: ClassVar = 2
+
+    def numbers(self, column: Values, clock: Clock) -> FloatArray:
+        """Return the coefficients of x, of x before and of y before, (models, 6).
+
+        Three that give what comes out, and three that give y at the sample, or at the next one.
+        """
+        lag = column[self.parameters[0].name]
+        if not self.is_held(clock):
+            recursion = first_order_lag(lag, clock.interval, "first")
+            row = np.column_stack([recursion.numerator, -recursion.denominator[:, 1]])
+            return np.concatenate([row, row], axis=1)
+        with np.errstate(divide="ignore"):
+            z = clock.interval / lag
+        mean = -np.expm1(-z) / z
+        none = np.zeros_like(z)
+        return np.column_stack([1 - mean, none, mean, -np.expm1(-z), none, np.exp(-z)])
+
+    def is_held(self, clock: Clock) -> bool:  # noqa: ARG002  # a displacement has no steps
+        """Tell whether x stays the same until the next sample."""
+        return False
+
+    def check(self, column: Values) -> None:
+        """Raise an InputError for a negative time constant; it may be zero."""
+        check(self.parameters, column, (self.parameters[0].name,))
+
+    @staticmethod
+    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # whatever the lag
+        """Return x."""
+        after[0], after[1] = value, value
+        return value
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:
+        """Return y."""
+        after[0] = parameters[3] * value + parameters[4] * memory[1] + parameters[5] * memory[0]
+        after[1] = value
+        return parameters[0] * value + parameters[1] * memory[1] + parameters[2] * memory[0]
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:
+        """Return x."""
+        return (value - parameters[1] * memory[1] - parameters[2] * memory[0]) / parameters[0]
+
+
+    def response(self, numbers: FloatArray, angles: FloatArray) -> ComplexArray:
+        """Return that of the recursion."""
+        out, x_out, y_out, now, before, keep = numbers.T[:, :, np.newaxis]
+        late = np.exp(-1j * angles)
+        y = (now + before * late) / (1 - keep * late)
+        response: ComplexArray = out + x_out * late + y_out * late * y
+        return response
+
+
+def _time_constant(name: str, label: str, whose: str) -> tuple[Declaration, ...]:
+    return (
+        Declaration(
+            name,
+            "s",
+            label,
+            f"time constant of the {whose}",
+            lambda context: lognormal(0.02 * context.ranges.time, 1.5),
+            floor=0.0,
+        ),
+    )
+
+
+class AmplifierLag(_Lag):
+    """A slow amplifier: τ y′ + y = x, with the command x and the actuator's voltage y, V."""
+
+    name: ClassVar = "amplifier-lag"
+    side: ClassVar[Side] = "input"
+    parameters = _time_constant("amplifier_lag", r"\tau_a", "amplifier")
+
+    def is_held(self, clock: Clock) -> bool:
+        """Tell whether the command is."""
+        return clock.hold == "zero"
+
+
+class SensorLag(_Lag):
+    """A slow sensor: τ y′ + y = x, with the displacement x and what is read y, um."""
+
+    name: ClassVar = "sensor-lag"
+    side: ClassVar[Side] = "output"
+    parameters = _time_constant("sensor_lag", r"\tau_s", "sensor")
