@@ -76,6 +76,7 @@ class Likelihood:
     The readings are r = x(θ) + Σ ξᵢ fᵢ + noise, with independent ξᵢ ~ N(0, σᵢ²): fᵢ are the free
     responses of the dynamics, σᵢ = gain times half the voltage's range, and of creep so much of it
     as :meth:`Creep.reach` says; the record's own offset, if it has one, comes first, with f = 1.
+    Stages behind the dynamics let fᵢ pass as they are.
 
     Parameters
     ----------
@@ -271,7 +272,8 @@ class Likelihood:
             offsets = np.ones((len(model), int(self.offset_sd > 0), readings.rows.size))
             parts = [residual, offsets]
             if not self.from_rest:
-                parts.append(self.free_responses(model)[..., readings.where])
+                sections = self.actuator.sections(self.actuator.columns(model))
+                parts.append(sections.free_responses(readings.samples)[..., readings.where])
             parts.append(every[batch])
             series = np.concatenate(parts, axis=1)
             white, log_determinant = self.whiten(noise, series)
@@ -279,25 +281,6 @@ class Likelihood:
             results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
         products, determinants = zip(*results, strict=True)
         return np.concatenate(products), np.concatenate(determinants)
-
-    def free_responses(self, model: FloatArray) -> FloatArray:
-        """Displacement (models, unknowns, samples) for a um of each unknown of the dynamics.
-
-        Of models (models, parameters of the actuator), up to the last reading. Stages behind the
-        dynamics need not be linear: then it is the slope where nothing is off rest.
-        """
-        samples = self.readings.samples
-        if not self.actuator.outputs:
-            return self.actuator.sections(self.actuator.columns(model)).free_responses(samples)
-        voltage, unknowns = self.voltage[:samples], self.actuator.unknowns
-        at_rest = self.simulate(model, voltage)
-        size = 1e-6 * float(np.ptp(at_rest))  # small beside any stage, large beside rounding
-        responses = np.empty((len(model), unknowns, samples))
-        for unknown in range(unknowns):
-            unrest = np.zeros((len(model), unknowns))
-            unrest[:, unknown] = size
-            responses[:, unknown] = (self.simulate(model, voltage, unrest) - at_rest) / size
-        return responses
 
     def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.

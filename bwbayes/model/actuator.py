@@ -220,7 +220,7 @@ class Actuator:
             return result, State(hysteresis, equilibrium, filtered, inputs)
         result += level[:, np.newaxis]
         if state is None:
-            behind = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
+            behind = self.begin_outputs(column, result[:, :2], from_rest=from_rest)
         else:
             behind = state.outputs
         result, outputs = pass_stages(self.outputs, column, result, behind, self.clock)
@@ -257,14 +257,14 @@ class Actuator:
         """Return the memories of the stages before the hysteresis at a record's first voltage."""
         models = column["offset"].size
         rest = np.zeros(models) if from_rest else None
-        return begin_stages(self.inputs, column, np.full(models, path[0]), self.clock, rest)
+        return begin_stages(self.inputs, column, np.tile(path[:2], (models, 1)), self.clock, rest)
 
     def begin_outputs(
         self, column: Values, first: FloatArray, *, from_rest: bool
     ) -> tuple[FloatArray, ...]:
-        """Return the memories of the stages behind the dynamics at a first displacement (models,).
+        """Return the memories of the stages behind the dynamics at first displacements.
 
-        Displacements are in um, without the offset.
+        (models, few), um, without the offset.
         """
         rest = self.level_at_rest(column) if from_rest else None
         return begin_stages(self.outputs, column, first, self.clock, rest)

@@ -85,10 +85,17 @@ class Stage(ABC):
         memory = np.empty((self.remembers, value.size))
         return np.asarray(self.settle(numbers.T, value, memory)), memory.T
 
-    def begin(self, column: Values, numbers: FloatArray, first: FloatArray) -> FloatArray:  # noqa: ARG002
+    def begin(
+        self,
+        column: Values,  # noqa: ARG002
+        numbers: FloatArray,
+        first: FloatArray,
+        slope: FloatArray,  # noqa: ARG002
+    ) -> FloatArray:
         """Return the memory (models, any) before a first value (models,), not from rest.
 
-        As it would be at rest there, if no parameter of a record's own (in ``column``) says more.
+        The values rise by ``slope`` (models,) a sample, and did so before. By default as it would
+        be at rest; a parameter of a record's own (in ``column``) may say more.
         """
         return self.settled(numbers, first)[1]
 
@@ -153,7 +160,7 @@ def begin_stages(
     clock: Clock,
     rest: FloatArray | None = None,
 ) -> tuple[FloatArray, ...]:
-    """Return the memories of stages in a row just before a record's first value (models,).
+    """Return the memories of stages in a row just before a record's first values (models, few).
 
     ``rest`` (models,) is the value at zero volts, where the actuator was at rest, if it came
     straight from there; otherwise what was before is not known.
@@ -162,14 +169,15 @@ def begin_stages(
     for stage in stages:
         numbers = stage.numbers(column, clock)
         if rest is None:
-            memory = stage.begin(column, numbers, first)
+            slope = first[:, 1] - first[:, 0] if first.shape[1] > 1 else np.zeros(len(first))
+            memory = stage.begin(column, numbers, first[:, 0], slope)
         else:
             rested, at_rest = stage.settled(numbers, rest)
             # What has no pace has come along the whole path from there.
-            memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
+            memory = at_rest if stage.rate_independent else stage.settled(numbers, first[:, 0])[1]
             rest = rested
         memories.append(memory)
-        first = stage.advance(numbers, memory, first[:, np.newaxis])[0][:, 0]
+        first, _ = stage.advance(numbers, memory, first)
     return tuple(memories)
 
 
@@ -196,12 +204,12 @@ def undo_stages(
         if rest is not None:
             rest = stage.settled(stage.numbers(column, clock), rest)[0]
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
-        numbers, first = stage.numbers(column, clock), values[:, 0].copy()
+        numbers, first = stage.numbers(column, clock), values[:, :2].copy()
         memories = begin_stages((stage,), column, first, clock, rested)
         # What comes out first hangs on what goes in first.
         for _ in range(40):
-            out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
-            first = first + (values[:, 0] - out[:, 0])
+            out, _ = stage.advance(numbers, memories[0], first)
+            first = first + (values[:, :2] - out)
             memories = begin_stages((stage,), column, first, clock, rested)
         values = stage.inverse(numbers, memories[0], values)
     return values

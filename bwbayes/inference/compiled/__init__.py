@@ -9,15 +9,16 @@ others the drive comes from NumPy, and the rest of the work is compiled still.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes, whitening
-from bwbayes.inference.compiled.motion import physics, shared
+from bwbayes.inference.compiled.motion import physics, shared, simulated
 from bwbayes.inference.compiled.stages import Stage, advance_of, given, prepared
-from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
 
@@ -49,7 +50,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
-    if noise.states > LANE_STATES or actuator.stages:
+    if noise.states > LANE_STATES:
         return likelihood.products_of_series(theta, np.empty((0, likelihood.readings.rows.size)))
     voltage = likelihood.voltage[: likelihood.readings.samples]
     offset = int(likelihood.offset_sd > 0)
@@ -60,12 +61,14 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     slow = len(actuator.creep.times) if actuator.creep and free else 0
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
-    record, together = (voltage, likelihood.values, gaps), shared(actuator, voltage)
-    sections = actuator.sections(column)
+    record, sections = (voltage, likelihood.values, gaps), actuator.sections(column)
+    # What further stages leave is simulated beforehand, and only follows here.
+    core = replace(actuator, gain=None, stages=()) if actuator.stages else actuator
+    together, make = shared(core, voltage), simulated if actuator.stages else physics
     for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.rest
-        named = physics(actuator, sections, column, equilibrium, voltage) | filtering
+        named = make(actuator, sections, column, equilibrium, voltage) | filtering
         result = kernels.sums(
             *record, lanes.in_lanes(lanes.by_rows(named)[rows]), _over_gaps(steps[rows]), second,
             stage.kind, lanes.in_lanes(stage.group), stage.plan, *together, *unknowns,
@@ -168,6 +171,11 @@ def _staged(
 ) -> Iterator[tuple[IntArray | slice, Stage]]:
     """Yield which models go together, and the stage that makes their drive."""
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
+    if actuator.stages:
+        theta = np.stack([column[name] for name in actuator.parameters], axis=1)
+        for batch in batches(len(theta), voltage.size):
+            yield batch, given(likelihood.simulate(theta[batch], voltage))
+        return
     operator, others = actuator.hysteresis, np.arange(column["offset"].size)
     memory = actuator.begin(column, voltage, from_rest=from_rest)
     stage = prepared(operator, column, voltage, memory)

@@ -71,6 +71,26 @@ def physics(
     return rows | {row: column[name] for row, name in others.items() if name in column}
 
 
+def simulated(
+    actuator: Actuator,  # noqa: ARG001  # all that it does is done
+    sections: Sections,
+    column: Values,  # noqa: ARG001
+    first: FloatArray,
+    voltage: FloatArray,  # noqa: ARG001
+) -> dict[str, FloatArray]:
+    """Return the same of models whose displacement is known, and ``first`` (models,) of it, um.
+
+    It passes dynamics whose numerator is their denominator, which leave it as it is; free responses
+    go on by the denominator alone.
+    """
+    dynamics, rows = sections.recursions[0], {"level": first, "b0": np.ones_like(first)}
+    rows |= dict(zip(("b1", "b2"), dynamics.denominator.T[1:], strict=False))
+    rows |= dict(zip(("a1", "a2"), dynamics.denominator.T[1:], strict=False))
+    for unknown, tap in np.ndindex(dynamics.free.shape[1:]):
+        rows[f"free_{unknown + 1}{tap + 1}"] = dynamics.free[:, unknown, tap]
+    return rows
+
+
 @inner()
 def displace(
     state: FloatArray,

@@ -62,7 +62,13 @@ class Backlash(Stage):
         after[0], after[1] = value, value
         return value
 
-    def begin(self, column: Values, numbers: FloatArray, first: FloatArray) -> FloatArray:
+    def begin(
+        self,
+        column: Values,
+        numbers: FloatArray,
+        first: FloatArray,
+        slope: FloatArray,  # noqa: ARG002  # where in its play it is, a parameter says
+    ) -> FloatArray:
         """Return y = x + s b, and x."""
         y = first + np.clip(column["backlash_start"], -1.0, 1.0) * numbers[:, 0]
         return np.stack([y, first], axis=1)

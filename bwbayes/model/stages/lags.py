@@ -55,6 +55,19 @@ class _Lag(Stage):
         after[0], after[1] = value, value
         return value
 
+    def begin(
+        self,
+        column: Values,  # noqa: ARG002
+        numbers: FloatArray,
+        first: FloatArray,
+        slope: FloatArray,
+    ) -> FloatArray:
+        """Return y as far behind x as it falls if x rises steadily."""
+        before, keep = numbers.T[4:]
+        # y = x − g s solves the recursion with x before and y before a slope s less.
+        behind = (before + keep) / np.maximum(1.0 - keep, 1e-300)
+        return np.stack([first - slope - slope * behind, first - slope], axis=1)
+
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:
         """Return y."""
