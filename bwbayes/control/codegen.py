@@ -248,7 +248,13 @@ class _Printer(ast.NodeTransformer):
         match node.func:
             case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
                 # What math.h calls otherwise.
-                others = {"abs": "fabs", "minimum": "fmin", "maximum": "fmax", "power": "pow"}
+                others = {
+                    "abs": "fabs",
+                    "minimum": "fmin",
+                    "maximum": "fmax",
+                    "power": "pow",
+                    "arctanh": "atanh",
+                }
                 return f"{others.get(name, name)}({arguments})"
             case ast.Name(id=name):
                 function = self.bindings.get(name, self.function.__globals__.get(name))

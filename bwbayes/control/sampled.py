@@ -277,7 +277,7 @@ class SampledModel:
 
     @property
     def zero(self) -> FloatArray:
-        """The displacement of demagnetized models at rest at zero volts, where 0 um is, (models,)."""
+        """Where models stand at zero volts, demagnetized and at rest: 0 um, (models,), um."""
         return self.outputs[1]
 
     def displacement(self, state: SteppedState) -> FloatArray:

@@ -1,7 +1,7 @@
 """Effects beside the model: of the sensor, and of what lies between voltage and actuator.
 
-A sensor may add a drift, a transient, a step or an oscillation, have another sign, a gain that
-moves or a mount with backlash. An amplifier may be late, saturate, or be slow.
+A sensor may add a drift, a transient, a step or an oscillation, have another sign, or a gain that
+moves. A voltage may be late.
 """
 
 from __future__ import annotations
@@ -128,28 +128,6 @@ def reversed_sign(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("sign", text, fix, fit)
 
 
-def backlash(scene: Scene) -> Iterator[Explanation]:
-    """Try a play between actuator and sensor, of a twentieth of the range each way or so."""
-    scale = 0.05 * scene.extent
-
-    def followed(moved: FloatArray, sizes: FloatArray) -> FloatArray:
-        # A sample later the sensor is where it was, held between low and high. To be held twice is
-        # to be held once, between other limits: these are found for 1, 2, 4 ... samples at a time.
-        play = scale * abs(sizes[0])
-        low, high = moved - play, moved + play
-        held = 1
-        while held < moved.shape[1]:
-            before, later = slice(None, -held), slice(held, None)
-            limits = [np.clip(end[:, before], low[:, later], high[:, later]) for end in (low, high)]
-            low[:, later], high[:, later] = limits
-            held *= 2
-        return np.clip(moved[:, :1], low, high)
-
-    fit = scene.extended(Effect(np.array([[0.3], [1.0]]), read=followed))
-    text = f"backlash of {2 * scale * abs(fit.sizes[0]):.2g} um in the mount"
-    yield scene.explained("backlash", text, "tighten the mount, or preload it", fit)
-
-
 def delay(scene: Scene) -> Iterator[Explanation]:
     """Try u(t − δ), of either sign; δ is a fiftieth of the time between reversals, give or take.
 
@@ -188,48 +166,3 @@ def _late(scene: Scene, late: float, fit: LocalFit, cost: float = 0.0) -> Explan
     if late > 0:
         fix += ", or set hold in [model] if the voltage is a command"
     return scene.explained("delay", text, fix, fit, cost)
-
-
-def saturation(scene: Scene) -> Iterator[Explanation]:
-    """Try a voltage that ends at levels inside its recorded range."""
-    low, high = float(scene.voltage.min()), float(scene.voltage.max())
-
-    def limits(sizes: FloatArray) -> FloatArray:
-        depth = 0.2 * (high - low) * np.minimum(np.abs(sizes), 2.0)
-        return np.array([low + depth[0], high - depth[1]])
-
-    def clipped(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
-        return np.clip(voltage, *limits(sizes))
-
-    starts = np.array([[0.0, 0.5], [0.5, 0.0], [0.5, 0.5]])
-    fit = scene.extended(Effect(starts, drive=clipped))
-    lower, upper = limits(fit.sizes)
-    text = f"amplifier that saturates at {lower:.4g} and {upper:.4g} V"
-    fix = "record the amplifier's output voltage, or drive inside its range"
-    yield scene.explained("saturation", text, fix, fit)
-
-
-def slew_limit(scene: Scene) -> Iterator[Explanation]:
-    """Try a voltage that changes by no more than so many volts a second."""
-    fastest = float(np.max(np.abs(scene.rate)))
-
-    def limit(sizes: FloatArray) -> float:
-        return float(fastest * np.exp(-0.7 * abs(sizes[0])))
-
-    def limited(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
-        step, reached = limit(sizes) * scene.interval, float(voltage[0])
-        followed = []
-        for wanted in voltage.tolist():
-            if wanted > reached + step:
-                reached += step
-            elif wanted < reached - step:
-                reached -= step
-            else:
-                reached = wanted
-            followed.append(reached)
-        return np.array(followed)
-
-    fit = scene.extended(Effect(np.array([[0.3], [1.0], [2.0]]), drive=limited))
-    text = f"amplifier that follows no faster than {limit(fit.sizes):.3g} V/s"
-    fix = "record the amplifier's output voltage, or drive more slowly"
-    yield scene.explained("slew limit", text, fix, fit)

@@ -16,6 +16,7 @@ import numpy as np
 from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.model.registry import STAGES
 from bwbayes.watching import Watch, unwatched
 
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
@@ -33,9 +34,7 @@ ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     model.growing_noise,
 )
 CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
-    effects.saturation,
-    effects.slew_limit,
-    effects.backlash,
+    model.stages,
     model.nonlinearity,
     model.creep,
     model.dynamics,
@@ -46,7 +45,7 @@ CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
 
 # Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
-LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
+LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *STAGES))))
 
 # Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))

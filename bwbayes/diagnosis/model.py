@@ -6,7 +6,7 @@ Another model has its own evidence; noise may have heavy tails, or be more where
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from types import MappingProxyType
@@ -23,7 +23,7 @@ from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
-from bwbayes.model.registry import HYSTERESIS
+from bwbayes.model.registry import HYSTERESIS, STAGES
 from bwbayes.model.spec import ModelSpec
 
 
@@ -59,6 +59,16 @@ def dynamics(scene: Scene) -> Iterator[Explanation]:
         },
         starts=[{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)],
     )
+
+
+def stages(scene: Scene) -> Iterator[Explanation]:
+    """Try each stage before or behind the hysteresis that the model has not."""
+    present = scene.study.spec.stages if scene.study is not None else ()
+    for name, make in STAGES.items():
+        if name in present:
+            continue
+        stage, changes = make(), {"stages": (*present, name)}
+        yield from _changed(scene, stage.describe, changes, name, stage.advice, starts=stage.starts)
 
 
 def hold(scene: Scene) -> Iterator[Explanation]:
@@ -97,18 +107,20 @@ def smooth(scene: Scene) -> Iterator[Explanation]:
 
 def _changed(
     scene: Scene,
-    text: str,
+    text: str | Callable[[Mapping[str, float]], str],
     changes: Mapping[str, object],
     kind: str = "",
+    advice: str = "",
     stated: Mapping[str, Stated] = MappingProxyType({}),
     starts: Sequence[Mapping[str, float]] = ({},),
     **facts: Any,
 ) -> Iterator[Explanation]:
     """Fit the changed model from the mode; its new parameters start at their priors' medians.
 
-    ``facts`` are other fields of the explanation.
+    ``text`` says what was found, of the parameters' values by name, if it hangs on them; ``advice``
+    is what else can be done. ``facts`` are other fields of the explanation.
     """
-    kind = kind or text
+    kind = kind or str(text)
     if scene.study is None or not scene.looks_for(kind):
         return
     spec = scene.study.spec.with_parts(**changes)
@@ -123,6 +135,11 @@ def _changed(
     fix = _lines(scene.study.spec, spec)
     if stated:
         fix += f", with what is known of {', '.join(stated)} in [parameters]"
+    if advice:
+        fix = f"{advice}, or {fix}"
+    if not isinstance(text, str):
+        theta = posterior.prior.theta(fit.free[np.newaxis])[0].tolist()
+        text = text(dict(zip(posterior.table.names, theta, strict=True)))
     yield scene.explained(kind, text, fix, fit, spec=spec, stated=stated, **facts)
 
 

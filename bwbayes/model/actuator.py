@@ -190,7 +190,6 @@ class Actuator:
             raise InputError("voltage: must be finite; check the record")
         column = self.columns(models)
         self.check(column)
-        sections = self.sections(column)
         if state is None:
             inputs = self.begin_inputs(column, path, from_rest=from_rest)
         else:
@@ -201,7 +200,29 @@ class Actuator:
         else:
             memory = state.hysteresis
         drive, hysteresis = self.drive(column, driven, memory)
-        drives = [drive]
+        result, equilibrium, filtered = self._follow(column, drive, path, state, unrest)
+        if state is None:
+            outputs = self.begin_outputs(column, result[:, :2], from_rest=from_rest)
+        else:
+            outputs = state.outputs
+        result, outputs = pass_stages(self.outputs, column, result, outputs, self.clock)
+        result += column["offset"][:, np.newaxis]
+        return result, State(hysteresis, equilibrium, filtered, inputs, outputs)
+
+    def _follow(
+        self,
+        column: Values,
+        drive: FloatArray,
+        path: FloatArray,
+        state: State | None,
+        unrest: FloatArray | None,
+    ) -> tuple[FloatArray, tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+        """Let dynamics and creep follow a drive (models, samples), um, along a path (samples,), V.
+
+        Returns the displacement without the offset, the drives at which they were at rest, and the
+        states of their recursions; ``state`` and ``unrest`` as in :meth:`advance`.
+        """
+        sections, drives = self.sections(column), [drive]
         if self.creep is not None:
             crept = self.creep.drive(column, drive, path)
             drives += [crept.copy() for _ in self.creep.times]
@@ -210,22 +231,13 @@ class Actuator:
         else:
             equilibrium, filtered = state.rest, tuple(carried.copy() for carried in state.filter)
         # The recursions see the drives' distance from rest, so that they start at zero exactly.
-        for drive, before in zip(drives, equilibrium, strict=True):
-            np.subtract(drive, before[:, np.newaxis], out=drive)
+        for driven, before in zip(drives, equilibrium, strict=True):
+            np.subtract(driven, before[:, np.newaxis], out=driven)
         result = sections.run(drives, filtered)
         levels = zip(sections.gains, equilibrium, strict=True)
-        level: FloatArray = sum((gain * w for gain, w in levels), start=np.zeros(len(models)))
-        if not self.outputs:
-            result += (level + column["offset"])[:, np.newaxis]
-            return result, State(hysteresis, equilibrium, filtered, inputs)
+        level: FloatArray = sum((gain * w for gain, w in levels), start=np.zeros(len(drive)))
         result += level[:, np.newaxis]
-        if state is None:
-            behind = self.begin_outputs(column, result[:, :2], from_rest=from_rest)
-        else:
-            behind = state.outputs
-        result, outputs = pass_stages(self.outputs, column, result, behind, self.clock)
-        result += column["offset"][:, np.newaxis]
-        return result, State(hysteresis, equilibrium, filtered, inputs, outputs)
+        return result, equilibrium, filtered
 
     @property
     def static(self) -> Actuator:

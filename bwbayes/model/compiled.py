@@ -55,9 +55,9 @@ WHOLE = 1.5 * 2.0**52
 class FormulaType(types.Type):
     """The type of what brings a formula, by its class and a digest of the formula's sources.
 
-    A step and a stage bring their ``move``, an operator that remembers extrema its ``everett``. What is kept on
-    disk knows the ``kind``, the class, by its name alone: one of a module of the user's own need
-    not be there when others are looked up beside it.
+    A step and a stage bring their ``move``, an operator that remembers extrema its ``everett``.
+    What is kept on disk knows the ``kind``, the class, by its name alone: one of a module of the
+    user's own need not be there when others are looked up beside it.
     """
 
     kind: Any

@@ -27,6 +27,9 @@ from bwbayes.model.operators.preisach import Preisach
 from bwbayes.model.stage import Stage
 from bwbayes.model.stages.backlash import Backlash
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
+from bwbayes.model.stages.saturation import Saturation
+from bwbayes.model.stages.sensor_curve import SensorCurve
+from bwbayes.model.stages.slew_limit import SlewLimit
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
@@ -58,7 +61,8 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 
 # Stages before and behind the hysteresis, in the order of the signal's way.
 STAGES: Mapping[str, Callable[..., Stage]] = {
-    stage.name: stage for stage in (AmplifierLag, Backlash, SensorLag)
+    stage.name: stage
+    for stage in (AmplifierLag, SlewLimit, Saturation, Backlash, SensorLag, SensorCurve)
 }
 
 

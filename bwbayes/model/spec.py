@@ -115,7 +115,9 @@ class ModelSpec:
         repeated = [name for name in self.stages if self.stages.count(name) > 1]
         if repeated:
             raise InputError(f"model.stages: {repeated[0]!r} is there twice; leave one out")
-        return sorted(self.stages, key=lambda name: order.index(name) if name in order else len(order))
+        return sorted(
+            self.stages, key=lambda name: order.index(name) if name in order else len(order)
+        )
 
     def explicit(self, actuator: Actuator) -> Self:
         """Return the spec with all that it left open as an actuator of it has it, but the hold.

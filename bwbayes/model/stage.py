@@ -15,7 +15,7 @@ moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -52,11 +52,19 @@ class Stage(ABC):
     """Whether :meth:`undo` is there."""
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
+    starts: ClassVar[Sequence[Mapping[str, float]]] = ({},)
+    """Where to climb from in a search for it: normal scores of its parameters by name."""
+    advice: ClassVar[str] = ""
+    """What can be done on the test stand, instead of making it a part of the model."""
 
     @property
     @abstractmethod
     def parameters(self) -> tuple[Declaration, ...]:
         """Its parameters."""
+
+    def describe(self, values: Mapping[str, float]) -> str:  # noqa: ARG002
+        """Say what it does with these values of its parameters, in a phrase."""
+        return self.name
 
     @abstractmethod
     def numbers(self, column: Values, clock: Clock) -> FloatArray:
@@ -147,9 +155,7 @@ class Stage(ABC):
             raise InputError(f"inverse: no command undoes the stage {self.name}")
 
 
-Advance = Callable[
-    [Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
-]
+Advance = Callable[[Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """What runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
 
 
@@ -223,7 +229,7 @@ def pass_stages(
     clock: Clock,
     advance: Advance = Stage.advance,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Let values (models, samples) pass stages in a row; return what comes out, and the memories."""
+    """Let values (models, samples) pass stages in a row; return them, and the memories."""
     after = []
     for stage, memory in zip(stages, memories, strict=True):
         values, reached = advance(stage, stage.numbers(column, clock), memory, values)

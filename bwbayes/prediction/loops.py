@@ -186,9 +186,9 @@ def steady_loop(
 ) -> Traced:
     """Drive models from the demagnetized state up and down until the loop closes.
 
-    Of the ``actuator`` counts what has no pace, and no offset; ``column`` has columns (models,) of its
-    parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points`` is the odd number
-    of voltages along a branch.
+    Of the ``actuator`` all counts that has no pace, but no offset; ``column`` has columns (models,)
+    of its parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points`` is the odd
+    number of voltages along a branch.
 
     Raises
     ------

@@ -6,6 +6,7 @@ the sensor looks at. That opens any loop by the same amount, minor loops most of
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,6 +29,8 @@ class Backlash(Stage):
     side: ClassVar[Side] = "output"
     rate_independent: ClassVar = True
     remembers: ClassVar = 2
+    starts: ClassVar = ({"backlash": 0.0}, {"backlash": 1.5})
+    advice: ClassVar = "tighten the mount, or preload it"
 
     parameters: tuple[Declaration, ...] = (
         Declaration(
@@ -51,6 +54,10 @@ class Backlash(Stage):
             at_rest=0.0,
         ),
     )
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Say how much it is from end to end."""
+        return f"backlash of {2 * values['backlash']:.2g} um in the mount"
 
     def numbers(self, column: Values, clock: Clock) -> FloatArray:  # noqa: ARG002  # no pace
         """Return b, (models, 1), um."""

@@ -7,6 +7,7 @@ and a slow sensor, with its filter, behind everything.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,6 +25,12 @@ class _Lag(Stage):
     """
 
     remembers: ClassVar = 2
+    starts: ClassVar = ({}, {"amplifier_lag": 1.0, "sensor_lag": 1.0})
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Say how slow it is."""
+        what = self.name.partition("-")[0]
+        return f"{what} with a lag of {1000 * values[self.parameters[0].name]:.2g} ms"
 
     def numbers(self, column: Values, clock: Clock) -> FloatArray:
         """Return the coefficients of x, of x before and of y before, (models, 6).
@@ -80,7 +87,6 @@ class _Lag(Stage):
         """Return x."""
         return (value - parameters[1] * memory[1] - parameters[2] * memory[0]) / parameters[0]
 
-
     def response(self, numbers: FloatArray, angles: FloatArray) -> ComplexArray:
         """Return that of the recursion."""
         out, x_out, y_out, now, before, keep = numbers.T[:, :, np.newaxis]
@@ -107,6 +113,7 @@ class AmplifierLag(_Lag):
     """A slow amplifier: τ y′ + y = x, with the command x and the actuator's voltage y, V."""
 
     name: ClassVar = "amplifier-lag"
+    advice: ClassVar = "record the amplifier's output voltage"
     side: ClassVar[Side] = "input"
     parameters = _time_constant("amplifier_lag", r"\tau_a", "amplifier")
 
@@ -119,5 +126,6 @@ class SensorLag(_Lag):
     """A slow sensor: τ y′ + y = x, with the displacement x and what is read y, um."""
 
     name: ClassVar = "sensor-lag"
+    advice: ClassVar = "widen the sensor's filter"
     side: ClassVar[Side] = "output"
     parameters = _time_constant("sensor_lag", r"\tau_s", "sensor")

@@ -1,0 +1,91 @@
+"""A sensor whose reading is not in proportion to the displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.stage import Clock, Side, Stage
+
+
+class SensorCurve(Stage):
+    """A sensor's curve: y = x + Y (a + b s) (s² − 1), s = (x − m) / Y, of displacement x, um.
+
+    Y is half of the displacement's range, and m its middle without the offset, of the record that
+    is fitted: there, s = −1 and 1, y is x.
+    """
+
+    name: ClassVar = "sensor-curve"
+    side: ClassVar[Side] = "output"
+    rate_independent: ClassVar = True
+    starts: ClassVar = ({},)
+    advice: ClassVar = "calibrate the sensor over its range"
+
+    parameters: tuple[Declaration, ...] = (
+        *(
+            Declaration(
+                f"sensor_{name}",
+                "-",
+                f"b_{power}",
+                f"{name} part of the sensor's curve, of half of its range",
+                lambda _: normal(0.0, 0.03),
+            )
+            for name, power in (("quadratic", 2), ("cubic", 3))
+        ),
+        Declaration(
+            "sensor_middle",
+            "um",
+            "m",
+            "displacement in the middle of the sensor's curve",
+            lambda context: context.ranges.gain * context.ranges.bias,
+        ),
+        Declaration(
+            "sensor_half",
+            "um",
+            "Y_s",
+            "half of the range of the sensor's curve",
+            lambda context: context.ranges.displacement,
+            floor=0.0,
+        ),
+    )
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Say how far the curve leaves its chord."""
+        s = np.linspace(-1.0, 1.0, 201)
+        bent = values["sensor_quadratic"] * (s**2 - 1) + values["sensor_cubic"] * s * (s**2 - 1)
+        return f"sensor with a curve, off its chord by {50 * np.abs(bent).max():.2g}% of the range"
+
+    def numbers(self, column: Values, clock: Clock) -> FloatArray:  # noqa: ARG002  # no pace
+        """Return a, b, m and Y, (models, 4)."""
+        names = ("sensor_quadratic", "sensor_cubic", "sensor_middle", "sensor_half")
+        return np.stack([column[name] for name in names], axis=1)
+
+    @staticmethod
+    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # no memory
+        """Return y."""
+        return bent(parameters, value)
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return y."""
+        return bent(parameters, value)
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return x, by Newton's rule: the curve is nearly straight."""
+        x = value
+        for _ in range(8):
+            s = (x - parameters[2]) / parameters[3]
+            slope = 1.0 + 2.0 * parameters[0] * s + parameters[1] * (3.0 * s * s - 1.0)
+            x = x - (bent(parameters, x) - value) / slope
+        return x
+
+
+def bent(parameters: Any, value: Any) -> Any:
+    """Return what a sensor reads of a displacement."""
+    s = (value - parameters[2]) / parameters[3]
+    return value + parameters[3] * (parameters[0] + parameters[1] * s) * (s * s - 1.0)
