@@ -315,7 +315,11 @@ class SampledModel:
         """
         memory, last, initial, filters, *_ = state
         begin = last if guess is None else guess
-        aim = _undone(self.outputs[0], state.outputs, displacement + self.zero)
+        behind = state.outputs
+        if self.outputs[0] and self.actuator.hold == "zero":
+            # The displacement of this sample is settled: they see that first.
+            behind = self.forward(state, last)[1].outputs
+        aim = _undone(self.outputs[0], behind, displacement + self.zero)
         close, after = tolerance or resolution(limits), np.empty_like(memory)
         model = *self.hysteresis, self.taps
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -286,8 +286,14 @@ class Actuator:
 
         Before the stages behind the dynamics, and without the offset.
         """
-        zero = np.zeros(1)
-        drive = self.drive(column, zero, self.begin(column, zero, from_rest=True))[0]
+        zero, driven = np.zeros(1), np.zeros(1)
+        if self.inputs:
+            rest = np.zeros(column["offset"].size)
+            for stage in self.inputs:
+                rest, _ = stage.settled(stage.numbers(column, self.clock), rest)
+            driven = rest[:, np.newaxis]
+        memory = self.begin(column, driven, from_rest=True, span=self.range_of(zero))
+        drive, _ = self.drive(column, driven, memory)
         level: FloatArray = drive[:, 0].copy()
         if self.creep is not None:
             crept = self.creep.drive(column, drive, zero)[:, 0]

@@ -25,7 +25,6 @@ class _Lag(Stage):
     """
 
     remembers: ClassVar = 2
-    starts: ClassVar = ({}, {"amplifier_lag": 1.0, "sensor_lag": 1.0})
 
     def describe(self, values: Mapping[str, float]) -> str:
         """Say how slow it is."""
@@ -113,6 +112,7 @@ class AmplifierLag(_Lag):
     """A slow amplifier: τ y′ + y = x, with the command x and the actuator's voltage y, V."""
 
     name: ClassVar = "amplifier-lag"
+    starts: ClassVar = ({}, {"amplifier_lag": 1.0})
     advice: ClassVar = "record the amplifier's output voltage"
     side: ClassVar[Side] = "input"
     parameters = _time_constant("amplifier_lag", r"\tau_a", "amplifier")
@@ -126,6 +126,7 @@ class SensorLag(_Lag):
     """A slow sensor: τ y′ + y = x, with the displacement x and what is read y, um."""
 
     name: ClassVar = "sensor-lag"
+    starts: ClassVar = ({}, {"sensor_lag": 1.0})
     advice: ClassVar = "widen the sensor's filter"
     side: ClassVar[Side] = "output"
     parameters = _time_constant("sensor_lag", r"\tau_s", "sensor")

@@ -1,0 +1,304 @@
+"""Every stage before and behind the hysteresis, by what its equation says, alone and in a chain.
+
+The oracles are plain loops over samples and scipy; the compiled passes, pieces of a record, the
+inverse, a model at a controller's pace and its C file have to agree with the whole record in NumPy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.arrays import FloatArray
+from bwbayes.control.exported import exported
+from bwbayes.control.sampled import SampledModel
+from bwbayes.errors import InputError
+from bwbayes.inference.compiled.walk import walk
+from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.readings import Readings
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.creep import Creep
+from bwbayes.model.declaration import Context
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inverse import inverse
+from bwbayes.model.linear import Hold
+from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.model.operators.duhem import Duhem
+from bwbayes.model.operators.prandtl_ishlinskii import Plays
+from bwbayes.model.registry import STAGES
+from bwbayes.model.spec import Extent, ModelSpec
+from bwbayes.model.stage import Clock, Stage
+from bwbayes.record.true_values import RING_BENDER, true_values
+from tests.control.compiled import Compiled
+from tests.programs import needs
+
+SPAN = Span(-80.0, 80.0)
+INTERVAL = 1e-3
+VALUES = {
+    "amplifier_lag": 2e-3,
+    "slew_limit": 6e3,
+    "saturation_middle": 5.0,
+    "saturation_reach": 200.0,
+    "backlash": 0.8,
+    "backlash_start": 0.3,
+    "sensor_lag": 1e-3,
+    "sensor_quadratic": 0.02,
+    "sensor_cubic": -0.015,
+    "sensor_middle": 2.0,
+    "sensor_half": 60.0,
+}
+# A backlash that turns asks for a jump, which a slew rate does not let pass.
+MANY = tuple(name for name in STAGES if name != "slew-limit")
+every_stage = pytest.mark.parametrize("name", STAGES)
+every_hold = pytest.mark.parametrize("hold", ["first", "zero"])
+
+
+def drive(samples: int = 600, seed: int = 3) -> FloatArray:
+    """Return a voltage (samples,) that swings, rests and turns at small amplitudes, V."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) / samples
+    voltage: FloatArray = 60 * np.sin(2 * np.pi * 4 * t) * (1 - 0.6 * t)
+    voltage += 4 * np.sin(2 * np.pi * 23 * t + rng.uniform(0, 6))
+    voltage[samples // 3 : samples // 3 + 40] = voltage[samples // 3]
+    return voltage
+
+
+def actuator(
+    *names: str, hold: Hold = "first", operator: Operator | None = None, **parts: Any
+) -> Actuator:
+    """Return an actuator with stages by name."""
+    stages = tuple(STAGES[name]() for name in names)
+    return Actuator("lag", hold, INTERVAL, operator or BoucWen(), span=SPAN, stages=stages, **parts)
+
+
+def theta(made: Actuator, models: int = 3) -> FloatArray:
+    """Return parameters (models, parameters), the first in the middle of the others."""
+    table = {"d": 1.0, "alpha": 0.3, "beta": 0.05, "gamma": 0.02, "exponent": 1.0, "offset": 2.0}
+    values = true_values(made, {**table, "initial": 0.1}) | {"lag": 3e-3}
+    values |= {name: value for name, value in VALUES.items() if name in values}
+    rows = np.tile([*values.values()], (models, 1))
+    free = [i for i, name in enumerate(made.parameters) if name in VALUES or name == "d"]
+    scale = 1 + 0.2 * np.random.default_rng(1).uniform(-1, 1, (models - 1, len(free)))
+    rows[1:, free] *= scale
+    return rows
+
+
+def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
+    """Return what a stage at rest at the first value makes of values (samples,)."""
+    v = VALUES
+    match name:
+        case "backlash":
+            y = [float(x[0])]
+            for value in x.tolist():
+                y.append(min(max(y[-1], value - v["backlash"]), value + v["backlash"]))
+            return np.array(y[1:])
+        case "slew-limit":
+            y, most = [float(x[0])], v["slew_limit"] * INTERVAL
+            for value in x.tolist():
+                y.append(y[-1] + min(max(value - y[-1], -most), most))
+            return np.array(y[1:])
+        case "saturation":
+            c, r = v["saturation_middle"], v["saturation_reach"]
+            return np.asarray(c + r * np.tanh((x - c) / r))
+        case "sensor-curve":
+            s = (x - v["sensor_middle"]) / v["sensor_half"]
+            a, b = v["sensor_quadratic"], v["sensor_cubic"]
+            return np.asarray(x + v["sensor_half"] * (a * (s**2 - 1) + b * (s**3 - s)))
+    # A lag, four hundred steps between each two samples; of a held command the mean in between.
+    lag, fine = v[name.replace("-", "_")], 400
+    held = hold == "zero" and name == "amplifier-lag"
+    time = np.arange((x.size - 1) * fine + 1) / fine
+    path = x[np.minimum(np.floor(time), x.size - 1).astype(int)] if held else None
+    path = np.interp(time, np.arange(x.size), x) if path is None else path
+    system = scipy.signal.StateSpace([[-1 / lag]], [[1 / lag]], [[1.0]], [[0.0]])
+    step = INTERVAL / fine
+    out = scipy.signal.lsim(system, path, step * np.arange(path.size), [x[0]], interp=not held)[1]
+    if not held:
+        return np.asarray(out[::fine])
+    means = (out[:-1] + out[1:]) / 2
+    return np.append(means.reshape(-1, fine).mean(axis=1), np.nan)
+
+
+def passed(name: str, x: FloatArray, hold: Hold = "first") -> FloatArray:
+    """Return what the package's stage makes of the same."""
+    stage = STAGES[name]()
+    column = {one: np.array([value]) for one, value in VALUES.items()}
+    numbers = stage.numbers(column, Clock(INTERVAL, hold))
+    _, memory = stage.settled(numbers, x[:1])
+    return stage.advance(numbers, memory, x[np.newaxis])[0][0]
+
+
+@every_stage
+@every_hold
+def test_a_stage_does_what_its_equation_says(name: str, hold: Hold) -> None:
+    x = drive(120)
+    expected = looped(name, x, hold)
+    known = np.isfinite(expected)
+    np.testing.assert_allclose(passed(name, x, hold)[known], expected[known], rtol=0, atol=1e-4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.sampled_from(list(STAGES)), unique=True, max_size=4),
+    st.sampled_from(["first", "zero"]),
+    st.sampled_from([BoucWen(), Duhem(), Plays(4)]),
+    st.booleans(),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
+def test_chains_agree_in_both_engines_and_in_pieces(
+    names: list[str], hold: Hold, operator: Operator, rich: bool, from_rest: bool, seed: int
+) -> None:
+    parts = {}
+    if rich:
+        parts = {"gain": PolynomialGain(reference=SPAN), "creep": Creep((0.1, 1.0), True, SPAN)}
+    made, voltage = actuator(*names, hold=hold, operator=operator, **parts), drive(400, seed)
+    models = theta(made)
+    whole = made.displacement(models, voltage, from_rest=from_rest)
+    cut = 2 + seed % 300
+    first, state = made.advance(models, voltage[:cut], from_rest=from_rest)
+    second, _ = made.advance(models, voltage[cut:], state)
+    size = np.ptp(whole)
+    np.testing.assert_allclose(np.hstack([first, second]), whole, rtol=0, atol=1e-11 * size)
+    onwards = walk(made, models, voltage, from_rest=from_rest)
+    pieces = np.hstack([onwards(cut), onwards(voltage.size)])
+    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-11 * size)
+    alone = made.displacement(models[1:2], voltage, from_rest=from_rest)
+    np.testing.assert_allclose(alone, whole[1:2], rtol=0, atol=1e-11 * size)
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in STAGES), MANY])
+@every_hold
+@pytest.mark.parametrize("from_rest", [False, True])
+def test_the_inverse_makes_the_displacement_again(
+    names: tuple[str, ...], hold: Hold, from_rest: bool
+) -> None:
+    """Where nothing was cut off: the drive alone is slower than the slew rate."""
+    made = actuator(*names, hold=hold)
+    models, voltage = theta(made, 2), drive(300)
+    if not from_rest:
+        voltage = np.concatenate([np.full(60, voltage[0]), voltage])
+    wanted = made.displacement(models, voltage, from_rest=from_rest)
+    command = inverse(made, models, wanted, from_rest=from_rest)
+    again = np.vstack(
+        [
+            made.displacement(row[np.newaxis], own, from_rest=from_rest)
+            for row, own in zip(models, command, strict=True)
+        ]
+    )
+    np.testing.assert_allclose(again, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "hold"), [*(((name,), "first") for name in STAGES), (tuple(STAGES), "zero")]
+)
+def test_a_controller_and_its_c_file_do_the_same(
+    names: tuple[str, ...], hold: Hold, tmp_path: Path
+) -> None:
+    made, voltage = actuator(*names, hold=hold), drive()
+    voltage[0] = 0.0
+    row = theta(made, 1)
+    row[:, [made.parameters.index(name) for name in ("initial", "offset")]] = 0.0
+    expected = made.displacement(row, voltage, from_rest=True)[0]
+    model = SampledModel.of(made, row)
+    state, moved = model.begin(voltage[:1]), []
+    for sample in voltage:
+        displacement, state = model.forward(state, np.array([sample]))
+        moved.append(displacement[0])
+    size = np.ptp(expected)
+    sampled = np.array(moved) + model.zero[0]
+    np.testing.assert_allclose(sampled, expected, rtol=0, atol=1e-11 * size)
+    compiled = Compiled(exported("chain", made, row[0], SPAN), tmp_path, needs("cc"))
+    in_c = compiled.run("forward", voltage[0], voltage)
+    np.testing.assert_allclose(in_c, moved, rtol=0, atol=1e-11 * size)
+
+
+@every_stage
+@every_hold
+def test_a_controller_s_inverse_undoes_a_stage(name: str, hold: Hold, tmp_path: Path) -> None:
+    made, voltage = actuator(name, hold=hold), drive()
+    voltage[0] = 0.0
+    row = theta(made, 1)
+    compiled = Compiled(exported("chain", made, row[0], SPAN), tmp_path, needs("cc"))
+    displacement = compiled.run("forward", voltage[0], voltage)
+    command = compiled.run("inverse", voltage[0], displacement[int(hold == "zero") :])
+    again = compiled.run("forward", voltage[0], command)
+    # A backlash that turns asks for a jump, which the limits may be in the way of.
+    near = np.abs(command) < 0.99 * SPAN.high
+    assert near.mean() > 0.9
+    reached = displacement[: again.size]
+    error = np.abs(again - reached)[np.roll(near, int(hold == "zero"))]
+    assert np.quantile(error, 0.98) < 1e-6
+
+
+@pytest.mark.parametrize("names", [("backlash",), ("amplifier-lag", "backlash", "sensor-curve")])
+@pytest.mark.parametrize("from_rest", [False, True])
+@pytest.mark.parametrize("creep", [None, Creep((0.1, 1.0), False, SPAN)])
+def test_both_engines_give_the_same_log_density(
+    names: tuple[str, ...], from_rest: bool, creep: Creep | None
+) -> None:
+    """With gaps, an offset of the record's own and an unknown start."""
+    made, voltage = actuator(*names, creep=creep), drive()
+    models = theta(made)
+    rng = np.random.default_rng(5)
+    readings = made.displacement(models[:1], voltage)[0] + 0.1 * rng.normal(size=voltage.size)
+    readings[rng.integers(0, readings.size, 40)] = np.nan
+    sds = np.tile([0.1, 0.05, 0.02], (len(models), 1))
+    every = np.hstack([models, sds])
+    densities = []
+    for engine in ("numpy", "numba"):
+        likelihood = Likelihood(
+            voltage,
+            Readings.of(readings, [slice(20, 580)]),
+            made,
+            DiscrepancyNoise(),
+            engine,  # type: ignore[arg-type]
+            from_rest,
+            SPAN.half,
+            0.0 if from_rest else 3.0,
+        )
+        densities.append(likelihood.start(every))
+    for numpy, compiled in zip(*densities, strict=True):
+        np.testing.assert_allclose(compiled, numpy, rtol=1e-9, atol=1e-9)
+
+
+def test_a_chain_stands_in_the_order_of_the_signal() -> None:
+    spec = ModelSpec(stages=("sensor-curve", "backlash", "saturation"))
+    made = spec.actuator(1e-3, "first", _extent())
+    assert [stage.name for stage in made.stages] == ["saturation", "backlash", "sensor-curve"]
+    with pytest.raises(InputError, match="'backlash' is there twice; leave one out"):
+        spec.with_stage("backlash").actuator(1e-3, "first", _extent())
+    with pytest.raises(InputError, match=r"model.stages: 'backlsh' is unknown.*backlash"):
+        ModelSpec(stages=("backlsh",)).actuator(1e-3, "first", _extent())
+
+
+@every_stage
+def test_a_stage_declares_priors_that_follow_the_record(name: str) -> None:
+    """Wide ones, in which the values of an actuator of any size lie; and says what it does."""
+    stage: Stage = STAGES[name]()
+    values = {}
+    for declared in stage.parameters:
+        default = declared.default(Context(RING_BENDER))
+        assert default is not None
+        if isinstance(default, Distribution):
+            default = float(default.frozen.median())
+        values[declared.name] = default
+    assert stage.describe(values)
+    assert stage.advice
+    assert all(
+        set(start) <= {declared.name for declared in stage.parameters} for start in stage.starts
+    )
+
+
+def _extent() -> Extent:
+
+    return Extent(SPAN, 1e-3, 10.0)
