@@ -16,6 +16,7 @@ from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, like
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.model.stages.slew_limit import SlewLimit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import problem_of
@@ -207,11 +208,12 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
 ) -> None:
     """The twin: from the smooth one alone a fit of the cause does not lead."""
     monkeypatch.setattr(explanations, "ADDITIONS", (effects.drift,))
-    monkeypatch.setattr(explanations, "CHANGES", (effects.slew_limit,))
+    monkeypatch.setattr(explanations, "CHANGES", (model.stages,))
+    monkeypatch.setattr(model, "STAGES", {"slew-limit": SlewLimit})
     slow = scene("slew limit", 1, tmp_path, 5.0)
-    assert all(found.nats < 0 for found in effects.slew_limit(slow))
+    assert all(found.nats < 0 for found in model.stages(slow))
     found = explain(slow)
-    assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
+    assert [cause.kind for cause in likely_causes(found)] == ["slew-limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
 
 
