@@ -68,7 +68,8 @@ def stages(scene: Scene) -> Iterator[Explanation]:
         if name in present:
             continue
         stage, changes = make(), {"stages": (*present, name)}
-        yield from _changed(scene, stage.describe, changes, name, stage.advice, starts=stage.starts)
+        kind = name.replace("-", " ")
+        yield from _changed(scene, stage.describe, changes, kind, stage.advice, starts=stage.starts)
 
 
 def hold(scene: Scene) -> Iterator[Explanation]:

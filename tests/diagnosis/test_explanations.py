@@ -213,7 +213,7 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     slow = scene("slew limit", 1, tmp_path, 5.0)
     assert all(found.nats < 0 for found in model.stages(slow))
     found = explain(slow)
-    assert [cause.kind for cause in likely_causes(found)] == ["slew-limit"]
+    assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
 
 
