@@ -206,13 +206,14 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
 def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The twin: from the smooth one alone a fit of the cause does not lead."""
+    """The twin: from the smooth one alone a fit of the cause does not lead as far."""
     monkeypatch.setattr(explanations, "ADDITIONS", (effects.drift,))
     monkeypatch.setattr(explanations, "CHANGES", (model.stages,))
     monkeypatch.setattr(model, "STAGES", {"slew-limit": SlewLimit})
     slow = scene("slew limit", 1, tmp_path, 5.0)
-    assert all(found.nats < 0 for found in model.stages(slow))
     found = explain(slow)
+    beside_smooth = max(each.nats for each in model.stages(slow))
+    assert beside_smooth < found[0].nats - 20
     assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
 

@@ -119,9 +119,12 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     time = np.arange((x.size - 1) * fine + 1) / fine
     path = x[np.minimum(np.floor(time), x.size - 1).astype(int)] if held else None
     path = np.interp(time, np.arange(x.size), x) if path is None else path
-    system = scipy.signal.StateSpace([[-1 / lag]], [[1 / lag]], [[1.0]], [[0.0]])
+    signal: Any = scipy.signal
+    system = signal.StateSpace([[-1 / lag]], [[1 / lag]], [[1.0]], [[0.0]])
     step = INTERVAL / fine
-    out = scipy.signal.lsim(system, path, step * np.arange(path.size), [x[0]], interp=not held)[1]
+    out = signal.lsim(system, path, step * np.arange(path.size), np.array([x[0]]), interp=not held)[
+        1
+    ]
     if not held:
         return np.asarray(out[::fine])
     means = (out[:-1] + out[1:]) / 2
@@ -134,7 +137,7 @@ def passed(name: str, x: FloatArray, hold: Hold = "first") -> FloatArray:
     column = {one: np.array([value]) for one, value in VALUES.items()}
     numbers = stage.numbers(column, Clock(INTERVAL, hold))
     _, memory = stage.settled(numbers, x[:1])
-    return stage.advance(numbers, memory, x[np.newaxis])[0][0]
+    return np.asarray(stage.advance(numbers, memory, x[np.newaxis])[0][0])
 
 
 @every_stage
@@ -261,7 +264,7 @@ def test_both_engines_give_the_same_log_density(
             Readings.of(readings, [slice(20, 580)]),
             made,
             DiscrepancyNoise(),
-            engine,  # type: ignore[arg-type]
+            engine,
             from_rest,
             SPAN.half,
             0.0 if from_rest else 3.0,
