@@ -18,7 +18,7 @@ class Saturation(Stage):
     name: ClassVar = "saturation"
     side: ClassVar[Side] = "input"
     rate_independent: ClassVar = True
-    starts: ClassVar = ({"saturation_reach": 0.5}, {"saturation_reach": -0.3})
+    starts: ClassVar = tuple({"saturation_reach": z} for z in (0.5, -0.3, -0.7))
     advice: ClassVar = "record the amplifier's output voltage, or drive inside its range"
 
     parameters: tuple[Declaration, ...] = (
