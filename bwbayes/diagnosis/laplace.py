@@ -29,8 +29,8 @@ GAIN, ROUNDS = 0.05, 20
 # Rounds from every start, and how many times what a round gained all later ones may gain.
 FIRST_ROUNDS, AHEAD = 2, 10.0
 
-# Steps in the noise's coordinates a round: of states side by side, and of one alone.
-NOISE_STEPS = 2, 6
+# Steps in the noise's coordinates a round; and where many starts of an effect go side by side.
+NOISE_STEPS, FEW_STEPS = 6, 2
 
 # Parts of a step that are tried.
 FRACTIONS = 0.5 ** np.arange(8)
@@ -243,7 +243,9 @@ class _Target:
 
         In these by Fisher scoring.
         """
-        states = [self._step_noise(state, NOISE_STEPS[len(states) == 1]) for state in states]
+        many = len(states) > 1 and self.effect is not NONE
+        count = FEW_STEPS if many else NOISE_STEPS
+        states = [self._step_noise(state, count) for state in states]
         slopes, curvatures = self._physical_bend(states)
         steps = np.zeros((len(states), states[0].coordinates.size))
         steps[:, self.physical] = np.linalg.solve(curvatures, slopes[..., np.newaxis])[..., 0]

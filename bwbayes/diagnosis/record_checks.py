@@ -140,17 +140,18 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     or last reading that may as well belong to a transient: one that is no more than twice the range
     of all others away from their middle.
     """
-    rows = retained = np.flatnonzero(record.has_reading)
-    while retained.size >= 0.95 * rows.size:
-        displacement, voltage = _readings(record)[np.isin(rows, retained)], record.voltage[retained]
+    rows, readings = np.flatnonzero(record.has_reading), _readings(record)
+    kept = np.ones(rows.size, dtype=np.bool_)
+    while (retained := np.flatnonzero(kept)).size >= 0.95 * rows.size:
+        displacement, voltage = readings[kept], record.voltage[rows[kept]]
         near = spikes(displacement, *_driven(displacement, voltage))
         if not ends:
             others = np.delete(displacement, near)
             far = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
             near = near[far | ((near > 0) & (near < retained.size - 1))]
         if not near.size:
-            return np.setdiff1d(rows, retained)
-        retained = np.delete(retained, near)
+            return rows[~kept]
+        kept[retained[near]] = False
     return rows[:0]
 
 
