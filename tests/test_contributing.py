@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import shutil
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import emcee
 import numpy as np
@@ -109,3 +115,124 @@ def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(
     np.testing.assert_array_equal(end.coords, fit.chain.ends[0].coordinates)
     assert (20, *end.coords.shape) == sampler.get_chain().shape
     assert 0.1 < np.mean(sampler.acceptance_fraction)
+
+
+# What the example of a product imports, and a second product, which is not what was asked for.
+IMPORTS = """
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+import numpy as np
+from bwbayes import Fit, InputError
+from bwbayes.diagnosis.validation import Standing
+from bwbayes.errors import ExitStatus
+from bwbayes.report.report import Product, Report, Text, standing_banner
+from bwbayes.watching import WatchSteps, unwatched, watched
+"""
+SHORT = '''
+class Far(Reach):
+    NAME = "far"
+    shortfall = "it does not move far enough"
+    exit_status = ExitStatus.VALIDATION_INCONCLUSIVE
+
+def far(fit: Fit, least: float, watch: WatchSteps = unwatched) -> Far:
+    """Say whether it moves far."""
+    return Far(least, fit.standing)
+'''
+
+# Runs each command line in one process, and a method beside.
+DRIVER = """
+import contextlib, io, json, pydoc, sys, warnings
+from bwbayes.app import verbs
+verbs.VERBS += (verbs.Verb("my_product:reach"), verbs.Verb("my_product:far"))
+import bwbayes
+from bwbayes.app.commands import cli
+said = []
+for line in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    sys.argv = ["bwbayes", *line.split()]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as end:
+            said.append((end.code, out.getvalue(), err.getvalue()))
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    um = bwbayes.open_run("failed").reach(after=1.0).um
+text = pydoc.plain(pydoc.render_doc(bwbayes.Fit.reach))
+method = um, [str(warning.message) for warning in caught], text
+print(json.dumps((said, method)))
+"""
+
+
+@pytest.fixture(scope="module")
+def product(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, Any], tuple[Any, ...]]:
+    """Return status and outputs of command lines with the example's product, and of its method."""
+    folder = tmp_path_factory.mktemp("product")
+    (folder / "my_product.py").write_text(IMPORTS + example("my_product.py") + SHORT)
+    shutil.copytree(small.finished(tmp_path_factory), folder / "my")
+    shutil.copytree(folder / "my", folder / "failed")
+    numbers = json.loads((folder / "failed/summary.json").read_text())
+    numbers["validation"]["held-out"] |= {
+        "holds": False,
+        "verdict": "held-out: it does not hold",
+    }
+    (folder / "failed/summary.json").write_text(json.dumps(numbers))
+    lines = [
+        "--help",
+        "reach --help",
+        "reach my --after 1 --out out",
+        "reach my --after 1 --out out",
+        "reach my --after 999",
+        "reach my --after x",
+        "reach none",
+        "reach failed --quiet",
+        "far my 3",
+        "far my",
+    ]
+    environment = {**os.environ, "COLUMNS": "100"}
+    command = [sys.executable, "-c", DRIVER, json.dumps(lines)]
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    said, method = json.loads(done.stdout)
+    assert (folder / "out/reach.html").exists()
+    assert (folder / "failed/reach/reach.json").exists()
+    return dict(enumerate(said)), method
+
+
+def test_a_product_gets_its_command(product: tuple[dict[int, Any], tuple[Any, ...]]) -> None:
+    """Its help and progress, its files and exit statuses, and errors of one line."""
+    said, _ = product
+    assert re.search(r"\n  reach +Say how far the actuator moves along its records\.\n", said[0][1])
+    help_text = " ".join(said[1][1].split())
+    assert "reach [OPTIONS] FOLDER Say how far" in help_text
+    assert "Example: bwbayes reach results/my --after 2" in help_text
+    assert "--after FLOAT Time from which on it counts, s. [default: 0.0]" in help_text
+    status, out, err = said[2]
+    assert (0, "") == (status, err)
+    assert re.search(r"It moves by [\d.]+ um\.\n", out)
+    assert "wrote out/reach.json\n" in out
+    refused = {
+        3: "out/reach.json: exists; choose another name, or give `--overwrite`",
+        4: "after: 999 s is behind every record; give less",
+        5: "Invalid value for '--after': 'x' is not a valid float.",
+        6: "none: no run here; start one with `bwbayes run RECORD --out none`",
+        9: "Missing argument 'LEAST'.",
+    }
+    for number, line in refused.items():
+        assert [2, "", f"bwbayes: {line}\n"] == said[number]
+    assert [3, "", "VALIDATION FAILED: held-out: it does not hold\n"] == said[7]
+    status, out, err = said[8]
+    assert (5, "it does not move far enough\n") == (status, err)
+    assert "It moves by 3 um." in out
+
+
+def test_a_product_gets_its_method(product: tuple[dict[int, Any], tuple[Any, ...]]) -> None:
+    """With its help; it warns of what the run's bands do not hold, as the command says it."""
+    said, (um, warned, text) = product
+    assert f"It moves by {um:.3g} um." in said[2][1]
+    assert ["VALIDATION FAILED: held-out: it does not hold"] == warned
+    assert re.search(r"\(fit: [\w.]*Fit, \*, after: float = 0\.0", text)
+    assert "Time from which on it counts, s." in text

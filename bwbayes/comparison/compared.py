@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from bwbayes.comparison.candidates import Candidate
 from bwbayes.diagnosis.validation import Standing
+from bwbayes.errors import ExitStatus
 from bwbayes.report.report import (
     UNKNOWN,
     Banner,
@@ -110,6 +111,18 @@ class Comparison(Product):
         """Whether the bands of the recommended model hold."""
         recommended = None if self.recommended is None else self[self.recommended].standing
         return recommended or Standing()
+
+    @property
+    def shortfall(self) -> str:
+        """Why no model is recommended; empty if one is."""
+        if self.recommended is not None:
+            return ""
+        return "NOT CONVERGED: no model has converged, so none is recommended"
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """Not a success if no model has converged."""
+        return ExitStatus.NOT_CONVERGED if self.shortfall else ExitStatus.SUCCESS
 
     def __getitem__(self, name: str) -> Candidate:
         """Return a model by its name."""

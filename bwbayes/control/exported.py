@@ -14,8 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -32,15 +33,20 @@ from bwbayes.control.sampled import (
     settle,
 )
 from bwbayes.diagnosis.validation import Standing
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.report.outputs import refuse_existing, write_summary
+from bwbayes.report.report import Facts, Product, Report
 from bwbayes.shown import brief
+from bwbayes.watching import Watch, unwatched
+
+FILES = ("model.json", "actuator.c")
 
 
 @dataclass(frozen=True)
-class Exported:
+class Exported(Product):
     """A model of an actuator that is ready for a controller.
 
     Parameters
@@ -59,7 +65,8 @@ class Exported:
         How the validation of the run came out that it is of.
     """
 
-    __repr__ = brief
+    NAME: ClassVar[str] = "model"
+    __repr__ = __str__ = brief
 
     name: str
     model: SampledModel
@@ -67,6 +74,35 @@ class Exported:
     sds: Mapping[str, float]
     without_inverse: str | None
     standing: Standing = field(default_factory=Standing)
+
+    @property
+    def shortfall(self) -> str:
+        """Why it has no inverse; empty if it has one."""
+        return f"no inverse in it: {self.without_inverse}" if self.without_inverse else ""
+
+    def report(self) -> Report:
+        """Return the parts, for a page: the files are all there is to see on a screen."""
+        facts = [(name, str(value)) for name, value in self.numbers()["parts"].items()]
+        return Report(title=self.name, blocks=[Facts(facts)])
+
+    def save(
+        self, folder: str | Path, *, overwrite: bool = False, watch: Watch = unwatched
+    ) -> list[Path]:
+        """Write ``model.json`` and ``actuator.c`` to a folder, and return them.
+
+        Raises
+        ------
+        InputError
+            A file that exists, unless it may be replaced, or that cannot be written.
+        """
+        numbers, code = files = [Path(folder) / name for name in FILES]
+        refuse_existing(files, overwrite=overwrite)
+        with refuse_unwritable(folder, "choose another folder"):
+            numbers.parent.mkdir(parents=True, exist_ok=True)
+            write_summary(numbers, self.numbers())
+            code.write_text(self.c_code(), encoding="ascii")
+        watch(1.0)
+        return files
 
     @property
     def linear(self) -> Any:

@@ -351,6 +351,7 @@ class Product(Shown):
     """A product with a report; its files are called by its ``NAME``."""
 
     NAME: ClassVar[str]
+    remarks: Sequence[str] = ()  # what to know of it, which its report says too
 
     @property
     def shortfall(self) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.jobs.control import FILES
+from bwbayes.control.exported import FILES
 from bwbayes.errors import InputError
 from tests.app.conftest import Type
 

@@ -1,4 +1,4 @@
-"""The command line: a thin layer over the package, and the two commands that print the reference.
+"""The command line: a thin layer over the package.
 
 Exit status 0: success. 2: invalid input, said in one line. 3: converged, but validation failed: the
 bands do not hold on a record that was measured, fitted or not. 4: not converged, or calibration
@@ -16,43 +16,40 @@ import signal
 import sys
 import threading
 import warnings
+from collections import UserDict
 from concurrent.futures import BrokenExecutor
 from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
 from types import FrameType
+from typing import Any
 
 import click
 
-from bwbayes.app.commands.fitting import check, init, report, resume, run
-from bwbayes.app.commands.products import compensate, design, export, predict, track
-from bwbayes.app.commands.shared import WithParts, as_typed
-from bwbayes.app.commands.studies import calibrate, campaign, compare, simulate
+from bwbayes.app.commands.shared import as_typed
+from bwbayes.app.verbs import VERBS, Verb
 from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
 
-
-@click.command()
-@click.argument("key", required=False)
-def config(key: str | None) -> int:
-    """Print the keys of a config: type, unit, default and an example; of all, or of one KEY.
-
-    Example: bwbayes config record.train
-    """
-    from bwbayes.app.config.reference import config_reference
-
-    click.echo(config_reference(key))
-    return 0
+# What does more than a verb, by the module that it is in.
+COMMANDS = {
+    "fitting": ("check", "init", "report", "resume", "run"),
+    "products": ("predict",),
+    "reference": ("config", "models"),
+    "studies": ("calibrate", "campaign", "compare", "simulate"),
+}
 
 
-@click.command(cls=WithParts)
-@click.argument("name", required=False)
-def models(name: str | None) -> int:
-    """Print the parts of a model, or of one NAME its equation, parameters and default priors.
+class Commands(UserDict[str, Any]):
+    """Commands by name, each loaded or made when it is asked for."""
 
-    Example: bwbayes models prandtl-ishlinskii
-    """
-    from bwbayes.app.config.reference import parts_reference
+    def __getitem__(self, name: str) -> click.Command:
+        """Return a command."""
+        source = self.data[name]
+        if isinstance(source, Verb):
+            from bwbayes.app.commands.products import command_of
 
-    click.echo(parts_reference(name))
-    return 0
+            return command_of(source)
+        command: click.Command = getattr(import_module(f"bwbayes.app.commands.{source}"), name)
+        return command
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -66,10 +63,8 @@ def cli() -> None:
     """
 
 
-for command in (init, check, run, resume, predict, report, simulate, calibrate, campaign):
-    cli.add_command(command)
-for command in (compensate, export, track, compare, design, config, models):
-    cli.add_command(command)
+cli.commands = Commands({verb.name: verb for verb in VERBS})
+cli.commands.update({name: module for module, names in COMMANDS.items() for name in names})
 
 
 def _failure(error: BaseException) -> tuple[str, int]:

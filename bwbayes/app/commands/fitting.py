@@ -24,6 +24,7 @@ from bwbayes.app.commands.shared import (
     working,
 )
 from bwbayes.app.running.figure_worker import artist_of
+from bwbayes.app.verbs import Verb
 from bwbayes.errors import (
     ColumnsError,
     InputError,
@@ -84,7 +85,7 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
 @naming_options
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @seed_option
-@options_of("bwbayes.app.fit.calls:fit", "folder", "progress")
+@options_of(Verb("bwbayes.app.fit.calls:fit"))
 @quiet_option
 def run(
     config: Path,
@@ -136,7 +137,7 @@ def run(
 
 @click.command()
 @folder_argument
-@options_of("bwbayes.app.fit.calls:resume", "progress")
+@options_of(Verb("bwbayes.app.fit.calls:resume"))
 @quiet_option
 def resume(folder: Path, quiet: bool, **options: Any) -> int:
     """Resume the run in FOLDER, interrupted or short of its target.

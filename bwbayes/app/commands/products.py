@@ -1,9 +1,9 @@
-"""What is made of a run: ``predict``, ``compensate``, ``design``, ``export`` and ``track``."""
+"""What is made of a run: the commands of verbs, and ``predict``, which writes bands and no page."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,41 +21,72 @@ from bwbayes.app.commands.shared import (
     quiet_option,
     reading_of,
     show_report,
+    type_of,
     working,
+    worse,
 )
-from bwbayes.errors import ColumnsError, ExitStatus, InputError, path_text
+from bwbayes.app.verbs import Verb
+from bwbayes.errors import ColumnsError, InputError, path_text
 
 
-def _saved(
-    module: str,
-    name: str,
-    folder: Path,
-    out: Path,
-    *arguments: Any,
-    overwrite: bool,
-    quiet: bool,
-    **options: Any,
-) -> int:
-    """Do a job with the run in a folder, save and show its product; return the exit status."""
-    with working() as watch:
-        from bwbayes.app.fit.fitted import converged
-        from bwbayes.report.outputs import refuse_existing
+def command_of(verb: Verb) -> click.Command:
+    """Return the command of a verb: it saves and shows what the verb makes of the run in FOLDER."""
+    words = _words(verb)
+    below = verb.below or verb.name
+    # What is told of the file that it reads, if it reads one.
+    files = [word for word in words if word.type is FILE]
+    told = files if any(name == "reading" for name, *_ in verb.options()) else []
 
-        # What takes long is refused at once, and every single file when it is saved.
-        refuse_existing([out / f"{name}.json"], overwrite=overwrite)
-        job = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
-        try:
-            product = job(converged(folder), *arguments, watch=watch, **options)
-        except ColumnsError as error:
-            raise error.in_command(command_as_typed()) from None
-        files = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
-        report = product.report()
-    status = present(report, files, product.standing, quiet=quiet)
-    if quiet and product.shortfall:
-        click.echo(product.shortfall, err=True)
-    # The worse of the two: a failure, then what is uncertain.
-    endings = (ExitStatus.VALIDATION_FAILED, ExitStatus.VALIDATION_INCONCLUSIVE)
-    return next((end for end in endings if end in (status, product.exit_status)), status)
+    def command(
+        folder: Path, out: Path | None, overwrite: bool, quiet: bool, **options: Any
+    ) -> int:
+        for file in told:
+            options["reading"] = reading_of(options, options[str(file.name)], file.opts[0])
+        given = [options.pop(str(word.name)) for word in words]
+        arguments = [value for value in given if value is not None]
+        if verb.either and len(arguments) != 1:
+            raise InputError(f"{verb.name}: give either {' or '.join(verb.either.values())}")
+        stem = "".join(Path(str(value)).stem for value in arguments)
+        out = out or folder / below.replace("NAME", stem)
+        with working() as watch:
+            from bwbayes.app.fit.fitted import converged
+            from bwbayes.report.outputs import refuse_existing
+
+            # What takes long is refused at once, and every single file when it is saved.
+            kind = verb.load(verb.product)
+            refuse_existing([out / f"{kind.NAME}.json"], overwrite=overwrite)
+            fit = converged(folder)
+            try:
+                product = verb.load()(fit, *arguments, watch=watch, **options)
+            except ColumnsError as error:
+                raise error.in_command(command_as_typed()) from None
+            files = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
+        return present(product, files, fit.standing, quiet=quiet)
+
+    where = f"Where the files go; default: FOLDER/{below}."
+    out_option = click.Option(["--out"], type=FILE, help=where)
+    first = [click.Argument(["folder"], type=FILE), *words, out_option]
+    options = options_of(verb, "overwrite", "reading")
+    about, *example = verb.help
+    text = [about, "FOLDER has the run, with whose status the command ends.", *example]
+    decorated = options(overwrite_option(quiet_option(command)))
+    if told:
+        decorated = column_options(decorated)
+    return click.command(verb.name, params=first, help="\n\n".join(text))(decorated)
+
+
+def _words(verb: Verb) -> list[click.Parameter]:
+    """Return what gives a verb's arguments after the fit: words, or what it says instead."""
+    words: list[click.Parameter] = []
+    for name, hint in verb.words.items():
+        kind = type_of(name, hint)
+        for way, text in zip(verb.either or [name], verb.sentences(name), strict=False):
+            flag, _, value = way.partition(" ")
+            if flag.startswith("--"):
+                words.append(click.Option([flag], type=FILE if value else str, help=text))
+            else:
+                words.append(click.Argument([flag.lower()], required=not verb.either, type=kind))
+    return words
 
 
 @click.command()
@@ -65,7 +96,7 @@ def _saved(
 )
 @naming_options
 @options_of(
-    "bwbayes.app.jobs.predict:predict", "name", "table", "displacement_file", "own_offset", "watch"
+    Verb("bwbayes.app.jobs.predict:predict"), "name", "table", "displacement_file", "own_offset"
 )
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
@@ -103,7 +134,7 @@ def predict(
         from bwbayes.app.jobs.predict import write_prediction
         from bwbayes.record import Record, read_record
         from bwbayes.report.outputs import refuse_existing
-        from bwbayes.report.report import Report, remarks_banner, standing_banner
+        from bwbayes.report.report import remarks_banner, standing_banner
 
         refuse_existing(files, overwrite=overwrite)
         fit = converged(folder)
@@ -133,117 +164,8 @@ def predict(
             "demagnetized, say --from-rest"
         )
     banners = [*standing_banner(fit.standing), *remarks_banner(remarks)]
-    show_report(Report(title=name, banners=banners))
-    # The worse of the two.
-    own = bands.standing.holds is False or fit.standing.holds
-    worse = bands.standing if own else fit.standing
-    return present(bands.report(), files, worse)
-
-
-@click.command()
-@folder_argument
-@click.argument(
-    "shape", required=False, type=click.Choice(["sine", "triangle", "staircase", "raster"])
-)
-@click.option(
-    "--reference", type=FILE, help="A file with time and displacement, in place of SHAPE."
-)
-@column_options
-@options_of("bwbayes.app.jobs.control:compensate", "reading", "watch", smoothed="smooth")
-@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/compensation/NAME.")
-@overwrite_option
-@quiet_option
-def compensate(
-    folder: Path, shape: str | None, reference: Path | None, out: Path | None, **options: Any
-) -> int:
-    """Compute the voltage command for a reference displacement, with the run in FOLDER.
-
-    The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
-    zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
-    voltage will do is predicted with its error; beside it stands what a linear command would do.
-    Exit status 3: a --limit is exceeded more probably than not; 5: it is kept at less than 95%.
-
-    Example: bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
-    """
-    requested = shape or reference
-    if requested is None or (shape and reference):
-        raise InputError("compensate: give either a shape or --reference")
-    options["reading"] = reading_of(options, reference, "--reference")
-    out = out or folder / "compensation" / Path(requested).stem
-    return _saved("control", "compensate", folder, out, requested, **options)
-
-
-@click.command()
-@folder_argument
-@click.option("--parameter", help="The parameter to know better.")
-@click.option(
-    "--drive", type=FILE, help="Or the drive whose band is to be narrow: a record or a signal."
-)
-@column_options
-@options_of("bwbayes.app.jobs.design:design", "reading", "watch")
-@click.option("--out", type=FILE, help="Where the best goes; default: FOLDER/design.")
-@overwrite_option
-@quiet_option
-def design(
-    folder: Path, parameter: str | None, drive: Path | None, out: Path | None, **options: Any
-) -> int:
-    """Rank input signals by the expected reduction in posterior SD, from the run in FOLDER.
-
-    What would be left of a parameter's standard deviation, or of a band's width along a drive,
-    after one more record; the best signal within the amplifier's limits goes into best.csv.
-
-    Example: bwbayes design results/ring_bender --parameter beta --slew 2000
-    """
-    target = parameter or drive
-    if target is None or (parameter and drive):
-        raise InputError("design: give either a parameter or a drive")
-    options["reading"] = reading_of(options, drive, "--drive")
-    return _saved("design", "design", folder, out or folder / "design", target, **options)
-
-
-@click.command()
-@folder_argument
-@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/export.")
-@options_of("bwbayes.app.jobs.control:export")
-def export(folder: Path, out: Path | None, **options: Any) -> int:
-    """Write the model of the run in FOLDER for a controller: JSON, and C with its inverse.
-
-    It is the posterior's mean. The C file needs math.h alone and does a sample a call; its head
-    says which sample, and what a value does that is not a number. 0 um is where the demagnetized
-    actuator stands at zero volts.
-
-    Example: bwbayes export results/ring_bender --rate 1000
-    """
-    out = out or folder / "export"
-    with working():
-        from bwbayes.app.fit.fitted import converged
-        from bwbayes.app.jobs.control import FILES
-        from bwbayes.app.jobs.control import export as write
-
-        model = write(converged(folder), out, **options)
-    for line in model.standing.said:
-        click.echo(line, err=True)
-    if model.without_inverse is not None:
-        click.echo(f"bwbayes: no inverse in it: {model.without_inverse}", err=True)
-    for name in FILES:
-        click.echo(f"wrote {out / name}")
-    return model.standing.exit_status
-
-
-@click.command()
-@folder_argument
-@click.option("--out", type=FILE, help="Where the files go; default: FOLDER/track.")
-@options_of("bwbayes.app.jobs.control:track", "watch", frequencies="frequency")
-@overwrite_option
-@quiet_option
-def track(folder: Path, out: Path | None, **options: Any) -> int:
-    """Simulate closed-loop tracking with the run in FOLDER: open loop, feedforward, PID, and both.
-
-    On the virtual test stand, with every draw of the posterior for actuator, and the paper's
-    signals: a linear command, the mean model's inverse (feedforward), a PID controller, and both
-    together. 0 um is where the demagnetized actuator stands at zero volts; the default voltages
-    are those fitted and 0 V.
-
-    Example: bwbayes track results/ring_bender --frequency 1 --frequency 10
-    """
-    return _saved("control", "track", folder, out or folder / "track", **options)
+    report = bands.report()
+    show_report(replace(report, banners=[*banners, *report.banners]))
+    for path in files:
+        click.echo(f"wrote {path}")
+    return worse(fit.standing.exit_status, bands.standing.exit_status)

@@ -17,7 +17,6 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +25,13 @@ from click.core import ParameterSource
 from rich.console import Console
 
 from bwbayes.app.config import LARGEST_SEED
+from bwbayes.app.verbs import Verb
 from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.running.progress import StepProgress
     from bwbayes.diagnosis.validation import Standing
-    from bwbayes.report.report import Report
+    from bwbayes.report.report import Product, Report
 
 type AnyCommand = Callable[..., Any]
 
@@ -52,38 +52,9 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but err
 seed_option = click.option("--seed", type=RANGES["seed"], help="Seed, instead of the config's.")
 
 
-def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyCommand], AnyCommand]:
-    """Return a decorator that adds a function's keyword arguments to a command as options.
-
-    Parameters
-    ----------
-    function
-        Where it is defined: ``"package.module:name"``; a method goes by its name too.
-    omitted
-        Arguments that are no options.
-    flags
-        Options that are called otherwise than their arguments.
-    """
-    module, _, name = function.partition(":")
-    spec = find_spec(module)
-    source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
-    (defined,) = (
-        node
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.FunctionDef) and node.name == name
-    )
-    # The description of each parameter, of which the first sentence counts.
-    section = (ast.get_docstring(defined) or "").partition("Parameters\n----------\n")[2]
-    section = re.split(r"\n\w+\n-+\n", section)[0]
-    texts: dict[str, str] = {}
-    for names, text in re.findall(r"^(\S.*)\n((?: {4}.*(?:\n|$))+)", section, re.MULTILINE):
-        first = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.replace("``", "").split()))[0]
-        texts |= dict.fromkeys(names.split(", "), first)
-    arguments = [
-        (argument.arg, ast.unparse(argument.annotation), ast.literal_eval(default))
-        for argument, default in zip(defined.args.kwonlyargs, defined.args.kw_defaults, strict=True)
-        if argument.annotation and default and argument.arg not in omitted
-    ]
+def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:
+    """Return a decorator that adds a function's keyword arguments, but some, as options."""
+    keywords = [keyword for keyword in verb.options() if keyword[0] not in omitted]
 
     def decorate(command: AnyCommand) -> AnyCommand:
         @wraps(command)
@@ -98,13 +69,23 @@ def options_of(function: str, *omitted: str, **flags: str) -> Callable[[AnyComma
 
         decorated: AnyCommand = usable
         # The first decorator of a command is applied last.
-        for key, hint, default in reversed(arguments):
-            flag = flags.get(key, key).replace("_", "-")
-            option = _option(flag, key, hint.removesuffix(" | None"), default, texts[key])
-            decorated = option(decorated)
+        for key, hint, default, text in reversed(keywords):
+            flag = verb.flags.get(key, key).replace("_", "-")
+            decorated = _option(flag, key, hint, default, text)(decorated)
         return decorated
 
     return decorate
+
+
+def type_of(name: str, hint: str) -> Any:
+    """Return the type of an argument with a type hint, as click has it; None if it is a text."""
+    if name in RANGES:
+        return RANGES[name]
+    choices = re.search(r"Literal(\[.*?\])", hint)
+    if choices:
+        return click.Choice(ast.literal_eval(choices[1]))
+    types = {"tuple[float, float]": (float, float), "tuple[float, ...]": float}
+    return {**types, "float": float, "int": int}.get(hint)
 
 
 def _option(
@@ -114,19 +95,15 @@ def _option(
     if hint == "bool":
         flags = f"--{flag}/--no-{flag}" if default else f"--{flag}"
         return click.option(flags, key, is_flag=True, default=default, help=text)
-    kinds: dict[str, dict[str, Any]] = {
-        "tuple[float, float]": {"type": (float, float), "metavar": "FROM TO"},
-        "tuple[float, ...]": {"type": float, "multiple": True},
-        "float": {"type": float},
-        "int": {"type": int},
-    }
-    options = kinds.get(hint, {})
-    if hint.startswith("Literal"):
-        options = {"type": click.Choice(ast.literal_eval(hint.removeprefix("Literal")))}
-    if key in RANGES:
-        options = {"type": RANGES[key]}
     return click.option(
-        f"--{flag}", key, default=default, show_default=default is not None, help=text, **options
+        f"--{flag}",
+        key,
+        type=type_of(key, hint),
+        metavar="FROM TO" if hint == "tuple[float, float]" else None,
+        multiple=hint == "tuple[float, ...]",
+        default=default,
+        show_default=default is not None,
+        help=text,
     )
 
 
@@ -287,17 +264,26 @@ def require_new_or_resumed(
 
 
 def present(
-    report: Report, files: Sequence[Path], standing: Standing, *, quiet: bool = False
+    product: Product, files: Sequence[Path], standing: Standing, *, quiet: bool = False
 ) -> int:
-    """Show what came of a run and the files of it; return the exit status of that run."""
-    if quiet:
-        for line in standing.said:
-            click.echo(line, err=True)
-    else:
+    """Show a product of a run and its files; return the worse of the run's and its own status."""
+    report = product.report()
+    if not quiet:
         show_report(report)
         for path in files:
             click.echo(f"wrote {path}")
-    return standing.exit_status
+    # Where no banner says it.
+    for line in standing.said if quiet or not report.banners else ():
+        click.echo(line, err=True)
+    if product.shortfall and (quiet or product.shortfall not in product.remarks):
+        click.echo(product.shortfall, err=True)
+    return worse(standing.exit_status, product.exit_status)
+
+
+def worse(*statuses: ExitStatus) -> ExitStatus:
+    """Return the worst: invalid input, what has not converged, a failure, what is uncertain."""
+    order = (2, 4, 3, 5)
+    return min(statuses, key=lambda status: (*order, status).index(status))
 
 
 def finish(path: Path, *, quiet: bool, **options: Any) -> int:

@@ -21,12 +21,13 @@ from bwbayes.app.commands.shared import (
     working,
 )
 from bwbayes.app.config import USUAL_MODELS
+from bwbayes.app.verbs import Verb
 from bwbayes.errors import ExitStatus
 
 
 @click.command()
 @click.argument("out", type=FILE)
-@options_of("bwbayes.app.jobs.simulate:simulate")
+@options_of(Verb("bwbayes.app.jobs.simulate:simulate"))
 def simulate(out: Path, **options: Any) -> int:
     """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
 
@@ -47,7 +48,7 @@ def simulate(out: Path, **options: Any) -> int:
 @click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
 @seed_option
 @click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
-@options_of("bwbayes.app.jobs.calibrate:resume")
+@options_of(Verb("bwbayes.app.jobs.calibrate:resume"))
 @quiet_option
 def calibrate(
     config: Path | None,
@@ -105,7 +106,7 @@ def calibrate(
 @click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
 @options_of(
-    "bwbayes.app.fit.calls:campaign", "config", "folder", "overwrite", "pictures", "progress"
+    Verb("bwbayes.app.fit.calls:campaign"), "config", "folder", "overwrite", "pictures", "progress"
 )
 @quiet_option
 def campaign(
@@ -155,7 +156,7 @@ def campaign(
 @click.argument("paths", type=FILE, nargs=-1, required=True)
 @click.option("--models", help=f"Models to fit to a CONFIG's record; default: {USUAL_MODELS}.")
 @click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
-@options_of("bwbayes.app.fit.calls:compare", "models", "folder", "progress")
+@options_of(Verb("bwbayes.app.fit.calls:compare"), "models")
 @quiet_option
 def compare(
     paths: tuple[Path, ...], models: str | None, out: Path | None, quiet: bool, **options: Any
@@ -176,10 +177,4 @@ def compare(
     alone = len(paths) == 1 and not paths[0].is_dir()
     out = out or Path("results") / (f"{paths[0].stem}-comparison" if alone else "comparison")
     comparison = compare_runs(*paths, models=models, folder=out, progress=not quiet, **options)
-    # What does not hold is among what speaks against the recommendation.
-    page = out / "comparison.html"
-    status = present(comparison.report(), [page], comparison.standing, quiet=quiet)
-    if comparison.recommended is None:
-        click.echo("NOT CONVERGED: no model has converged, so none is recommended", err=True)
-        return ExitStatus.NOT_CONVERGED
-    return status
+    return present(comparison, [out / "comparison.html"], comparison.standing, quiet=quiet)

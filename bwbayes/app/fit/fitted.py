@@ -10,7 +10,6 @@ import shutil
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from types import MethodType
 from typing import TYPE_CHECKING, Any, Self, cast
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.verbs import VERBS, Verb
 from bwbayes.errors import InputError, NotConvergedError
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import draws, log_densities
@@ -44,17 +44,16 @@ if TYPE_CHECKING:
     from bwbayes.sampling.diagnostics import Outcome
 
 
-class _JobOf:
-    """A job as the method of a fit, as ``at_work`` makes it, loaded when it is asked for."""
+class _Method:
+    """A verb as the method of a fit, loaded when it is asked for."""
 
-    def __init__(self, module: str, name: str, *, carried: bool = True) -> None:
-        self.module, self.name, self.carried = module, name, carried
+    def __init__(self, verb: Verb) -> None:
+        self.verb = verb
 
     def __get__(self, fit: Fit | None, _: object = None) -> Any:
         from bwbayes.app.jobs.at_work import at_work
 
-        job = getattr(import_module(f"bwbayes.app.jobs.{self.module}"), self.name)
-        method = at_work(job, carried=self.carried)
+        method = at_work(self.verb.load())
         return method if fit is None else MethodType(method, fit)
 
 
@@ -287,17 +286,13 @@ class Fit(Shown):
 
         return Plots(self)
 
+    # Every verb is a method, see below. Type checkers do not run that, and see these.
     if TYPE_CHECKING:
         predict = at_work(predict_record)
         compensate = at_work(compensate_fit)
         design = at_work(design_fit)
         export = at_work(export_fit)
         track = at_work(track_fit)
-    else:
-        predict = _JobOf("predict", "predict", carried=False)
-        design = _JobOf("design", "design")
-        compensate = _JobOf("control", "compensate")
-        export, track = _JobOf("control", "export"), _JobOf("control", "track")
 
     def compare(self, *others: Fit, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.
@@ -370,6 +365,10 @@ class Fit(Shown):
         from bwbayes.report.run import run_report
 
         return run_report(self.result, self.numbers)
+
+
+for verb in VERBS:
+    setattr(Fit, verb.name, _Method(verb))
 
 
 def finished(folder: RunFolder) -> Fit:

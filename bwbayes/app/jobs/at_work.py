@@ -26,11 +26,12 @@ from bwbayes.model.operator import Span
 
 
 def at_work[**P, R](
-    job: Callable[Concatenate[Fit, P], R], *, carried: bool = True
+    job: Callable[Concatenate[Fit, P], R],
 ) -> Callable[Concatenate[Fit, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints.
 
-    Of what the run's bands do not hold if that is ``carried``, and of its product's notes.
+    It warns of what the run's bands do not hold, unless its product has bands to judge, and of its
+    product's notes.
     """
     options = [*signature(job).parameters][1:]
 
@@ -40,8 +41,9 @@ def at_work[**P, R](
             if name not in options:
                 raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")
         fit.require_converged()
-        warn(fit.standing.said if carried else (), 3)
         product = job(fit, *args, **kwargs)
+        if getattr(product, "standing", fit.standing) is fit.standing:
+            warn(fit.standing.said, 3)
         warn(getattr(product, "notes", getattr(product, "remarks", ())), 3)
         return product
 

@@ -33,22 +33,19 @@ from bwbayes.control.references import SHAPES, Reference, shaped
 from bwbayes.control.tracking import Tracking
 from bwbayes.control.tracking import track as tracked
 from bwbayes.diagnosis.extrapolation import beyond_training
-from bwbayes.errors import InputError, refuse_unwritable, suggestion
+from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thinned
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference
-from bwbayes.report.outputs import refuse_existing, write_summary
 from bwbayes.watching import WatchSteps, unwatched
-
-FILES = ("model.json", "actuator.c")  # of an export
 
 
 def compensate(
     fit: Fit,
-    reference: Any,
+    reference: Literal["sine", "triangle", "staircase", "raster"] | Any,
     *,
     amplitude: float | None = None,
     frequency: float | None = None,
@@ -69,21 +66,21 @@ def compensate(
     reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Compensation:
-    """Return the voltage for a displacement, and its predicted error.
+    """Compute the voltage command for a reference displacement, and its predicted error.
 
-    ``fit.compensate("triangle", amplitude=30, frequency=1)`` is what
-    ``bwbayes compensate FOLDER triangle --amplitude 30 --frequency 1`` writes.
+    The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
+    zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
+    voltage will do is predicted with its error; beside it stands what a linear command would do.
+    Exit status 3: the limit is exceeded more probably than not; 5: it is kept at less than 95%.
 
     Parameters
     ----------
     fit
         What is built on; of several records the first, and a thousand of the draws.
     reference
-        What the displacement is to be: one of the shapes ``"sine"``, ``"triangle"``,
-        ``"staircase"`` and ``"raster"``; a file with time and displacement; displacements
-        (samples,), um; or the ``reference`` of an earlier command. 0 um is where the actuator
-        stands at zero volts as the command begins: there a command begins too, and a reference
-        that begins elsewhere gets a way from there before it.
+        The shape of the displacement. A file with time and displacement, in place of SHAPE. In
+        Python also displacements (samples,), um, or the ``reference`` of an earlier command. One
+        that begins elsewhere than at 0 um gets a way from there before it.
     amplitude
         Amplitude of the shape, um.
     frequency
@@ -135,6 +132,12 @@ def compensate(
     -----
     InputWarning
         A reference that was smoothed or led to, a command beyond what was fitted.
+
+    Examples
+    --------
+    ``fit.compensate("sine", amplitude=40, frequency=1, from_rest=True)`` is what this writes::
+
+        bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
     problem, seed = fit.problem, fit.problem.config.seed
     span = limits_of(problem, voltage, 0.0)
@@ -242,19 +245,19 @@ def _reference(
 
 def export(
     fit: Fit,
-    folder: str | Path,
+    folder: str | Path | None = None,
     *,
     voltage: tuple[float, float] | None = None,
     rate: float | None = None,
     hold: str = "zoh",
     overwrite: bool = False,
+    watch: WatchSteps = unwatched,
 ) -> Exported:
-    """Write the posterior's mean model for a controller: ``model.json`` and ``actuator.c``.
+    """Write the model for a controller: JSON, and C with its inverse.
 
-    0 um is where the demagnetized actuator stands at zero volts. With ``hold="zoh"`` the inverse is
-    for the next sample: forward of inverse is one sample late. In C a value that is not a number
-    holds the last voltage, and the state says so. What is returned has the ``linear`` part as a
-    discrete ``scipy.signal`` system.
+    It is the posterior's mean. The C file needs math.h alone and does a sample a call; its head
+    says which sample, and what a value does that is not a number. 0 um is where the demagnetized
+    actuator stands at zero volts.
 
     Parameters
     ----------
@@ -262,16 +265,19 @@ def export(
         What is built on; of several records the first, as what belongs to a record matters little
         to a controller.
     folder
-        Where the files go.
+        Where the files go, ``model.json`` and ``actuator.c``; by default nothing is written.
     voltage
         Lowest and highest voltage of the inverse, V; default: what was fitted, and 0 V.
     rate
         The controller's samples a second; default: the record's.
     hold
         Voltage between samples: held, as a DAC does (zoh), or straight lines (foh). The latter is
-        for a model beside a measured voltage; neither need be that of the record.
+        for a model beside a measured voltage; neither need be that of the record. With zoh the
+        inverse is for the next sample: forward of inverse is one sample late.
     overwrite
         Replace existing files.
+    watch
+        Called with the name of a step and the share of it that is done.
 
     Raises
     ------
@@ -280,6 +286,13 @@ def export(
     InputError
         A hysteresis that has no step of bounded time, options that make no sense, or files that
         exist or cannot be written.
+
+    Examples
+    --------
+    ``fit.export("controller", rate=1000)`` returns the model, its ``linear`` part as a discrete
+    ``scipy.signal`` system, and writes what this writes::
+
+        bwbayes export results/ring_bender --rate 1000
     """
     problem, posterior = fit.problem, fit.problem.posterior
     dataset, theta = posterior.datasets[0], posterior.prior.theta(fit.flat_draws)
@@ -289,12 +302,8 @@ def export(
     name = problem.config.name or problem.record.origin
     model = exported(name, actuator, theta.mean(axis=0), limits_of(problem, voltage, 0.0), sds)
     model = replace(model, standing=fit.standing)
-    numbers, code = (Path(folder) / name for name in FILES)
-    refuse_existing([numbers, code], overwrite=overwrite)
-    with refuse_unwritable(folder, "choose another folder"):
-        numbers.parent.mkdir(parents=True, exist_ok=True)
-        write_summary(numbers, model.numbers())
-        code.write_text(model.c_code(), encoding="ascii")
+    if folder is not None:
+        model.save(folder, overwrite=overwrite, watch=partial(watch, "files"))
     return model
 
 
@@ -322,7 +331,12 @@ def track(
     draws: int = 200,
     watch: WatchSteps = unwatched,
 ) -> Tracking:
-    """Say how well a closed loop would follow the paper's signals, with and without the model.
+    """Simulate closed-loop tracking: open loop, feedforward, PID, and both.
+
+    On the virtual test stand, with every draw of the posterior for actuator, and the paper's
+    signals: a linear command, the mean model's inverse (feedforward), a PID controller, and both
+    together. 0 um is where the demagnetized actuator stands at zero volts; the default voltages
+    are those fitted and 0 V.
 
     Parameters
     ----------
@@ -354,6 +368,12 @@ def track(
         The sampling has not converged.
     InputError
         A model that cannot be stepped or inverted, or options that make no sense.
+
+    Examples
+    --------
+    ::
+
+        bwbayes track results/ring_bender --frequency 1 --frequency 10
     """
     if not 0 <= delay <= 100:
         raise InputError(f"delay: {delay} samples; give 0 to 100")

@@ -54,15 +54,18 @@ def design(
     reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Design:
-    """Rank signals by what they would leave of an sd, or of a band's width; the best first.
+    """Rank input signals by the expected reduction in posterior SD.
+
+    What would be left of a parameter's standard deviation, or of a band's width along a drive,
+    after one more record; the best signal within the amplifier's limits goes into best.csv.
 
     Parameters
     ----------
     fit
         What is built on.
     target
-        A parameter's name; or a drive whose parameter band is to be narrow: voltages (samples,), V,
-        or the ``Path`` of a record's file, or of a signal's name.
+        The parameter to know better. Or the drive whose band is to be narrow: a record or a signal.
+        In Python the ``Path`` of a record's file or of a signal's name, or voltages (samples,), V.
     candidates
         A TOML file with a table for each signal, or the preset. Its keys are those of a config's
         [record.signal]. In Python also voltages (samples,) by name, V, at the fitted record's
@@ -88,6 +91,12 @@ def design(
     InputError
         A target that is not a free parameter of the actuator, candidates that cannot be read, or
         none that the amplifier can make.
+
+    Examples
+    --------
+    ``fit.design("beta", slew=2000)`` ranks as this does::
+
+        bwbayes design results/ring_bender --parameter beta --slew 2000
     """
     problem = fit.problem
     low, high = voltage or limits_of(problem, None)

@@ -1,0 +1,124 @@
+"""What can be asked of a run, a line each: commands, methods and their help are made of these.
+
+A verb is a function of a ``fit`` and a ``watch`` that returns a
+:class:`~bwbayes.report.report.Product`. Its command takes the FOLDER of a run, shows how far it is,
+saves and shows the product, and ends with the worse of the run's and the product's status. Its
+method of :class:`bwbayes.Fit` warns of what the command shows. Positional arguments are words,
+keyword arguments are options of the same names, types and defaults. The docstring is the help: what
+stands before the parameters, of each parameter the first sentence, and the first command among the
+examples.
+
+All that is read from the source: to load it takes a second, for which neither ``--help`` nor
+completion should wait.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A function, and what the command line calls otherwise.
+
+    Parameters
+    ----------
+    place
+        Where it is: ``"package.module:name"``.
+    flags
+        Options that are called otherwise than their arguments.
+    either
+        Of several ways to give the argument after the fit the one that is meant: a word, an option,
+        or an option with a FILE; and what each is called where none or two are given. The
+        argument's description has a sentence for each.
+    below
+        Where below FOLDER the files go, if not where the verb says; NAME is that of the argument.
+    """
+
+    place: str
+    flags: Mapping[str, str] = field(default_factory=dict)
+    either: Mapping[str, str] = field(default_factory=dict)
+    below: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of function, command and method."""
+        return self.place.partition(":")[2]
+
+    def load(self, name: str = "") -> Any:
+        """Return the function itself, or what has another name in its module."""
+        return getattr(import_module(self.place.partition(":")[0]), name or self.name)
+
+    @cached_property
+    def _source(self) -> ast.FunctionDef:
+        spec = find_spec(self.place.partition(":")[0])
+        text = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
+        functions = (node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
+        return next(function for function in functions if function.name == self.name)
+
+    @cached_property
+    def _sections(self) -> dict[str, str]:
+        """The sections of the docstring by their titles; the first one has none."""
+        text = (ast.get_docstring(self._source) or "").replace("``", "")
+        first, *others = re.split(r"\n\n(\w+)\n-{3,}\n", text)
+        return {"": first, **dict(zip(others[::2], others[1::2], strict=True))}
+
+    @property
+    def help(self) -> list[str]:
+        """The paragraphs before the parameters, and the first command among the examples."""
+        found = re.search(r"^ *(bwbayes .*)", self._sections.get("Examples", ""), re.MULTILINE)
+        return [self._sections[""], *([f"Example: {found[1]}"] if found else [])]
+
+    def sentences(self, parameter: str) -> list[str]:
+        """Return what is said of a parameter."""
+        lines = rf"^(?:.*, )?{parameter}(?:, .*)?\n((?: {{4}}.*(?:\n|$))+)"
+        found = re.search(lines, self._sections.get("Parameters", ""), re.MULTILINE)
+        return re.split(r"(?<=\.) (?=[A-Z])", " ".join(found[1].split()) if found else "")
+
+    @property
+    def product(self) -> str:
+        """The type of what it returns."""
+        return ast.unparse(self._source.returns) if self._source.returns else ""
+
+    @property
+    def words(self) -> dict[str, str]:
+        """The type hints of the arguments without a default after the fit."""
+        args = self._source.args
+        required = args.args[1 : len(args.args) - len(args.defaults)]
+        return {arg.arg: ast.unparse(arg.annotation) for arg in required if arg.annotation}
+
+    def options(self) -> Iterator[tuple[str, str, Any, str]]:
+        """Yield name, type hint, default and help of the keyword arguments.
+
+        All but those that every command has otherwise: ``--out``, ``--quiet`` and its progress.
+        """
+        args = self._source.args
+        for arg, default in zip(args.kwonlyargs, args.kw_defaults, strict=True):
+            if arg.annotation and default and arg.arg not in ("folder", "progress", "watch"):
+                hint = ast.unparse(arg.annotation).removesuffix(" | None")
+                yield arg.arg, hint, ast.literal_eval(default), self.sentences(arg.arg)[0]
+
+
+VERBS = (
+    Verb("bwbayes.app.jobs.predict:predict"),
+    Verb(
+        "bwbayes.app.jobs.control:compensate",
+        flags={"smoothed": "smooth"},
+        either={"SHAPE": "a shape", "--reference FILE": "--reference"},
+        below="compensation/NAME",
+    ),
+    Verb(
+        "bwbayes.app.jobs.design:design",
+        either={"--parameter": "a parameter", "--drive FILE": "a drive"},
+    ),
+    Verb("bwbayes.app.jobs.control:export"),
+    Verb("bwbayes.app.jobs.control:track", flags={"frequencies": "frequency"}),
+)
