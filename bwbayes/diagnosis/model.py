@@ -33,13 +33,13 @@ def nonlinearity(scene: Scene) -> Iterator[Explanation]:
     present = set(gain.terms) if gain else set()
     for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
-            yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", {"gain": terms})
+            yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", terms)
 
 
 def creep(scene: Scene) -> Iterator[Explanation]:
     """Try slow lags."""
     if scene.posterior.only.actuator.creep is None:
-        yield from _changed(scene, "creep", {"creep": True})
+        yield from _changed(scene, "creep", ("creep",))
 
 
 def dynamics(scene: Scene) -> Iterator[Explanation]:
@@ -51,7 +51,7 @@ def dynamics(scene: Scene) -> Iterator[Explanation]:
     yield from _changed(
         scene,
         "second-order dynamics",
-        {"dynamics": "second-order"},
+        ("second-order",),
         stated={
             "mass": Stated(fixed=1.0),
             "stiffness": Stated(lognormal(stiffness, 2.0)),
@@ -67,9 +67,8 @@ def stages(scene: Scene) -> Iterator[Explanation]:
     for name, make in STAGES.items():
         if name in present:
             continue
-        stage, changes = make(), {"stages": (*present, name)}
-        kind = name.replace("-", " ")
-        yield from _changed(scene, stage.describe, changes, kind, stage.advice, starts=stage.starts)
+        stage, kind = make(), name.replace("-", " ")
+        yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
 
 
 def hold(scene: Scene) -> Iterator[Explanation]:
@@ -78,7 +77,7 @@ def hold(scene: Scene) -> Iterator[Explanation]:
     text = "voltage that is held between samples"
     if other == "first":
         text = "voltage that changes steadily between samples"
-    yield from _changed(scene, text, {"hold": other}, "hold")
+    yield from _changed(scene, text, (), "hold", hold=other)
 
 
 def operator(scene: Scene) -> Iterator[Explanation]:
@@ -90,7 +89,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         kind = f"operator {name}"
         if scene.study is None or HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
-        spec = scene.study.spec.with_parts(hysteresis=name)
+        spec = scene.study.spec.with_stage(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
         # One start finds the best place for nearly all records, in half of the time of five.
         places = map_estimate.valleys(posterior, scene.generator, 1)
@@ -103,28 +102,33 @@ def operator(scene: Scene) -> Iterator[Explanation]:
 def smooth(scene: Scene) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
     if isinstance(scene.posterior.only.noise, DiscrepancyNoise) and scene.before is None:
-        yield from _changed(scene, "a smooth discrepancy", {"noise": "smooth"}, noise=True)
+        facts = {"noise": True}
+        yield from _changed(scene, "a smooth discrepancy", (), facts=facts, noise="smooth")
 
 
 def _changed(
     scene: Scene,
     text: str | Callable[[Mapping[str, float]], str],
-    changes: Mapping[str, object],
+    stages: Sequence[str],
     kind: str = "",
     advice: str = "",
     stated: Mapping[str, Stated] = MappingProxyType({}),
     starts: Sequence[Mapping[str, float]] = ({},),
-    **facts: Any,
+    facts: Mapping[str, Any] = MappingProxyType({}),
+    **parts: str,
 ) -> Iterator[Explanation]:
-    """Fit the changed model from the mode; its new parameters start at their priors' medians.
+    """Fit the model with further stages from the mode; new parameters start at their medians.
 
     ``text`` says what was found, of the parameters' values by name, if it hangs on them; ``advice``
-    is what else can be done. ``facts`` are other fields of the explanation.
+    is what else can be done. ``parts`` are another noise or hold; ``facts`` are other fields of the
+    explanation.
     """
     kind = kind or str(text)
     if scene.study is None or not scene.looks_for(kind):
         return
-    spec = scene.study.spec.with_parts(**changes)
+    spec = scene.study.spec.with_parts(**parts)
+    for name in stages:
+        spec = spec.with_stage(name)
     posterior = scene.rebuilt(scene.study.with_model(spec, stated))
     places = []
     for coordinates, start in product(scene.places, starts):

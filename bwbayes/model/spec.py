@@ -16,11 +16,11 @@ from typing import Any, NamedTuple, Self
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep, creep_times
-from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import HYSTERESIS, OPTIONS, STAGES, made
-from bwbayes.model.stage import Stage
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, choose, made
+from bwbayes.model.stage import Side, Stage
 
 
 class Extent(NamedTuple):
@@ -104,9 +104,57 @@ class ModelSpec:
             tuple(made("model.stages", name, STAGES, {}, Stage) for name in self._in_order),
         )
 
+    @property
+    def chain(self) -> tuple[str, ...]:
+        """Names of all stages that the model has, in the order of the signal's way."""
+        further = {name: self._side_of(name) for name in self._in_order}
+        core = (self.hysteresis, *self.gain, self.dynamics, *(("creep",) if self.creep else ()))
+        inputs = [name for name, side in further.items() if side == "input"]
+        outputs = [name for name, side in further.items() if side == "output"]
+        return (*inputs, *core, *outputs)
+
     def with_stage(self, name: str) -> Self:
-        """Return the spec with a further stage."""
-        return replace(self, stages=(*self.stages, name))
+        """Return the spec with a stage of the package, by its name.
+
+        One operator and one dynamics exclude another; all else is added to what is there.
+
+        Raises
+        ------
+        InputError
+            No stage has that name.
+        """
+        if name in HYSTERESIS:
+            return self.with_parts(hysteresis=name)
+        if name in DYNAMICS:
+            return self.with_parts(dynamics=name)
+        if name in TERMS:
+            terms = tuple(term for term in TERMS if term in (*self.gain, name))
+            return self.with_parts(gain=terms)
+        if name == "creep":
+            return self if self.creep else self.with_parts(creep=True)
+        choose("model.stages", name, STAGES)
+        return self.with_parts(stages=(*self.stages, name))
+
+    def without(self, name: str) -> Self:
+        """Return the spec without a stage; that of the dynamics leaves none, the operator stays.
+
+        Raises
+        ------
+        InputError
+            The model has no such stage, or cannot do without.
+        """
+        if name in self.gain:
+            return self.with_parts(gain=tuple(term for term in self.gain if term != name))
+        if name == "creep" and self.creep:
+            return self.with_parts(creep=False, creep_growth=False)
+        if name == self.dynamics and name != "none":
+            return self.with_parts(dynamics="none")
+        if name in self.stages:
+            return self.with_parts(stages=tuple(one for one in self.stages if one != name))
+        raise InputError(f"model: cannot leave out {name!r}; it has {', '.join(self.chain)}")
+
+    def _side_of(self, name: str) -> Side:
+        return made("model.stages", name, STAGES, {}, Stage).side
 
     @property
     def _in_order(self) -> list[str]:
