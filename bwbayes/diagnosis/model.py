@@ -71,6 +71,20 @@ def stages(scene: Scene) -> Iterator[Explanation]:
         yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
 
 
+def without(scene: Scene, names: Sequence[str]) -> Iterator[Explanation]:
+    """Try the model without each of these stages: a gain says that it is not needed."""
+    for name in names:
+        # Another operator, hold or noise has taken the place of one.
+        if scene.study is None or name not in {*scene.study.spec.chain} - {*HYSTERESIS}:
+            continue
+        spec = scene.study.spec.without(name)
+        posterior = scene.rebuilt(scene.study.with_model(spec))
+        rows = [scene.posterior.names.index(one) for one in posterior.names]
+        fit = scene.extended(posterior=posterior, places=scene.places[:, rows])
+        fix = _lines(scene.study.spec, spec)
+        yield scene.explained(name, f"no {name}", fix, fit, spec=spec)
+
+
 def hold(scene: Scene) -> Iterator[Explanation]:
     """Try the other thing that the voltage may do between samples."""
     other = "first" if scene.whole.only.actuator.hold == "zero" else "zero"

@@ -6,9 +6,9 @@ discrepancy claims least, because it has white noise as a limit, and corners tha
 not. What another noise could gain shows in the rough one's innovations, which are cheap to look at.
 
 :func:`improve_model` gives a model the parts for which its record has evidence. Each round fits the
-model, explains its readings better in every way there is, and takes the part of the model that
-leads, if it is worth more than chance. None is added while the fit follows what the actuator did
-not do: no part of a model mends a transient.
+model, explains its readings better in every way there is, and takes the stage that leads, if it is
+worth more than chance; then it leaves out again what was added and is not needed any more. None is
+added while the fit follows what the actuator did not do: no stage mends a transient.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
+from bwbayes.diagnosis.model import without
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
@@ -36,6 +37,9 @@ from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
 from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
+
+# Stages that a search adds at most if it has found the mechanism.
+MAX_STAGES = 3
 
 
 def explained(
@@ -49,8 +53,13 @@ def explained(
     ``places`` are the posterior's modes (modes, free), coordinates; ``watch`` is called with the
     share that is done.
     """
+    return explain(_scene(problem, name, places), watch)
+
+
+def _scene(problem: Problem, name: str, places: FloatArray) -> Scene:
+    """Return a training record as explanations see it."""
     posterior, record = problem.posterior, problem.records[name]
-    scene = Scene.of(
+    return Scene.of(
         posterior.alone(name),
         posterior.select_draws(places, name),
         generator(problem.config.seed, f"explanations {record.sha256}"),
@@ -59,7 +68,6 @@ def explained(
         # Of several records no other model is built: it would be one of all of them.
         problem.study if len(problem.records) == 1 else None,
     )
-    return explain(scene, watch)
 
 
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
@@ -144,7 +152,7 @@ def _fit_point(problem: Problem, watch: Watch) -> PointFit:
 def improve_model(
     config: Config, folder: Path, console: Console, records: Mapping[str, Record] | None = None
 ) -> Config:
-    """Return a config with all parts of the model that pay; progress goes to the console.
+    """Return a config with all stages that pay; progress goes to the console.
 
     Config, folder and records are as :func:`~bwbayes.app.problem.problem.resolve` takes them.
 
@@ -152,21 +160,40 @@ def improve_model(
     """
     if len(config.records) > 1:
         raise InputError("improve: is for one training record; improve a fit of one of them first")
-    notes: list[str] = []
+    notes = dict[str, str]()
     while True:
         problem = resolve(config, folder, records)
         (name,) = problem.records
         with StepProgress(console, "searching for missing parts of the model ...") as watch:
             point = _fit_point(problem, partial(watch, "MAP estimate"))
-            found = explained(problem, name, point.optima, partial(watch, "explanations"))
+            scene = _scene(problem, name, point.optima)
+            found = explain(scene, partial(watch, "explanations"))
+            # The last one has just been weighed.
+            needless = [each for each in without(scene, [*notes][:-1]) if each.nats >= 0]
         parts = likely_causes([cause for cause in found if cause.spec is not None])
-        if followed_causes(found) or not parts:
+        if needless:
+            chosen = max(needless, key=lambda each: each.nats)
+            del notes[chosen.kind]
+            said = f"left out again: {chosen.kind}"
+        elif parts and not followed_causes(found):
+            chosen, chain = parts[0], problem.study.spec.chain
+            assert chosen.spec is not None
+            added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
+            notes[added] = f"model improved: {chosen.text} ({chosen.worth})"
+            said = f"added: {chosen.text}"
+        else:
             break
-        explanation = parts[0]
-        notes.append(f"model improved: {explanation.text} ({explanation.worth})")
-        console.print(f"added: {explanation.text}", highlight=False, soft_wrap=True)
-        assert explanation.spec is not None
-        config = with_model(config, explanation.spec, problem.records, explanation.stated)
+        console.print(said, highlight=False, soft_wrap=True)
+        assert chosen.spec is not None
+        config = with_model(config, chosen.spec, problem.records, chosen.stated)
+    if not notes:
+        return config
+    remarks = [*notes.values()]
+    if len(notes) > MAX_STAGES:
+        remarks.append(
+            f"{len(notes)} stages were added: many gains are no proof of a mechanism, and a drive "
+            "unlike the training record's may be missed"
+        )
     record = config.records[name]
-    noted = record.model_copy(update={"remarks": [*(record.remarks or []), *notes]})
-    return config.model_copy(update={"record": noted}) if notes else config
+    noted = record.model_copy(update={"remarks": [*(record.remarks or []), *remarks]})
+    return config.model_copy(update={"record": noted})
