@@ -8,7 +8,7 @@ keep them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -82,8 +82,16 @@ def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
         for explanation in sorted(found, key=lambda explanation: explanation.nats):
             best[explanation.kind] = explanation
         watch((number + 1) / len(kinds))
+    ranked = _ranked(best.values())
+    # A long record was looked at in parts: what leads has to lead on all of it.
+    for explanation in better_models(ranked):
+        best[explanation.kind] = scene.confirmed(explanation)
     watch(1.0)
-    return tuple(sorted(best.values(), key=lambda explanation: -explanation.nats))
+    return _ranked(best.values())
+
+
+def _ranked(explanations: Iterable[Explanation]) -> tuple[Explanation, ...]:
+    return tuple(sorted(explanations, key=lambda explanation: -explanation.nats))
 
 
 def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:

@@ -110,7 +110,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
         fix = _lines(scene.study.spec, spec)
-        yield scene.explained(kind, text, fix, fit, spec=spec)
+        yield scene.explained(kind, text, fix, fit, spec=spec, coordinates=fit.coordinates)
 
 
 def smooth(scene: Scene) -> Iterator[Explanation]:
@@ -159,7 +159,9 @@ def _changed(
     if not isinstance(text, str):
         theta = posterior.prior.theta(fit.free[np.newaxis])[0].tolist()
         text = text(dict(zip(posterior.table.names, theta, strict=True)))
-    yield scene.explained(kind, text, fix, fit, spec=spec, stated=stated, **facts)
+    yield scene.explained(
+        kind, text, fix, fit, spec=spec, stated=stated, coordinates=fit.coordinates, **facts
+    )
 
 
 def prior(scene: Scene) -> Iterator[Explanation]:

@@ -36,8 +36,8 @@ class Explanation(Finding):
     that of the readings that were held out, nan without any. ``shift`` is by how many sds of both
     fits the actuator's parameter moves that moves most. What is ``foreign`` the actuator has not
     done, so that a fit without it has followed it. What is ``noise`` leaves the displacement as it
-    is. ``changes`` are the values of keys of [model] that make it a part of the model, and
-    ``parameters`` what [parameters] says of new ones.
+    is. ``spec`` is the model that it is a part of, ``stated`` what is stated of new parameters, and
+    ``coordinates`` (free,) where that was fitted.
     """
 
     rmse: tuple[float, float] = (np.nan, np.nan)
@@ -47,6 +47,7 @@ class Explanation(Finding):
     noise: bool = False
     spec: ModelSpec | None = None
     stated: Mapping[str, Stated] = field(default_factory=dict)
+    coordinates: FloatArray | None = field(default=None, repr=False, compare=False)
 
     @property
     def mends(self) -> bool:
@@ -292,6 +293,23 @@ class Scene:
         posterior = self.posterior if posterior is None else posterior
         places = self.places if places is None else places
         return climb(posterior, places, effect, self.fit.log_density + 1.0)
+
+    def confirmed(self, explanation: Explanation) -> Explanation:
+        """Weigh another model on all readings, if the scene looked at some of them."""
+        few = self.posterior.only.readings.rows.size < self.whole.only.readings.rows.size
+        spec, coordinates = explanation.spec, explanation.coordinates
+        if not few or self.study is None or spec is None or coordinates is None:
+            return explanation
+        other = self.study.with_model(spec, explanation.stated).posterior
+        fit, before = climb(other, coordinates), self._on_all
+        rmse, nats = (before.rmse, fit.rmse), fit.log_evidence - before.log_evidence
+        return replace(explanation, nats=nats, rmse=rmse)
+
+    @cached_property
+    def _on_all(self) -> LocalFit:
+        """The fit of all readings."""
+        before = self.before or self.fit
+        return climb(self.whole, before.coordinates)
 
     def explained(
         self,

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import effects, explanations, model
+from bwbayes.diagnosis import scene as scenes
 from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.scene import Explanation, Scene
@@ -273,3 +274,20 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
         assert gained < max(whole[name], 0.0) + 0.5
     for name in ("moving gain", "creep"):
         assert thin[name] == pytest.approx(whole[name], abs=0.1)
+
+
+def test_what_leads_on_some_readings_is_weighed_on_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if all had been looked at from the beginning."""
+    monkeypatch.setattr(explanations, "ADDITIONS", ())
+    monkeypatch.setattr(explanations, "CHANGES", (model.nonlinearity,))
+    full = explain(scene("cubic", 0, tmp_path, 8.0))[0]
+    monkeypatch.setattr(scenes, "READINGS", 200)
+    few = scene("cubic", 0, tmp_path, 8.0)
+    assert few.posterior.only.readings.rows.size <= 200
+    on_few = max(model.nonlinearity(few), key=lambda found: found.nats)
+    found = explain(few)[0]
+    assert (found.kind, found.text) == (full.kind, full.text)
+    assert found.nats == pytest.approx(full.nats, abs=0.5)
+    assert abs(on_few.nats - full.nats) > 5
