@@ -59,9 +59,14 @@ class Verb:
 
     @cached_property
     def _source(self) -> ast.FunctionDef:
-        spec = find_spec(self.place.partition(":")[0])
-        text = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
-        functions = (node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
+        # The packages between would be loaded, if one asked for the module itself.
+        package, *inner = self.place.partition(":")[0].split(".")
+        spec = find_spec(package)
+        path = Path(str(spec and spec.origin))
+        if inner:
+            path = path.parent.joinpath(*inner).with_suffix(".py")
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        functions = (node for node in body if isinstance(node, ast.FunctionDef))
         return next(function for function in functions if function.name == self.name)
 
     @cached_property
@@ -79,7 +84,7 @@ class Verb:
 
     def sentences(self, parameter: str) -> list[str]:
         """Return what is said of a parameter."""
-        lines = rf"^(?:.*, )?{parameter}(?:, .*)?\n((?: {{4}}.*(?:\n|$))+)"
+        lines = rf"^(?:.*, )?{parameter}(?:, .*| : .*)?\n((?: {{4}}.*(?:\n|$))+)"
         found = re.search(lines, self._sections.get("Parameters", ""), re.MULTILINE)
         return re.split(r"(?<=\.) (?=[A-Z])", " ".join(found[1].split()) if found else "")
 

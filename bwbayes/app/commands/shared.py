@@ -54,7 +54,6 @@ seed_option = click.option("--seed", type=RANGES["seed"], help="Seed, instead of
 
 def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:
     """Return a decorator that adds a function's keyword arguments, but some, as options."""
-    keywords = [keyword for keyword in verb.options() if keyword[0] not in omitted]
 
     def decorate(command: AnyCommand) -> AnyCommand:
         @wraps(command)
@@ -69,9 +68,10 @@ def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:
 
         decorated: AnyCommand = usable
         # The first decorator of a command is applied last.
-        for key, hint, default, text in reversed(keywords):
-            flag = verb.flags.get(key, key).replace("_", "-")
-            decorated = _option(flag, key, hint, default, text)(decorated)
+        for key, hint, default, text in reversed([*verb.options()]):
+            if key not in omitted:
+                flag = verb.flags.get(key, key).replace("_", "-")
+                decorated = _option(flag, key, hint, default, text)(decorated)
         return decorated
 
     return decorate
@@ -84,6 +84,8 @@ def type_of(name: str, hint: str) -> Any:
     choices = re.search(r"Literal(\[.*?\])", hint)
     if choices:
         return click.Choice(ast.literal_eval(choices[1]))
+    if "Path" in hint:
+        return FILE
     types = {"tuple[float, float]": (float, float), "tuple[float, ...]": float}
     return {**types, "float": float, "int": int}.get(hint)
 
@@ -95,6 +97,11 @@ def _option(
     if hint == "bool":
         flags = f"--{flag}/--no-{flag}" if default else f"--{flag}"
         return click.option(flags, key, is_flag=True, default=default, help=text)
+    if hint.startswith("Mapping"):
+        metavar = f"QUANTITY={flag.upper()}"
+        return click.option(
+            f"--{flag}", key, multiple=True, metavar=metavar, callback=_pairs, help=text
+        )
     return click.option(
         f"--{flag}",
         key,
@@ -105,6 +112,25 @@ def _option(
         show_default=default is not None,
         help=text,
     )
+
+
+def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+    """Read what stands to the left and right of equals signs."""
+    for text in texts:
+        if "=" not in text:
+            flag = option.opts[0]
+            raise InputError(f"{flag} {text}: write {flag} displacement=..., with a value")
+    pairs = (text.partition("=") for text in texts)
+    return {quantity.strip(): value.strip() for quantity, _, value in pairs}
+
+
+# What of a record's files is meant, and of a single file.
+_reading = Verb(
+    "bwbayes.record.io.formats:read_record",
+    flags={"columns": "column", "units": "unit", "displacement_file": "displacement"},
+)
+naming_options = options_of(_reading, "voltage_is", "need_displacement")
+column_options = options_of(_reading, "voltage_is", "need_displacement", "displacement_file")
 
 
 class WithParts(click.Command):
@@ -144,41 +170,6 @@ def file_argument(name: str) -> Callable[[AnyCommand], AnyCommand]:
     return decorate
 
 
-def naming_options(command: AnyCommand) -> AnyCommand:
-    """Add the options that say what of a record's files is meant, as a naming has it."""
-    other = click.option(
-        "--displacement",
-        "displacement_file",
-        type=FILE,
-        help="The file with the displacement, if the record's has the voltage alone.",
-    )
-    return column_options(other(command))
-
-
-def column_options(command: AnyCommand) -> AnyCommand:
-    """Add the options that say what of one file is meant, as a naming has it."""
-    table = click.option("--table", metavar="N", help="One of several tables: number or sheet.")
-    fs = click.option("--fs", type=float, help="Sampling rate, Hz, in place of a time column.")
-    units = click.option(
-        "--unit",
-        "units",
-        multiple=True,
-        metavar="QUANTITY=UNIT",
-        callback=_pairs,
-        help="A column's unit, if the file does not state it: nm; -nm turns the sign; '0.35 um' is "
-        "a sensor's sensitivity.",
-    )
-    columns = click.option(
-        "--column",
-        "columns",
-        multiple=True,
-        metavar="QUANTITY=NAME",
-        callback=_pairs,
-        help="The column of time, voltage or displacement: a name, or a number from 1 on.",
-    )
-    return columns(units(fs(table(command))))
-
-
 def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, Any]:
     """Take what :func:`column_options` say out of a command's options.
 
@@ -190,16 +181,6 @@ def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, An
         problem = "--column, --unit, --fs and --table are for a file"
         raise InputError(f"{context.info_name}: {problem}; give {flag}, or remove them")
     return reading
-
-
-def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
-    """Read what stands to the left and right of equals signs."""
-    for text in texts:
-        if "=" not in text:
-            flag = option.opts[0]
-            raise InputError(f"{flag} {text}: write {flag} displacement=..., with a value")
-    pairs = (text.partition("=") for text in texts)
-    return {quantity.strip(): value.strip() for quantity, _, value in pairs}
 
 
 def command_as_typed() -> str:

@@ -68,19 +68,18 @@ def read_record(
     need_displacement : bool
         False also accepts a planned voltage without a displacement.
     columns : dict
-        The columns by quantity, where they are not to be recognized: their names, the ends of
-        their paths in the file, or their numbers, counted from 1:
-        ``{"time": "t [ms]", "voltage": "U_mV", "displacement": 3}``.
+        The column of time, voltage or displacement: a name, or a number from 1 on. A name may be
+        the end of a path in the file: ``{"time": "t [ms]", "voltage": "U_mV", "displacement": 3}``.
     units : dict
-        Units by quantity, ``{"displacement": "nm"}``, where the file does not state them; ``"-nm"``
-        turns the sign, and ``"0.35 um"`` is a sensor's sensitivity, that of 1 in the column.
-    fs : float, Hz
-        The sampling rate, in place of a time column.
+        A column's unit, if the file does not state it: nm; -nm turns the sign; '0.35 um' is a
+        sensor's sensitivity. By quantity, ``{"displacement": "nm"}``; a sensitivity is that of 1 in
+        the column.
+    fs : float
+        Sampling rate, Hz, in place of a time column.
     table : int or str
-        Of a workbook or text with several tables the one that counts: its number, from 1 on, or
-        the sheet's name.
+        One of several tables: number or sheet. Numbers count from 1.
     displacement_file : path
-        The file with the displacement, if ``path`` has the voltage alone.
+        The file with the displacement, if the record's has the voltage alone.
 
     Raises
     ------
