@@ -18,7 +18,6 @@ import threading
 import warnings
 from collections import UserDict
 from concurrent.futures import BrokenExecutor
-from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from types import FrameType
 from typing import Any
@@ -85,6 +84,9 @@ def _failure(error: BaseException) -> tuple[str, int]:
             where = f"{error.filename}: " if error.filename else ""
             text = f"{where}{error.strerror or error}; fix it and resume"
         case BrokenExecutor():
+            # Here, because it is slow to load.
+            from concurrent.futures.process import BrokenProcessPool
+
             # Python's own says nothing of use.
             text = one_line("" if isinstance(error, BrokenProcessPool) else text)
             text = (

@@ -66,7 +66,7 @@ def command_of(verb: Verb) -> click.Command:
     where = f"Where the files go; default: FOLDER/{below}."
     out_option = click.Option(["--out"], type=FILE, help=where)
     first = [click.Argument(["folder"], type=FILE), *words, out_option]
-    options = options_of(verb, "overwrite", "reading")
+    options = options_of(verb, "overwrite")
     about, *example = verb.help
     text = [about, "FOLDER has the run, with whose status the command ends.", *example]
     decorated = options(overwrite_option(quiet_option(command)))
@@ -107,9 +107,6 @@ def predict(
     same_offset: bool,
     out: Path | None,
     overwrite: bool,
-    columns: dict[str, str],
-    units: dict[str, str],
-    fs: float | None,
     **options: Any,
 ) -> int:
     """Write displacement bands for another record or voltage, from the run in FOLDER.
@@ -132,20 +129,15 @@ def predict(
         from bwbayes.app.fit.fitted import converged
         from bwbayes.app.jobs.predict import predict as predict_record
         from bwbayes.app.jobs.predict import write_prediction
-        from bwbayes.record import Record, read_record
         from bwbayes.report.outputs import refuse_existing
         from bwbayes.report.report import remarks_banner, standing_banner
 
         refuse_existing(files, overwrite=overwrite)
         fit = converged(folder)
-        other: Record | Path | None = record
         try:
-            if record and (columns or units or fs is not None):
-                naming: dict[str, Any] = {"columns": columns, "units": units, "fs": fs}
-                naming |= {key: options[key] for key in ("table", "displacement_file")}
-                other = read_record(record, need_displacement=False, **naming)
             options |= {"name": name, "own_offset": not same_offset, "watch": watch}
-            bands = predict_record(fit, other, **options)
+            reading = {key: options.pop(key) for key in ("columns", "units", "fs")}
+            bands = predict_record(fit, record, reading=reading, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None
         write_prediction(bands, files, fit.standing, partial(watch, "files"))

@@ -69,7 +69,7 @@ def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:
         decorated: AnyCommand = usable
         # The first decorator of a command is applied last.
         for key, hint, default, text in reversed([*verb.options()]):
-            if key not in omitted:
+            if key not in ("reading", *omitted):
                 flag = verb.flags.get(key, key).replace("_", "-")
                 decorated = _option(flag, key, hint, default, text)(decorated)
         return decorated
@@ -97,7 +97,7 @@ def _option(
     if hint == "bool":
         flags = f"--{flag}/--no-{flag}" if default else f"--{flag}"
         return click.option(flags, key, is_flag=True, default=default, help=text)
-    if hint.startswith("Mapping"):
+    if hint.startswith("Mapping[str, str"):
         metavar = f"QUANTITY={flag.upper()}"
         return click.option(
             f"--{flag}", key, multiple=True, metavar=metavar, callback=_pairs, help=text

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from bwbayes.app.fit.fitted import Fit
 from bwbayes.app.problem.alike import options_alike
@@ -36,6 +37,7 @@ def predict(
     lead_in_from: float | None = None,
     after: bool = False,
     of: str | None = None,
+    reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Prediction:
     """Predict another record, a planned voltage without a displacement, or a signal.
@@ -72,6 +74,9 @@ def predict(
         record, behind which the signal follows.
     of
         Training record whose per-record parameters to use; default: the first.
+    reading
+        How the record's file is read, as keyword arguments of ``read_record``: columns, units, fs;
+        default: as the training record was, if its columns are the same.
     watch
         Called with the name of a step and the share of it that is done.
 
@@ -117,7 +122,7 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
-        reading = {"table": table, "displacement_file": displacement_file}
+        reading = {**(reading or {}), "table": table, "displacement_file": displacement_file}
         alike = options_alike(record, problem.config.records[of].read_as, reading)
         record = read_record(record, need_displacement=False, **alike)
     record = record.without_values(problem.config.records[of].missing or ())
