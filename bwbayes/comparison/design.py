@@ -15,7 +15,6 @@ far as the discrepancy's correlation time says so.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -23,7 +22,8 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.comparison.designed import Promise
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.likelihood import batches
+from bwbayes.inference.linearization import linearize, value_and_jacobian
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
 from bwbayes.watching import Watch, part, unwatched, watched
@@ -43,7 +43,7 @@ def promises(
     With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
     sampling, and I the information of the candidate's readings about them and about the initial
     state and offset of its record, whose prior is standard normal there
-    (:meth:`~bwbayes.inference.likelihood.Likelihood.score`),
+    (:func:`~bwbayes.inference.linearization.linearize`),
 
         Σ' = (Σ⁻¹ + Iₐₐ − Iₐᵣ (1 + Iᵣᵣ)⁻¹ Iᵣₐ)⁻¹.
 
@@ -98,75 +98,56 @@ def promises(
     begun[:, new] = generator.standard_normal((len(chosen), new.size))
     possible = np.isfinite(prior.constrain(begun)[1])
     chosen[possible] = begun[possible]
-    steps = np.full(coordinates.shape[1], 0.01)
-    steps[columns] *= np.sqrt(np.diag(covariance))
 
-    def derivatives(
-        position: FloatArray, moving: IntArray, quantity: str | Likelihood
-    ) -> FloatArray:
-        """Return those (moving, ...) of a parameter, or of the displacement of a record."""
-        moved = np.tile(position, (2 * moving.size, 1))
-        rows = np.arange(moving.size)
-        moved[rows, moving] += steps[moving]
-        moved[moving.size + rows, moving] -= steps[moving]
-        theta = prior.theta(prior.constrain(moved)[0])
-        if isinstance(quantity, str):
-            values = theta[:, [dataset.table.names.index(quantity)]]
-        else:
-            values = quantity.simulate(dataset.table.actuator(theta), quantity.voltage)
-        above, below = np.split(values, 2)
-        return np.asarray((above - below) / (2 * steps[moving, np.newaxis]))
+    def targeted(places: FloatArray) -> FloatArray:
+        if isinstance(target, str):
+            return prior.constrain(places)[0][:, [prior.free_names.index(target)]]
+        return band.displacement(places)
 
+    band = _planned(posterior, posterior.only.voltage if isinstance(target, str) else target)
     factor = np.linalg.cholesky(covariance)
-    quantity = target if isinstance(target, str) else _planned(posterior, target)
-    gradients = [derivatives(position, columns, quantity) for position in chosen]
+    gradients = [value_and_jacobian(targeted, place[np.newaxis], columns)[1][0] for place in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
-    scores = []
-    models, count = [*zip(chosen, gradients, strict=True)], len(candidates)
+    scores, count = [], len(candidates)
     for number, (name, voltage) in enumerate(candidates.items()):
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
         if refused:
             scores.append(Promise(name, np.nan, np.nan, refused))
             continue
-        likelihood, remaining = _planned(posterior, voltage), []
+        planned, remaining = _planned(posterior, voltage), []
         this = part(watch, number / count, (number + 1) / count)
-        for position, gradient in watched(models, this):
-            shapes = derivatives(position, np.concatenate([columns, new]), likelihood)
-            theta = prior.theta(prior.constrain(position[np.newaxis])[0])
-            information = _information(likelihood, theta, shapes, columns.size)
-            # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
-            inner = np.eye(len(factor)) + factor.T @ information @ factor
-            after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
-            remaining.append(_mean_sd(gradient, after))
+        for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
+            informations = linearize(planned, chosen[batch]).fisher_information
+            for gradient, whole in zip(gradients[batch], informations, strict=True):
+                information = _left_open(whole, columns, new)
+                # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
+                inner = np.eye(len(factor)) + factor.T @ information @ factor
+                after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
+                remaining.append(_mean_sd(gradient, after))
         shares = np.array(remaining) / before
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
         scores.append(Promise(name, float(np.mean(shares)), error))
     return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
 
 
-def _planned(posterior: Posterior, voltage: FloatArray) -> Likelihood:
-    """Return the likelihood of another record of one actuator, of which only readings are missing.
+def _planned(posterior: Posterior, voltage: FloatArray) -> Posterior:
+    """Return the posterior of another record of one actuator, of which only readings are missing.
 
     It starts as the one that was fitted.
     """
     nothing, whole = np.zeros(voltage.size), (slice(0, voltage.size),)
-    planned = replace(posterior.only, voltage=voltage, displacement=nothing, training=whole)
-    return planned.likelihood(posterior.engine)
+    return posterior.altered(voltage=voltage, displacement=nothing, training=whole)
 
 
-def _information(
-    likelihood: Likelihood, theta: FloatArray, shapes: FloatArray, count: int
-) -> FloatArray:
-    """Return that (count, count) of a record about the first of shapes (shapes, readings), um.
+def _left_open(information: FloatArray, columns: IntArray, new: IntArray) -> FloatArray:
+    """Return a record's information about ``columns``, its ``new`` unknowns integrated out.
 
-    The sizes of the others are unknowns of the record, with standard normal priors.
+    These have standard normal priors.
     """
-    nothing = np.zeros((1, shapes.shape[1]))
-    information = likelihood.score(theta, shapes, nothing).information[0]
-    known, across = information[:count, :count], information[:count, count:]
-    start = information[count:, count:] + np.eye(len(shapes) - count)
-    remaining: FloatArray = known - across @ np.linalg.solve(start, across.T)
-    return remaining
+    across = information[np.ix_(columns, new)]
+    start = information[np.ix_(new, new)] + np.eye(new.size)
+    remaining: FloatArray = information[np.ix_(columns, columns)]
+    return remaining - across @ np.linalg.solve(start, across.T)
 
 
 def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:

@@ -26,6 +26,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
@@ -36,9 +37,6 @@ from bwbayes.watching import Watch, part, unwatched, watched
 
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
-
-# Step of a slope, in prior sds.
-STEP = 1e-5
 
 
 def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
@@ -95,14 +93,13 @@ def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatAr
     """
     prior, columns = posterior.prior, _columns(posterior, posterior.table.physical)
     free, _ = prior.constrain(point.mode[np.newaxis])
-    theta = prior.theta(free)
-    values = dict(zip(prior.names, theta[0], strict=True))
-    # Each parameter a step above and below the mode.
-    steps = np.zeros((len(columns), free.shape[1]))
-    steps[np.arange(len(columns)), columns] = STEP
-    steps[:, columns] *= [_prior_sd(prior, prior.free[column], values) for column in columns]
-    stepped = prior.theta(np.concatenate([free + steps, free - steps]))
-    information = sum(_information(posterior, data, theta, stepped) for data in posterior.datasets)
+    values = dict(zip(prior.names, prior.theta(free)[0], strict=True))
+    sds = np.zeros((len(columns), free.shape[1]))
+    sds[np.arange(len(columns)), columns] = [
+        _prior_sd(prior, prior.free[column], values) for column in columns
+    ]
+
+    information = sum(_information(posterior, data, free, sds) for data in posterior.datasets)
     remaining = scipy.linalg.inv(np.eye(len(columns)) + information)
     loop = [columns.index(column) for column in _columns(posterior, posterior.table.loop)]
     variance, directions = scipy.linalg.eigh(remaining[np.ix_(loop, loop)])
@@ -128,13 +125,19 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
 
 
 def _information(
-    posterior: Posterior, dataset: Dataset, theta: FloatArray, stepped: FloatArray
+    posterior: Posterior, dataset: Dataset, free: FloatArray, sds: FloatArray
 ) -> FloatArray:
-    """Fisher information (physical, physical) of a record, each distinct branch counted once."""
-    # Change of the displacement per prior sd of each parameter, (physical, samples), um.
-    plus, minus = np.split(posterior.simulate(stepped, record=dataset.name), 2)
-    slopes = (plus - minus) / (2 * STEP)
-    noise_parameters = dataset.table.noise(posterior.table.of(theta, dataset.name))
+    """Fisher information (physical, physical) of a record, each distinct branch counted once.
+
+    Of moves by ``sds`` (physical, free) from ``free`` (1, free).
+    """
+
+    def simulate(scores: FloatArray) -> FloatArray:
+        return posterior.simulate(posterior.prior.theta(free + scores @ sds), record=dataset.name)
+
+    slopes = value_and_jacobian(simulate, np.zeros((1, len(sds))))[1][0]
+    theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
+    noise_parameters = dataset.table.noise(theta)
     _, sensor = dataset.noise.marginal_sd(noise_parameters)
     rows = np.concatenate([np.arange(w.start, w.stop) for w in dataset.training])
     weights, duration = stretches_once(dataset.voltage, rows)

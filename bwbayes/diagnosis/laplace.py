@@ -21,6 +21,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood, batches
+from bwbayes.inference.linearization import gradient_and_hessian, value_and_jacobian
 from bwbayes.inference.posterior import Posterior
 
 # A round that gains less, nats, is the last one; and rounds at most.
@@ -31,6 +32,9 @@ FIRST_ROUNDS, AHEAD = 2, 10.0
 
 # Steps in the noise's coordinates a round; and where many starts of an effect go side by side.
 NOISE_STEPS, FEW_STEPS = 6, 2
+
+# Step of differences in the noise's coordinates: the posterior's sds are hundredths of the prior's.
+NOISE_STEP = 2e-2
 
 # Parts of a step that are tried.
 FRACTIONS = 0.5 ** np.arange(8)
@@ -192,14 +196,24 @@ class _Target:
         sizes = coordinates[:, self.free :]
         return self.posterior.prior.theta(free), density - 0.5 * np.sum(sizes**2, axis=1)
 
-    def displacement(self, theta: FloatArray, coordinates: FloatArray) -> FloatArray:
-        """Displacement (models, readings), um, of θ and coordinates that are possible."""
-        likelihood = self.posterior.likelihood
+    def displacement(self, coordinates: FloatArray) -> FloatArray:
+        """Displacement (models, readings), um, at coordinates; nan where the prior is zero."""
+        return self.simulate(*self.prior(coordinates), coordinates)
+
+    def simulate(
+        self, theta: FloatArray, log_prior: FloatArray, coordinates: FloatArray
+    ) -> FloatArray:
+        """Return :meth:`displacement`, with θ and log prior of the coordinates."""
+        likelihood, possible = self.posterior.likelihood, np.isfinite(log_prior)
         readings = likelihood.readings
-        model, voltage = likelihood.table.actuator(theta), likelihood.voltage[: readings.samples]
-        sizes = coordinates[:, self.free :]
-        moved = self.effect.displacement(likelihood, model, voltage, sizes)
-        return moved[:, readings.where]
+        moved = np.full((len(theta), readings.rows.size), np.nan)
+        if possible.any():
+            model, sizes = likelihood.table.actuator(theta), coordinates[:, self.free :]
+            voltage = likelihood.voltage[: readings.samples]
+            moved[possible] = self.effect.displacement(
+                likelihood, model[possible], voltage, sizes[possible]
+            )[:, readings.where]
+        return moved
 
     def density(
         self, theta: FloatArray, log_prior: FloatArray, displacement: FloatArray
@@ -228,12 +242,9 @@ class _Target:
     def at(self, coordinates: FloatArray) -> list[_State]:
         """Return the states at coordinates (states, free + sizes)."""
         theta, density = self.prior(coordinates)
-        possible = np.isfinite(density)
-        moved = np.zeros((len(coordinates), self.posterior.likelihood.readings.rows.size))
+        possible, moved = np.isfinite(density), self.simulate(theta, density, coordinates)
         if possible.any():
-            theta = theta[possible]
-            moved[possible] = self.displacement(theta, coordinates[possible])
-            score = self.posterior.likelihood.score(theta, moved[:0], moved[possible])
+            score = self.posterior.likelihood.score(theta[possible], moved[:0], moved[possible])
             density[possible] += score.log_density
         density = np.where(np.isfinite(density), density, -np.inf)
         return [_State(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
@@ -246,9 +257,9 @@ class _Target:
         many = len(states) > 1 and self.effect is not NONE
         count = FEW_STEPS if many else NOISE_STEPS
         states = [self._step_noise(state, count) for state in states]
-        slopes, curvatures = self._physical_bend(states)
+        gradients, informations = self._linearize(states)
         steps = np.zeros((len(states), states[0].coordinates.size))
-        steps[:, self.physical] = np.linalg.solve(curvatures, slopes[..., np.newaxis])[..., 0]
+        steps[:, self.physical] = np.linalg.solve(informations, gradients[..., np.newaxis])[..., 0]
         left = [*range(len(states))]
         for fraction in FRACTIONS:
             tried = np.stack([states[i].coordinates + fraction * steps[i] for i in left])
@@ -263,12 +274,12 @@ class _Target:
     def fitted(self, state: _State) -> LocalFit:
         """Put the evidence at a mode together."""
         log_evidence, covariance = state.density, np.eye(state.coordinates.size)
-        # What the record does not tell keeps its prior; the noise's bend is a finite difference.
+        # What the record does not tell keeps its prior; the noise's Hessian is of differences.
         # A model that is possible at none of its starts has no evidence, and no curvature.
         parts: list[tuple[IntArray, FloatArray, float]] = []
         if np.isfinite(state.density):
-            parts.append((self.physical, self._physical_bend([state])[1][0], 1.0))
-            parts.append((self.noise, self._noise_bend(state)[1], 1e-2))
+            parts.append((self.physical, self._linearize([state])[1][0], 1.0))
+            parts.append((self.noise, self._noise_hessian(state)[1], 1e-2))
         for rows, curvature, flattest in parts:
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
@@ -284,33 +295,23 @@ class _Target:
             state.displacement,
         )
 
-    def _physical_bend(self, states: Sequence[_State]) -> tuple[FloatArray, FloatArray]:
-        """Slopes and curvatures of the log density of states in the physical coordinates."""
-        step = 1e-4  # a simulation has no noise but rounding
+    def _linearize(self, states: Sequence[_State]) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Fisher information of states' log density in the physical coordinates."""
         coordinates = np.stack([state.coordinates for state in states])
-        steps = step * np.eye(coordinates.shape[1])[self.physical]
-        sides = coordinates[:, np.newaxis] + np.concatenate([steps, -steps])
-        theta, _ = self.prior(coordinates)
-        flat = sides.reshape(-1, coordinates.shape[1])
-        theta_sides, log_prior = self.prior(flat)
-        possible = np.isfinite(log_prior)
         here = np.stack([state.displacement for state in states])
-        moved = np.repeat(here, 2 * len(steps), axis=0)
-        moved[possible] = self.displacement(theta_sides[possible], flat[possible])
-        forth, back = np.split(moved.reshape(*sides.shape[:2], -1), 2, axis=1)
-        width = np.sum(possible.reshape(len(states), 2, -1), axis=1)
-        slopes = (forth - back) / (step * np.maximum(width, 1))[..., np.newaxis]
-        score = self.posterior.likelihood.score(theta, slopes, here)
-        return score.pull - coordinates[:, self.physical], score.information + np.eye(len(steps))
+        _, slopes = value_and_jacobian(self.displacement, coordinates, self.physical, here)
+        score = self.posterior.likelihood.score(self.prior(coordinates)[0], slopes, here)
+        gradient = score.gradient - coordinates[:, self.physical]
+        return gradient, score.fisher_information + np.eye(self.physical.size)
 
     def _step_noise(self, state: _State, count: int) -> _State:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
         for _ in range(count if self.noise.size else 0):
-            slope, curvature = self._noise_bend(state)
-            values, vectors = np.linalg.eigh(curvature)
-            step = vectors @ (vectors.T @ slope / np.maximum(np.abs(values), 1.0))
+            gradient, hessian = self._noise_hessian(state)
+            values, vectors = np.linalg.eigh(hessian)
+            step = vectors @ (vectors.T @ gradient / np.maximum(np.abs(values), 1.0))
             step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
-            if slope @ step <= GAIN / 4:
+            if gradient @ step <= GAIN / 4:
                 break
             steps = FRACTIONS[:, np.newaxis] * step
             gains = self._noise_gains(state, steps)
@@ -329,15 +330,9 @@ class _Target:
         density = self.density(*self.prior(coordinates), state.displacement)
         return np.maximum(density, -1e12) - state.density
 
-    def _noise_bend(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """Slope and curvature of the log density in the noise's coordinates."""
-        step = 2e-2  # the posterior's sds are hundredths of the prior's, which are one
-        size, (i, j) = self.noise.size, np.tril_indices(self.noise.size, -1)
-        single = step * np.eye(size)
-        # Along each coordinate, then along each two of them.
-        steps = np.concatenate([single, single[i] + single[j]])
-        plus, minus = np.split(self._noise_gains(state, np.concatenate([steps, -steps])), 2)
-        bend = plus + minus
-        curvature = np.diag(bend[:size])
-        curvature[i, j] = curvature[j, i] = (bend[size:] - bend[i] - bend[j]) / 2
-        return (plus - minus)[:size] / (2 * step), -curvature / step**2
+    def _noise_hessian(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """Gradient of the log density in the noise's coordinates, and minus its Hessian."""
+        gradient, hessian = gradient_and_hessian(
+            lambda steps: self._noise_gains(state, steps), self.noise.size, NOISE_STEP, 0.0
+        )
+        return gradient, -hessian

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.linearization import value_and_jacobian
 
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
@@ -85,7 +86,7 @@ class LeastSquares:
         if not self.physical.any():
             return optima[:1]
         optima[:, self.physical] = starts[:, self.physical]
-        residual, slopes = self._linearized(optima)
+        residual, slopes = self._linearize(optima)
         costs = np.sum(residual**2, axis=1)
         curvature = slopes @ np.swapaxes(slopes, 1, 2)
         damping = 1e-3 * np.max(np.diagonal(curvature, axis1=1, axis2=2), axis=1)
@@ -100,7 +101,7 @@ class LeastSquares:
             step = -np.linalg.solve(damped, gradient)[:, :, 0]
             trial = optima[moving]
             trial[:, self.physical] += step * length
-            tried, tried_slopes = self._linearized(trial)
+            tried, tried_slopes = self._linearize(trial)
             cost = np.sum(tried**2, axis=1)
             descent = costs[moving] - cost
             descends = descent > 0  # not where the place is impossible
@@ -121,15 +122,8 @@ class LeastSquares:
             moving = moving[~settled]
         return optima[np.isfinite(costs)]
 
-    def _linearized(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _linearize(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (places, rows) and their slopes (places, physical, rows), per spread."""
-        steps = 1e-5 * np.diag(self.spread)[self.physical]
-        star = np.concatenate([np.zeros((1, self.spread.size)), steps, -steps])
-        models = (places[:, np.newaxis] + star).reshape(-1, self.spread.size)
-        values = self.residuals(models).reshape(len(places), len(star), -1)
-        here, plus, minus = np.split(values, [1, 1 + len(steps)], axis=1)
-        # Where one side is impossible, the slope is that of the other; of neither none is known.
-        sides = np.stack([plus - minus, 2 * (plus - here), 2 * (here - minus)])
-        finite = np.isfinite(sides[..., :1])
-        slopes = np.take_along_axis(sides, np.argmax(finite, axis=0)[np.newaxis], axis=0)[0] / 2e-5
-        return here[:, 0], np.where(finite.any(axis=0), slopes, 0.0)
+        physical = np.flatnonzero(self.physical)
+        residual, slopes = value_and_jacobian(self.residuals, places, physical)
+        return residual, slopes * self.spread[physical, np.newaxis]

@@ -52,20 +52,21 @@ class LinearStart(NamedTuple):
 class Score(NamedTuple):
     """What shapes in the readings would explain, beside an unknown start.
 
-    ``pull`` u (models, shapes) is the log density's slope in their sizes, where these are zero, and
-    ``information`` I (models, shapes, shapes) its bend; ``log_density`` (models,) is that without
-    them, nats.
+    ``gradient`` u (models, shapes) is the log density's in their sizes, where these are zero, and
+    ``fisher_information`` I (models, shapes, shapes) minus its Hessian; ``log_density`` (models,)
+    is that without them, nats.
     """
 
-    pull: FloatArray
-    information: FloatArray
+    gradient: FloatArray
+    fisher_information: FloatArray
     log_density: FloatArray
 
     @property
     def together(self) -> FloatArray:
         """uᵀ I⁻¹ u (models,): χ² with a degree of freedom a shape, if the model is right."""
-        pull = self.pull[:, :, np.newaxis]
-        squares: FloatArray = np.sum(pull * np.linalg.solve(self.information, pull), axis=(1, 2))
+        gradient = self.gradient[:, :, np.newaxis]
+        steps = np.linalg.solve(self.fisher_information, gradient)
+        squares: FloatArray = np.sum(gradient * steps, axis=(1, 2))
         return squares
 
 

@@ -240,6 +240,25 @@ class Posterior:
             moving = None if unrest is None else unrest[batch]
             yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
+    def displacement(self, coordinates: FloatArray) -> FloatArray:
+        """Displacement (models, readings), um, from rest, at coordinates (models, free).
+
+        Readings are those of all records, one after the other; nan where the prior is zero.
+        """
+        free, log_prior = self.prior.constrain(coordinates)
+        possible = np.flatnonzero(np.isfinite(log_prior))
+        theta, sizes = self.prior.theta(free), [d.readings.rows.size for d in self.datasets]
+        result = np.full((len(theta), sum(sizes)), np.nan)
+        parts = np.split(result, np.cumsum(sizes)[:-1], axis=1)
+        for dataset, likelihood, part in zip(self.datasets, self.likelihoods, parts, strict=True):
+            readings = likelihood.readings
+            model = likelihood.table.actuator(self.table.of(theta, dataset.name))
+            voltage = dataset.voltage[: readings.samples]
+            for batch in batches(possible.size, voltage.size):
+                models = possible[batch]
+                part[models] = likelihood.simulate(model[models], voltage)[:, readings.where]
+        return result
+
     def noise_of_new(self, theta: FloatArray) -> FloatArray:
         """Return the noise's parameters (models, its own) for readings that were not fitted.
 

@@ -10,8 +10,8 @@ The coordinates z of the longer model are found from the fit's by Gauss and Newt
 
     H = I + Q,   z → z + H⁻¹ (u − Q z),
 
-where u and I are what the likelihood says of the slopes of the readings in z, the noise held
-(:meth:`~bwbayes.inference.likelihood.Likelihood.score`), and Q is the prior's precision: one, but
+where u and I are the likelihood's gradient and Fisher information in z, the noise held
+(:func:`~bwbayes.inference.linearization.linearize`), and Q is the prior's precision: one, but
 between the strengths, which are alike. Strengths c are drawn from the normal distribution of that
 mode, and each draw of the fit moves with its own, by the mode's move and −H_φφ⁻¹ H_φc (c − ĉ): the
 gain of a fast drive gives way to the creep in it, and what is predicted of such a drive stays as it
@@ -25,14 +25,15 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.linearization import linearize
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.operator import Span
 from bwbayes.model.reversals import time_between_turns
 
-# Step of the slopes, in prior sds, and steps to the mode.
-STEP, ROUNDS = 1e-3, 4
+# Steps to the mode.
+ROUNDS = 4
 
 
 def with_creep(
@@ -66,14 +67,15 @@ def with_creep(
     prior[np.ix_(strengths, strengths)] = np.linalg.inv(0.9**decades)
 
     begin = places.mean(axis=0)
-    mode, bend = begin.copy(), prior
+    mode, hessian = begin.copy(), prior
     for _ in range(ROUNDS):
-        pull, information = _score(extended, mode)
-        bend = information + prior
-        step = np.linalg.solve(bend[np.ix_(moving, moving)], (pull - prior @ mode)[moving])
-        mode[moving] += step
-    follow = np.linalg.solve(bend[np.ix_(others, others)], bend[np.ix_(others, strengths)])
-    precision = bend[np.ix_(strengths, strengths)] - bend[np.ix_(strengths, others)] @ follow
+        linear = linearize(extended, mode[np.newaxis])
+        hessian = linear.fisher_information[0] + prior
+        gradient = (linear.gradient[0] - prior @ mode)[moving]
+        mode[moving] += np.linalg.solve(hessian[np.ix_(moving, moving)], gradient)
+    across = hessian[np.ix_(others, strengths)]
+    follow = np.linalg.solve(hessian[np.ix_(others, others)], across)
+    precision = hessian[np.ix_(strengths, strengths)] - across.T @ follow
     covariance = np.linalg.inv((precision + precision.T) / 2)
     crept = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))
     places[:, others] += (mode - begin)[others] - (crept - mode[strengths]) @ follow.T
@@ -112,21 +114,3 @@ def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:
     joint = replace(posterior.table, actuator_part=datasets[0].actuator)
     prior = JointPrior((declared[name] for name in joint.names), posterior.prior.constraint)
     return Posterior(datasets, prior, posterior.engine, joint), creep
-
-
-def _score(posterior: Posterior, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return u (free,) and I (free, free) of the coordinates at a place (free,)."""
-    steps = STEP * np.eye(coordinates.size)
-    around = np.concatenate([[coordinates], coordinates + steps, coordinates - steps])
-    theta = posterior.prior.theta(posterior.prior.constrain(around)[0])
-    pull, information = np.zeros(coordinates.size), np.zeros((coordinates.size, coordinates.size))
-    for dataset, likelihood in zip(posterior.datasets, posterior.likelihoods, strict=True):
-        its_theta = posterior.table.of(theta, dataset.name)
-        voltage = dataset.voltage[: dataset.readings.samples]
-        model = dataset.table.actuator(its_theta)
-        simulated = likelihood.simulate(model, voltage)[:, dataset.readings.rows]
-        here, plus, minus = np.split(simulated, [1, 1 + coordinates.size])
-        score = likelihood.score(its_theta[:1], (plus - minus) / (2 * STEP), here)
-        pull += score.pull[0]
-        information += score.information[0]
-    return pull, information

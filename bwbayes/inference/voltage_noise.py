@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.map_estimate import PointFit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.record.voltage_path import VoltagePath
@@ -35,24 +36,23 @@ def path_covariance(
     unconstrained coordinates: mean of sₖ sₖᵀ, sₖ = C (∇ℓₖ − ∇ℓ), of the actuator's parameters. The
     ``paths`` are those of the records by name; ``watch`` is called with the share that is done.
     """
-    physical = np.array([name in posterior.table.physical for name in posterior.names])
+    physical = np.flatnonzero([name in posterior.table.physical for name in posterior.names])
 
-    def slopes(along: Posterior) -> FloatArray:
-        sds = np.sqrt(np.diag(point.covariance))
-        away = 1e-2 * np.diag(sds)
-        sides = along.log_density(np.concatenate([point.mode + away, point.mode - away]))
-        upper, lower = np.split(sides, 2)
-        return np.where(physical, (upper - lower) / (2e-2 * sds), 0.0)
+    def gradient(along: Posterior) -> FloatArray:
+        (slopes,) = value_and_jacobian(along.log_density, point.mode[np.newaxis], physical)[1]
+        return np.asarray(slopes)
 
-    here, steps = slopes(posterior), []
+    here, steps = gradient(posterior), []
     for _ in watched(range(COPIES), watch):
         datasets = tuple(
             replace(dataset, voltage=paths[dataset.name].redrawn(generator))
             for dataset in posterior.datasets
         )
-        steps.append(point.covariance @ (slopes(replace(posterior, datasets=datasets)) - here))
-    moved = np.where(physical, steps, 0.0)
-    return moved.T @ moved / COPIES
+        change = gradient(replace(posterior, datasets=datasets)) - here
+        steps.append(point.covariance[np.ix_(physical, physical)] @ change)
+    added = np.zeros_like(point.covariance)
+    added[np.ix_(physical, physical)] = np.transpose(steps) @ np.stack(steps) / COPIES
+    return added
 
 
 def widened(coordinates: FloatArray, covariance: FloatArray, more: FloatArray) -> FloatArray:
