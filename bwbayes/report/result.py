@@ -16,6 +16,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.consistency import Agreement
+from bwbayes.diagnosis.drive_lock import DriveLock
 from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.diagnosis.predictive_checks import PredictiveChecks
@@ -49,10 +50,10 @@ class Result:
     bands, scores, verdicts
         Of all that was predicted; by the bands' names, for those with a measurement, their scores,
         and whether they hold. Empty unless converged, as is all that was worked out below.
-    innovations, agreement, explanations, replicated
-        By fitted record: the innovation of each reading at the most probable draw; of several, how
-        it agrees with the others; what may explain it better, the best first; where it lies among
-        replicated records.
+    innovations, drive_locks, agreement, explanations, replicated
+        By fitted record: the innovation of each reading at the most probable draw; whether what the
+        model misses follows the drive; of several, how it agrees with the others; what may explain
+        it better, the best first; where it lies among replicated records.
     loops, steps
         The loops of the actuator, measured, and its responses to the predicted steps by name.
     learned
@@ -77,6 +78,7 @@ class Result:
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
+    drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
     loops: Loops | None = None
     steps: Mapping[str, StepResponse] = field(default_factory=dict)
     agreement: Mapping[str, Agreement] = field(default_factory=dict)
@@ -145,8 +147,8 @@ def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
     ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
-    ``identifiability``, ``replicated`` and ``explanations`` are None unless the sampling has
-    converged; ``agreement`` is there for several records alone.
+    ``identifiability``, ``model_error``, ``replicated`` and ``explanations`` are None unless the
+    sampling has converged; ``agreement`` is there for several records alone.
     """
     outcome, check = result.outcome, result.outcome.check
     numbers: dict[str, object] = {
@@ -166,7 +168,7 @@ def summary(result: Result) -> dict[str, object]:
     if not outcome.converged:
         sections = (
             *("parameters", "validation", "validated_drives", "innovations", "loops"),
-            *("step_responses", "identifiability", "replicated", "explanations"),
+            *("step_responses", "identifiability", "model_error", "replicated", "explanations"),
         )
         return numbers | dict.fromkeys(sections)
     innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
@@ -184,6 +186,7 @@ def summary(result: Result) -> dict[str, object]:
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.steps.items()},
         "identifiability": None if result.learned is None else result.learned.numbers,
+        "model_error": {name: lock.numbers for name, lock in result.drive_locks.items()},
         "replicated": {n: checks.numbers for n, checks in result.replicated.items()} or None,
         "explanations": {
             name: [explanation.numbers for explanation in explanations]

@@ -22,6 +22,7 @@ from bwbayes.app.running.predictions import predictions, validate_predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import conflict, identifiability, innovations
 from bwbayes.diagnosis import consistency as agreement
+from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.identifiability import information_gain
 from bwbayes.diagnosis.predictive_checks import check_predictions
@@ -102,6 +103,7 @@ def assemble(
         agreement=compared,
     )
     artist.draw(result)
+    locks = drive_locks(posterior, subset, generator(seed, "drive lock"))
     departures = {name: innovations.departures(whitened) for name, whitened in series.items()}
     places = [*posterior.prior.unconstrain(best), *chain.point.optima]
     modes = distinct(places, chain.point.covariance)
@@ -118,6 +120,7 @@ def assemble(
     remarks += map(str, agreement.disagreements(compared))
     for said in (
         departures,
+        {name: lock.findings for name, lock in locks.items()},
         {name: lines(likely_causes(causes)) for name, causes in explanations.items()},
     ):
         for name, texts in said.items():
@@ -135,6 +138,7 @@ def assemble(
         result,
         verdicts=verdicts,
         explanations=explanations,
+        drive_locks=locks,
         learned=learned,
         replicated={
             dataset.name: check_predictions(

@@ -17,6 +17,7 @@ import numpy as np
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.scene import Explanation
@@ -154,9 +155,27 @@ def predict_another(
         *[noise] * bool(noise),
         *[rest] * bool(rest),
         *[held] * bool(held),
+        *_model_error_remarks(problem, subset, other.of, beyond),
         *(finding.note for finding in beyond),
     )
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
+
+
+def _model_error_remarks(
+    problem: Problem, draws: FloatArray, of: str, beyond: Iterable[Finding]
+) -> tuple[str, ...]:
+    """Say of an unlike drive that what the model misses follows the drive, where it does."""
+    locks = (
+        drive_locks(problem.posterior, draws, generator(problem.config.seed, "drive lock"))
+        if beyond
+        else {}
+    )
+    return tuple(
+        "what the model misses follows the drive, and this drive is unlike the training record's: "
+        "the bands may miss it"
+        for name, lock in locks.items()
+        if name == of and lock.locked
+    )
 
 
 def planned_noise(record: Record) -> str:
