@@ -147,7 +147,9 @@ from bwbayes.app import verbs
 verbs.VERBS += (verbs.Verb("my_product:reach"), verbs.Verb("my_product:far"))
 import bwbayes
 from bwbayes.app.commands import cli
-said = []
+from bwbayes.app.running.progress import StepProgress
+said, steps = [], []
+StepProgress.__call__ = lambda _, *step: steps.append(step)
 for line in json.loads(sys.argv[1]):
     out, err = io.StringIO(), io.StringIO()
     sys.argv = ["bwbayes", *line.split()]
@@ -155,7 +157,8 @@ for line in json.loads(sys.argv[1]):
         try:
             cli.main()
         except SystemExit as end:
-            said.append((end.code, out.getvalue(), err.getvalue()))
+            said.append((end.code, out.getvalue(), err.getvalue(), steps))
+            steps = []
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     um = bwbayes.open_run("failed").reach(after=1.0).um
@@ -210,8 +213,11 @@ def test_a_product_gets_its_command(product: tuple[dict[int, Any], tuple[Any, ..
     assert "reach [OPTIONS] FOLDER Say how far" in help_text
     assert "Example: bwbayes reach results/my --after 2" in help_text
     assert "--after FLOAT Time from which on it counts, s. [default: 0.0]" in help_text
-    status, out, err = said[2]
+    status, out, err, steps = said[2]
     assert (0, "") == (status, err)
+    shares = [share for name, share in steps if name == "records"]
+    assert [0.0, 1.0] == [shares[0], shares[-1]]
+    assert shares == sorted(shares)
     assert re.search(r"It moves by [\d.]+ um\.\n", out)
     assert "wrote out/reach.json\n" in out
     refused = {
@@ -222,9 +228,9 @@ def test_a_product_gets_its_command(product: tuple[dict[int, Any], tuple[Any, ..
         9: "Missing argument 'LEAST'.",
     }
     for number, line in refused.items():
-        assert [2, "", f"bwbayes: {line}\n"] == said[number]
-    assert [3, "", "VALIDATION FAILED: held-out: it does not hold\n"] == said[7]
-    status, out, err = said[8]
+        assert [2, "", f"bwbayes: {line}\n"] == said[number][:3]
+    assert [3, "", "VALIDATION FAILED: held-out: it does not hold\n"] == said[7][:3]
+    status, out, err, _ = said[8]
     assert (5, "it does not move far enough\n") == (status, err)
     assert "It moves by 3 um." in out
 

@@ -32,8 +32,7 @@ from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedErr
 COMMANDS = {
     "fitting": ("check", "init", "report", "resume", "run"),
     "products": ("predict",),
-    "reference": ("config", "models"),
-    "studies": ("calibrate", "campaign", "compare", "simulate"),
+    "studies": ("calibrate", "campaign", "compare", "config", "models", "simulate"),
 }
 
 

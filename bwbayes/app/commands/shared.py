@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -21,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 from rich.console import Console
 
 from bwbayes.app.config import LARGEST_SEED
@@ -185,24 +185,13 @@ def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, An
 
 def command_as_typed() -> str:
     """Return the command as it was typed, but for the options that say which columns are meant."""
-    context = click.get_current_context()
-    words = ["bwbayes", str(context.info_name)]
-    for parameter in context.command.params:
-        key = str(parameter.name)
-        if (
-            key in ("columns", "units", "fs")
-            or context.get_parameter_source(key) != ParameterSource.COMMANDLINE
-        ):
-            continue
-        value = context.params[key]
-        is_option = isinstance(parameter, click.Option)
-        for given in value if is_option and parameter.multiple else [value]:
-            if isinstance(parameter, click.Option) and parameter.is_flag:
-                words += [parameter.opts[0] if given else parameter.secondary_opts[0]]
-            else:
-                values = given if isinstance(given, tuple) else [given]
-                words += [parameter.opts[0]] * is_option
-                words += [f"{item:g}" if isinstance(item, float) else str(item) for item in values]
+    words, typed = ["bwbayes"], iter(sys.argv[1:])
+    for word in typed:
+        flag, has_value, _ = word.partition("=")
+        if flag not in ("--column", "--unit", "--fs"):
+            words.append(word)
+        elif not has_value:
+            next(typed)
     return shlex.join(words)
 
 

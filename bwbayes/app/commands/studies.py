@@ -1,4 +1,4 @@
-"""Studies of many fits, ``calibrate``, ``campaign`` and ``compare``, and ``simulate``."""
+"""What needs no run: studies of many fits, ``simulate``, and the reference that is printed."""
 
 from __future__ import annotations
 
@@ -178,3 +178,29 @@ def compare(
     out = out or Path("results") / (f"{paths[0].stem}-comparison" if alone else "comparison")
     comparison = compare_runs(*paths, models=models, folder=out, progress=not quiet, **options)
     return present(comparison, [out / "comparison.html"], comparison.standing, quiet=quiet)
+
+
+@click.command()
+@click.argument("key", required=False)
+def config(key: str | None) -> int:
+    """Print the keys of a config: type, unit, default and an example; of all, or of one KEY.
+
+    Example: bwbayes config record.train
+    """
+    from bwbayes.app.config.reference import config_reference
+
+    click.echo(config_reference(key))
+    return 0
+
+
+@click.command(cls=WithParts)
+@click.argument("name", required=False)
+def models(name: str | None) -> int:
+    """Print the parts of a model, or of one NAME its equation, parameters and default priors.
+
+    Example: bwbayes models prandtl-ishlinskii
+    """
+    from bwbayes.app.config.reference import parts_reference
+
+    click.echo(parts_reference(name))
+    return 0
