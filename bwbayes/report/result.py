@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,14 @@ from bwbayes.prediction.steps import StepResponse
 from bwbayes.sampling.diagnostics import Outcome
 from bwbayes.shown import brief
 
+RENAMED = {
+    "agreement": "consistency",
+    "bands": "predictions",
+    "learned": "information_gain",
+    "replicated": "posterior_checks",
+    "steps": "step_responses",
+}
+
 
 @dataclass(frozen=True)
 class Result:
@@ -47,16 +55,16 @@ class Result:
         density is that of the chain's own.
     moves
         How often each kind of move was proposed to a walker for these draws, and accepted.
-    bands, scores, verdicts
+    predictions, scores, verdicts
         Of all that was predicted; by the bands' names, for those with a measurement, their scores,
         and whether they hold. Empty unless converged, as is all that was worked out below.
-    innovations, drive_locks, agreement, explanations, replicated
+    innovations, drive_locks, consistency, explanations, posterior_checks
         By fitted record: the innovation of each reading at the most probable draw; whether what the
         model misses follows the drive; of several, how it agrees with the others; what may explain
         it better, the best first; where it lies among replicated records.
-    loops, steps
+    loops, step_responses
         The loops of the actuator, measured, and its responses to the predicted steps by name.
-    learned
+    information_gain
         Information gained from the data: prior against posterior.
     facts
         What was run, for people: one line each, by subject.
@@ -74,20 +82,27 @@ class Result:
     draws: FloatArray
     log_density: FloatArray
     moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    bands: tuple[Bands, ...] = ()
+    predictions: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
     loops: Loops | None = None
-    steps: Mapping[str, StepResponse] = field(default_factory=dict)
-    agreement: Mapping[str, Agreement] = field(default_factory=dict)
+    step_responses: Mapping[str, StepResponse] = field(default_factory=dict)
+    consistency: Mapping[str, Agreement] = field(default_factory=dict)
     explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
-    learned: InformationGain | None = None
-    replicated: Mapping[str, PredictiveChecks] = field(default_factory=dict)
+    information_gain: InformationGain | None = None
+    posterior_checks: Mapping[str, PredictiveChecks] = field(default_factory=dict)
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            """Say what is called otherwise now."""
+            now = f"; it is {RENAMED[name]} now" if name in RENAMED else ""
+            raise AttributeError(f"a result has no attribute {name!r}{now}")
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -102,7 +117,7 @@ class Result:
     @property
     def looped(self) -> list[Bands]:
         """The bands that have a loop: a step has none."""
-        return [bands for bands in self.bands if bands.name not in self.steps]
+        return [bands for bands in self.predictions if bands.name not in self.step_responses]
 
     @property
     def standing(self) -> Standing:
@@ -175,8 +190,9 @@ def summary(result: Result) -> dict[str, object]:
     if len(innovations) == 1:
         # Those of one record stand alone, those of several by their names.
         innovations = next(iter(result.innovations.values())).numbers
-    if result.agreement:
-        numbers["agreement"] = {n: record.numbers for n, record in result.agreement.items()}
+    if result.consistency:
+        numbers["agreement"] = {n: record.numbers for n, record in result.consistency.items()}
+    gain = result.information_gain
     return numbers | {
         "parameters": result.estimates,
         "validation": result.validation,
@@ -184,10 +200,10 @@ def summary(result: Result) -> dict[str, object]:
         "validated_drives": result.facts.get("drive") if result.standing.holds else None,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
-        "step_responses": {name: step.numbers for name, step in result.steps.items()},
-        "identifiability": None if result.learned is None else result.learned.numbers,
+        "step_responses": {name: step.numbers for name, step in result.step_responses.items()},
+        "identifiability": None if gain is None else gain.numbers,
         "model_error": {name: lock.numbers for name, lock in result.drive_locks.items()},
-        "replicated": {n: checks.numbers for n, checks in result.replicated.items()} or None,
+        "replicated": {n: checks.numbers for n, checks in result.posterior_checks.items()} or None,
         "explanations": {
             name: [explanation.numbers for explanation in explanations]
             for name, explanations in result.explanations.items()

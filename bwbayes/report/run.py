@@ -71,7 +71,9 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
         moves.append(Text(f"validation passed {drives_like(result.facts)}", on="screen"))
     shown = ("record", "fitted", "model", "noise")
     about = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
-    held_out = [f"{bands.name} ({_span(bands)})" for bands in result.bands if not bands.training]
+    held_out = [
+        f"{bands.name} ({_span(bands)})" for bands in result.predictions if not bands.training
+    ]
     about += [f"predicted: {', '.join(held_out)}"] * bool(held_out)
     return Report(
         title=result.name,
@@ -151,7 +153,7 @@ def _sampled(result: Result) -> str:
 def _results(result: Result) -> list[Text]:
     """Return what the bands did on readings that were not fitted, or else on those that were."""
     texts = []
-    scored = [bands for bands in result.bands if bands.name in result.scores]
+    scored = [bands for bands in result.predictions if bands.name in result.scores]
     for bands in [bands for bands in scored if not bands.training] or scored:
         scores, verdict = result.scores[bands.name], result.verdicts.get(bands.name)
         status = Markup("validation {}. ").format(mark(verdict.status)) if verdict else ""
@@ -178,7 +180,7 @@ def _results(result: Result) -> list[Text]:
 
 
 def _evidence(result: Result, pictures: Pictures) -> list[Block]:
-    ordered = sorted(result.bands, key=lambda bands: bands.training)  # held out first
+    ordered = sorted(result.predictions, key=lambda bands: bands.training)  # held out first
     shown = [pictures[f"bands_{bands.name}"] for bands in ordered]
     # Of several records "innovations_NAME" is one of the innovations.
     for kind in ("agreement", "coverage", "innovations", "spectrum"):
@@ -207,8 +209,8 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         terms = [pair for pair in LOOP_TERMS.items() if any(r.startswith(pair[0]) for r in rows)]
         loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
         blocks.append(Section("Loops", loops, folded=False))
-    if result.steps:
-        steps: list[Block] = [tables.steps_table(result.steps), pictures["steps"]]
+    if result.step_responses:
+        steps: list[Block] = [tables.steps_table(result.step_responses), pictures["steps"]]
         blocks.append(Section("Step responses", steps, folded=False))
     return blocks
 
@@ -216,11 +218,11 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
 def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> Iterator[Section]:
     priors = priors_table(JointPrior(result.parameters))
     yield Section("Priors and fixed values", [replace(priors, on="page")])
-    if result.learned is not None:
-        remarks = [Text(str(finding)) for finding in result.learned.findings]
-        table = tables.learned_table(result, result.learned)
+    if result.information_gain is not None:
+        remarks = [Text(str(finding)) for finding in result.information_gain.findings]
+        table = tables.learned_table(result, result.information_gain)
         yield Section("Information gained from the data", [table, *remarks])
-    if result.replicated:
+    if result.posterior_checks:
         note = (
             "Each number of the fitted readings, among those of records that posterior draws make "
             "anew with their own noise; p: the part of these that is larger. Extreme: among "

@@ -123,13 +123,13 @@ def replicated_tables(result: Result) -> list[Table]:
         "Extreme": "{extreme}",
     }
     tables = []
-    for name, checked in result.replicated.items():
+    for name, checked in result.posterior_checks.items():
         rows = []
         for kind, statistic in checked.statistics.items():
             words, unit = STATISTICS[kind]
             row = {"words": words, "unit": unit_text(unit), **vars(statistic)}
             rows.append(row | {"extreme": "extreme" if statistic.extreme else ""})
-        of = f" of {name}" if len(result.replicated) > 1 else ""
+        of = f" of {name}" if len(result.posterior_checks) > 1 else ""
         caption = f"Posterior predictive checks{of}"
         tables.append(Table.of(f"replicated-{name}", caption, rows, columns))
     return tables

@@ -124,7 +124,7 @@ def run(
         draws=values,
         log_density=np.zeros(values.shape[:3]),
         moves={"differential evolution": (1000, 123), "mixture": (3800, 1221)},
-        bands=every,
+        predictions=every,
         scores={b.name: scores() for b in every if b.measured is not None},
         facts={"record": "made up", "drive": "-100 to 100 V"},
         remarks=("the sensor was clipped",),

@@ -18,15 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bwbayes as bw
-from bwbayes.app.running import assembling
 from bwbayes.app.running.fingerprint import load, save
+from bwbayes.app.running.stages import STAGES
 from bwbayes.sampling import sampler
 
 
-def content(result: Any, path: Path) -> bytes:
-    """Return what a file of a result's parts holds: types, texts and arrays to the bit."""
-    names = ("bands", "scores", "verdicts", "loops", "innovations", "explanations", "learned")
-    save(path, "now", {name: getattr(result, name) for name in names})
+def content(stage: Any, path: Path) -> bytes:
+    """Return what a file of a stage holds: types, texts and arrays to the bit."""
+    save(path, "now", {"stage": stage})
     return path.read_bytes()
 
 
@@ -34,19 +33,51 @@ def refuse(*_: object) -> None:
     raise AssertionError("worked out again")
 
 
-def test_an_opened_run_works_nothing_out(
-    run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    expected = bw.open_run(run)
-    worked_out = assembling.assemble(expected.problem, expected.chain, expected.outcome)
-    monkeypatch.setattr(assembling, "assemble", refuse)
+@pytest.fixture
+def _nothing_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for stage in STAGES.values():
+        monkeypatch.setattr(stage, "compute", refuse)
     monkeypatch.setattr(sampler, "sample", refuse)
+
+
+@pytest.mark.usefixtures("_nothing_computed")
+def test_an_opened_run_computes_nothing(run: Path) -> None:
     opened = bw.open_run(run)
     assert opened.converged
-    first, second = (content(r, tmp_path / "result.npz") for r in (worked_out, opened.result))
-    assert first == second
     assert opened.bands
+    assert set(vars(opened.result)) > set(STAGES)
     assert "converged" in str(opened)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_is_the_same_computed_alone_read_or_after_the_others(
+    run: Path, tmp_path: Path, name: str
+) -> None:
+    alone = getattr(bw.open_run(run).knowing(kept={}), name)
+    kept = bw.open_run(run).kept[name]
+    assert content(alone, tmp_path / "alone.npz") == content(kept, tmp_path / "kept.npz")
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_is_computed_once(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    fit, computed = bw.open_run(run).knowing(kept={}), []
+    for other, stage in STAGES.items():
+        monkeypatch.setattr(stage, "compute", lambda *_, other=other: computed.append(other))
+    assert getattr(fit, name) is getattr(fit, name)
+    assert computed == [name]
+    fit.compute()
+    assert sorted(computed) == sorted(STAGES)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_no_stage_speaks_of_an_interval_without_convergence(run: Path, name: str) -> None:
+    fit = bw.open_run(run)
+    fit = fit.knowing(outcome=replace(fit.outcome, converged=False))
+    if STAGES[name].always:
+        assert not getattr(fit.knowing(kept={}), name)
+    else:
+        with pytest.raises(bw.NotConvergedError, match="intervals are withheld"):
+            getattr(fit, name)
 
 
 def test_to_open_a_run_is_to_read_files(run: Path) -> None:
@@ -57,9 +88,10 @@ def test_to_open_a_run_is_to_read_files(run: Path) -> None:
     assert not slow & set(opened.stdout.decode().split())
 
 
+@pytest.mark.usefixtures("_nothing_computed")
 @pytest.mark.parametrize("damage", ["missing", "config", "record"])
 def test_what_is_missing_or_of_another_state_is_worked_out_again(
-    run: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, damage: str
 ) -> None:
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
@@ -73,7 +105,6 @@ def test_what_is_missing_or_of_another_state_is_worked_out_again(
     else:
         config = (folder / "config.toml").read_text(encoding="utf-8")
         (folder / "config.toml").write_text(f'name = "other"\n{config.partition(chr(10))[2]}')
-    monkeypatch.setattr(assembling, "assemble", refuse)
     with pytest.raises(AssertionError, match="worked out again"):
         _ = bw.open_run(folder).result
 

@@ -255,7 +255,7 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
     with artist_of(2) as artist:
         if artist.pool is None:
             pytest.skip("this machine has one core")
-        artist.draw(dataclasses.replace(run, bands=(), scores={}, innovations={}))
+        artist.draw(dataclasses.replace(run, predictions=(), scores={}, innovations={}))
         artist.draw(dataclasses.replace(run, scores={}))
         drawn, plots = artist.drawn(run, tmp_path / "apart")
     here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}

@@ -15,7 +15,6 @@ from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.running import assembling
 from bwbayes.app.running import fingerprint as fingerprint_module
 from bwbayes.app.running.fingerprint import fingerprint, require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
@@ -125,8 +124,7 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert () == version_remarks(noted, {"numpy": "1.0"})
     assert not any("other versions" in r for r in finished(RunFolder(run)).result.remarks)
     installed = versions("numpy")
-    for room in (assembling, fingerprint_module):
-        monkeypatch.setattr(room, "versions", lambda _: installed | {"numpy": "99"})
+    monkeypatch.setattr(fingerprint_module, "versions", lambda _: installed | {"numpy": "99"})
     remarks = finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")

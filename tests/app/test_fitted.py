@@ -74,7 +74,7 @@ def stopped(folder: Path, steps: int = 25) -> Fit:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
     outcome = replace(made.outcome, converged=False, stop_reason=f"step limit {steps} reached")
-    return made.knowing(outcome=outcome, _loaded=None)
+    return made.knowing(outcome=outcome, kept={})
 
 
 # Arrays to bands

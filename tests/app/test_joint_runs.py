@@ -98,7 +98,7 @@ def test_a_run_shows_each_record_by_its_name(finished: RunFolder) -> None:
     assert {"loops", "step"} == numbers["innovations"].keys() == numbers["agreement"].keys()
     assert all(one["agrees"] for one in numbers["agreement"].values())
     made = bwbayes.open_run(finished.path)
-    assert {"step"} <= made.result.steps.keys()
+    assert {"step"} <= made.step_responses.keys()
     drawn = {path.stem for path in (finished.path / "figures").glob("*.png")}
     assert drawn == pictures(made.result).keys()
     assert {"agreement", "bands_loops", "bands_step", "innovations_step"} <= drawn

@@ -15,7 +15,6 @@ from rich.console import Console
 
 from bwbayes.app.fit.fitted import converged, finished
 from bwbayes.app.jobs.check import check
-from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import redraw
@@ -234,17 +233,18 @@ def test_a_check_tells_what_share_of_its_steps_is_done(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_without_pictures")
 def test_a_run_tells_what_share_is_done_until_its_last_file(copy: RunFolder) -> None:
-    fit, steps = finished(copy), Steps()
-    assemble(fit.problem, fit.chain, fit.outcome, watch=steps)
+    copy.result.unlink()
+    steps = Steps()
+    finished(copy).compute(steps)
     steps.require(
-        "remarks",
         "predictions",
-        "innovations",
         "scores",
+        "innovations",
         "loops",
         "explanations",
         "information gain",
         "posterior checks",
+        "remarks",
     )
     written = Steps()
     redraw(copy, written)

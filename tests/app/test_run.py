@@ -14,9 +14,9 @@ import pytest
 import xarray
 
 from bwbayes.app.fit.fitted import finished
-from bwbayes.app.running.assembling import assemble
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
+from bwbayes.app.running.stages import STAGES
 from bwbayes.errors import InputError
 from bwbayes.model.distributions import Distribution
 from bwbayes.record import read_record
@@ -73,7 +73,8 @@ def test_what_is_finished_is_not_worked_out_again(
 ) -> None:
     """So it stays finished, whenever it is interrupted; files that are missing are made again."""
     numbers, before = copy.numbers(), copy.summary.stat().st_mtime_ns
-    monkeypatch.setattr("bwbayes.app.running.run.assemble", None)
+    for stage in STAGES.values():
+        monkeypatch.setattr(stage, "compute", None)
     fit = resume(copy, small.quiet(), workers=1)
     assert fit.converged
     assert copy.summary.stat().st_mtime_ns == before
@@ -109,12 +110,12 @@ def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder)
 def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
     folder = RunFolder(run)
     fit = finished(folder)
-    problem, chain, outcome = fit.problem, fit.chain, fit.outcome
-    outcome = replace(outcome, converged=False)  # no bands are needed
-    assert () == assemble(problem, chain, outcome).remarks
+    outcome = replace(fit.outcome, converged=False)  # no bands are needed
+    fit = fit.knowing(outcome=outcome, kept={})
+    assert () == fit.remarks
     nanometres = Distribution("lognormal", {"median": 1e-3, "sigma": 0.6})
-    odd = replace(problem, defaults={**problem.defaults, "d": nanometres})
-    (remark,) = assemble(odd, chain, outcome).remarks
+    odd = replace(fit.problem, defaults={**fit.problem.defaults, "d": nanometres})
+    (remark,) = finished(folder).knowing(problem=odd, outcome=outcome, kept={}).remarks
     assert "Fix: check its unit" in remark
 
 

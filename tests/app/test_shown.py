@@ -44,7 +44,7 @@ def objects(fit: bw.Fit, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         bw.NotConvergedError("a"),
         *bw.inspect(bw.Record(voltage, -voltage, 0.02)),
         fit.predict(record, lead_in=0.2),
-        *fit.result.bands,
+        *fit.predictions,
         bw.Campaign(CampaignFolder(folder), rows, many),
         fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
         fit.export(folder / "export"),

@@ -11,7 +11,7 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import resolve
-from bwbayes.app.running.assembling import VOLTAGE_NOISE
+from bwbayes.app.running.draws import VOLTAGE_NOISE
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume

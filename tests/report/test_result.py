@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import Verdict
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
-from bwbayes.report.result import summary
+from bwbayes.report.result import RENAMED, summary
 from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
@@ -105,3 +105,11 @@ def test_a_length_keeps_three_digits_at_any_size(um: float) -> None:
     text = length_text(um)
     assert text.endswith(" µm")
     np.testing.assert_allclose(float(text[:-3]), um, rtol=0.0051)
+
+
+@pytest.mark.parametrize("name", [*RENAMED])
+def test_an_earlier_name_is_told_the_new_one(name: str) -> None:
+    run = example.run()
+    assert hasattr(run, RENAMED[name])
+    with pytest.raises(AttributeError, match=f"it is {RENAMED[name]} now"):
+        getattr(run, name)

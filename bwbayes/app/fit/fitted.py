@@ -7,18 +7,17 @@ same functions. Without a folder of one's own it lives in a temporary one, as lo
 from __future__ import annotations
 
 import shutil
-from copy import copy
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MethodType
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.stages import Stages
 from bwbayes.app.verbs import VERBS, Verb
-from bwbayes.errors import InputError, NotConvergedError
+from bwbayes.errors import InputError
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.storage import ChainFile
@@ -27,21 +26,17 @@ if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
-    from bwbayes.app.jobs.at_work import Scratch, at_work
+    from bwbayes.app.jobs.at_work import at_work
     from bwbayes.app.jobs.control import compensate as compensate_fit
     from bwbayes.app.jobs.control import export as export_fit
     from bwbayes.app.jobs.control import track as track_fit
     from bwbayes.app.jobs.design import design as design_fit
     from bwbayes.app.jobs.predict import predict as predict_record
-    from bwbayes.app.problem.problem import Problem
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
-    from bwbayes.diagnosis.validation import Standing, Verdict
-    from bwbayes.prediction.loops import Loops
+    from bwbayes.diagnosis.validation import Standing
     from bwbayes.report.report import Report
-    from bwbayes.report.result import Result
-    from bwbayes.sampling.diagnostics import Outcome
 
 
 class _Method:
@@ -57,11 +52,10 @@ class _Method:
         return method if fit is None else MethodType(method, fit)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Fit(Shown):
+class Fit(Shown, Stages):
     """A record that was fitted: its posterior, its bands, and what to know of them.
 
-    Parameters
+    Attributes
     ----------
     chain
         The draws.
@@ -77,53 +71,10 @@ class Fit(Shown):
     follows from them is worked out, and what it needs is loaded, when it is first asked for.
     """
 
-    chain: ChainFile
-    folder: RunFolder
-    seconds: float = 0.0
-    _scratch: Scratch | None = field(default=None, repr=False)
-
-    def knowing(self, **results: object) -> Self:
-        """Return this fit with attributes that are there already, worked out ones too."""
-        fit = copy(self)
-        fit.__dict__.update(results)  # a cached property is a plain attribute
-        return fit
-
-    @cached_property
-    def problem(self) -> Problem:
-        """What was fitted: config in explicit numbers, record, priors.
-
-        Raises
-        ------
-        InputError
-            Config or records were edited, so that the chain is another posterior's.
-        """
-        from bwbayes.app.running.fingerprint import require_own
-
-        problem = self.folder.problem()
-        require_own(problem, self.folder.chain, self.chain.attributes())
-        return problem
-
     @property
     def name(self) -> str:
         """The name of its config, or else of its operator."""
         return self.problem.config.name or self.problem.config.model.hysteresis
-
-    @cached_property
-    def outcome(self) -> Outcome:
-        """How the sampling ended, or stands."""
-        if self._loaded is not None:
-            return self._loaded.outcome
-        from bwbayes.app.running.workers import open_executor
-        from bwbayes.sampling.sampler import sample
-
-        plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
-        with open_executor(1) as pool:
-            return sample(self.problem.posterior, plan, self.chain, pool)
-
-    @property
-    def converged(self) -> bool:
-        """Whether the sampling has converged."""
-        return self.outcome.converged
 
     @cached_property
     def standing(self) -> Standing:
@@ -131,7 +82,7 @@ class Fit(Shown):
         from bwbayes.diagnosis.validation import Standing
 
         numbers = self.folder.numbers()
-        return Standing.read(numbers) if numbers else self.result.standing
+        return Standing.read(numbers) if numbers else Standing.of(self.verdicts.values())
 
     @property
     def holds(self) -> bool | None:
@@ -139,41 +90,10 @@ class Fit(Shown):
         return self.standing.holds if self.converged else None
 
     @property
-    def verdicts(self) -> dict[str, Verdict]:
-        """Whether the bands hold, and why not, by the bands' name."""
-        return dict(self.result.verdicts)
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What to know of the record, the priors and the fit, one line each."""
-        return self.result.remarks
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """The remarks, what does not hold, and a sampling that has not converged."""
         unconverged = f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
         return (*self.remarks, *self.standing.said, *[unconverged] * (not self.converged))
-
-    @cached_property
-    def result(self) -> Result:
-        """The run in numbers and arrays, as the report is made of."""
-        from bwbayes.app.running.assembling import assemble
-
-        return self._loaded or assemble(self.problem, self.chain, self.outcome)
-
-    @cached_property
-    def _loaded(self) -> Result | None:
-        from bwbayes.app.running.assembling import load_result
-
-        return load_result(self.folder.result, self.problem, self.chain)
-
-    @cached_property
-    def flat_draws(self) -> FloatArray:
-        """All draws, (draws, free), parameters in their own units."""
-        from bwbayes.app.running.assembling import run_draws
-
-        drawn = run_draws(self.problem, self.chain)
-        return drawn.reshape(-1, drawn.shape[-1])
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -182,16 +102,6 @@ class Fit(Shown):
         sampled = draws(posterior, self.chain).reshape(-1, len(posterior.names))
         _, log_prior = posterior.prior.constrain(posterior.prior.unconstrain(sampled))
         return log_density - log_prior.reshape(log_density.shape)
-
-    @property
-    def resuming(self) -> str:
-        """The command that resumes the run, with twice the steps that it had, or all it needs."""
-        return f"bwbayes resume {self.folder.path} --steps {self._more_steps}"
-
-    @property
-    def _more_steps(self) -> int:
-        needed = np.nan_to_num(self.outcome.check.steps_needed, posinf=0.0)
-        return max(2 * self.problem.config.sampling.steps, int(needed))
 
     @property
     def numbers(self) -> dict[str, object]:
@@ -212,7 +122,7 @@ class Fit(Shown):
         """The draws as arviz has them, an xarray.DataTree; its ``converged`` is 1 or 0."""
         from bwbayes.report.outputs import posterior_tree
 
-        return posterior_tree(self.result, self.log_likelihood, self.problem.records)
+        return posterior_tree(self.sampled, self.log_likelihood, self.problem.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -233,7 +143,8 @@ class Fit(Shown):
         """
         import pandas as pd
 
-        return pd.DataFrame.from_dict(self._converged().estimates, orient="index")
+        self.require_converged()
+        return pd.DataFrame.from_dict(self.sampled.estimates, orient="index")
 
     @cached_property
     def bands(self) -> dict[str, Prediction]:
@@ -246,12 +157,13 @@ class Fit(Shown):
         """
         from bwbayes.app.running.predictions import Prediction
 
-        scores, verdicts = self._converged().scores, self.result.verdicts
         return {
             bands.name: Prediction(
-                **vars(bands), scores=scores.get(bands.name), verdict=verdicts.get(bands.name)
+                **vars(bands),
+                scores=self.scores.get(bands.name),
+                verdict=self.verdicts.get(bands.name),
             )
-            for bands in self.result.bands
+            for bands in self.predictions
         }
 
     @property
@@ -273,11 +185,6 @@ class Fit(Shown):
             values[span] = np.where(np.isfinite(residuals), residuals, values[span])
         coords = {"time": ("time", record.time, {"units": "s"})}
         return xr.DataArray(values, coords, "time", "residual", {"units": "um"})
-
-    @property
-    def loops(self) -> Loops | None:
-        """The major and a minor loop and the initial curve: ``fit.loops.major.estimates``."""
-        return self._converged().loops
 
     @property
     def plot(self) -> Plots:
@@ -333,19 +240,6 @@ class Fit(Shown):
             shutil.copyfile(self.folder.backend, copied.backend)
             run.write_files(self, copied, Artist())
         return copied.path
-
-    def require_converged(self) -> None:
-        """Raise a NotConvergedError unless the sampling has converged."""
-        if not self.converged:
-            call = "fit.resume(" if self._scratch else f"bwbayes.resume({str(self.folder.path)!r}, "
-            raise NotConvergedError(
-                f"not converged: {self.outcome.stop_reason}; intervals are withheld; resume with "
-                f"`{call}steps={self._more_steps})`, and look at the traces"
-            )
-
-    def _converged(self) -> Result:
-        self.require_converged()
-        return self.result
 
     @property
     def heading(self) -> str:

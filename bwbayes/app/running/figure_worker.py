@@ -113,7 +113,7 @@ def _works(result: Result) -> dict[str, Callable[[], Any]]:
     from bwbayes.report.figures.pictures import pictures  # noqa: PLC0415
 
     works: dict[str, Callable[[], Any]] = {}
-    if result.bands:
+    if result.predictions:
         works[PLOTS] = partial(plots_of, result)
     for name, picture in pictures(result).items():
         works[name] = partial(picture_of, picture.draw)

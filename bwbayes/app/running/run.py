@@ -21,7 +21,7 @@ from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import Fit, finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.assembling import assemble, load_result, save_result, voltage_noise
+from bwbayes.app.running.draws import voltage_noise
 from bwbayes.app.running.explaining import find_map
 from bwbayes.app.running.figure_worker import Artist
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
@@ -92,9 +92,9 @@ def resume(
             artist.rehearse(problem.posterior)
             problem, chain = _open_chain(folder, problem, console, engine)
             plan = problem.plan
+            fit = Fit(chain, folder).knowing(problem=problem)
             with Progress(console, plan) as progress:
-                known = load_result(folder.result, problem, chain)
-                if known is None:
+                if not fit.kept:
                     # It is written last, as the sign that all is done; now there is more to do.
                     folder.summary.unlink(missing_ok=True)
                 outcome = sample(problem.posterior, plan, chain, pool, progress)
@@ -104,16 +104,13 @@ def resume(
             f"sampled {models} models, {models / ess:.1f} for each of {ess:.0f} effective draws",
             highlight=False,
         )
-        fit = Fit(chain, folder).knowing(problem=problem, outcome=outcome)
+        fit = fit.knowing(outcome=outcome)
         if not predict:
             return fit
-        result = known
-        if result is None:
+        if not fit.kept:
             with StepProgress(console, "computing predictions ...") as watch:
-                result = assemble(problem, chain, outcome, artist, watch)
-        fit = fit.knowing(
-            result=result, standing=result.standing, seconds=time.monotonic() - start_time
-        )
+                fit.compute(watch, artist)
+        fit.seconds = time.monotonic() - start_time
         if answer is not None:
             answer(fit)
         if files and not folder.numbers():
@@ -186,8 +183,8 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist, watch: WatchSteps =
 
     ``watch`` is called with the name of a step and the share of it that is done.
     """
-    fit = fit.knowing(folder=folder)
-    result, numbers, bands = fit.result, fit.numbers, folder.path / "bands.csv"
+    result, bands = fit.result, folder.path / "bands.csv"
+    numbers = fit.knowing(folder=folder).numbers
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
     artist.draw(result)
@@ -198,9 +195,9 @@ def write_files(fit: Fit, folder: RunFolder, artist: Artist, watch: WatchSteps =
         draft.write_bytes(bytes(fit.posterior.to_netcdf(engine="h5netcdf")))
     files(0.3)
     bands.unlink(missing_ok=True)
-    if result.bands:
-        write_bands(bands, result.bands, part(files, 0.3, 0.9))
-    save_result(folder.result, fit.problem, fit.chain, result)
+    if result.predictions:
+        write_bands(bands, result.predictions, part(files, 0.3, 0.9))
+    fit.keep(folder)
     files(1.0)
     pictures, plots = artist.drawn(result, figures, partial(watch, "figures"))
     page = render(fit.report(), pictures, plots)

@@ -47,7 +47,7 @@ def draw(result: Result) -> dict[str, Markup]:
     ``loop`` and ``bands_NAME`` for each of the result's bands; nothing without convergence.
     """
     plots: dict[str, models.Model] = {
-        f"bands_{bands.name}": _series(bands) for bands in result.bands
+        f"bands_{bands.name}": _series(bands) for bands in result.predictions
     }
     loops = [_loop(bands) for bands in sorted(result.looped, key=lambda b: b.training)]
     if loops:

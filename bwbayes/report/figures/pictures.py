@@ -24,11 +24,11 @@ def pictures(result: Result) -> Pictures:
     if result.outcome.converged:
         shown = {
             "loop": (result.looped,),
-            "agreement": (result.agreement,),
+            "agreement": (result.consistency,),
             "loops": (result.loops,),
-            "steps": (result.steps,),
-            **{f"bands_{bands.name}": (bands,) for bands in result.bands},
-            "coverage": (result.scores and result.bands, result.scores),
+            "steps": (result.step_responses,),
+            **{f"bands_{bands.name}": (bands,) for bands in result.predictions},
+            "coverage": (result.scores and result.predictions, result.scores),
         }
         several = len(result.innovations) > 1
         for name, innovations in result.innovations.items():
