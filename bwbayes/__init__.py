@@ -27,12 +27,12 @@ from typing import TYPE_CHECKING
 __all__ = [
     "Bands",
     "Campaign",
-    "Fit",
     "InputError",
     "InputWarning",
     "NotConvergedError",
     "Prediction",
     "Record",
+    "Run",
     "VirtualTestStand",
     "campaign",
     "compare",
@@ -48,7 +48,7 @@ __all__ = [
 
 if TYPE_CHECKING:
     from bwbayes.app.fit.calls import campaign, compare, fit, open_run, resume
-    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.fit.fitted import Run
     from bwbayes.app.running.campaign import Campaign
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.diagnosis.record_checks import inspect
@@ -68,7 +68,9 @@ else:
             (home,) = re.findall(line, Path(__file__).read_text("utf-8"), re.MULTILINE)
             return getattr(import_module(home), name)
         missing = f"module {__name__!r} has no attribute {name!r}"
-        if not name.startswith("_"):
+        if name == "Fit":
+            missing += "; it is bwbayes.Run now"
+        elif not name.startswith("_"):
             # Its room may have it.
             root = Path(__file__).parent
             defined = rf"^(?:(?:class|def) {re.escape(name)}\b|{re.escape(name)}(?::| =))"

@@ -27,7 +27,7 @@ LIMITS = (-100.0, 100.0)
 FREQUENCIES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 
-def fitted(seed: int) -> bw.Fit:
+def fitted(seed: int) -> bw.Run:
     """Return a fit of the paper's record, from the virtual stand with a discrepancy."""
     record = bw.VirtualTestStand().run(bw.signal("identification"), generator(seed, "record"))
     fixed = {"mass": {"fixed": 0.00134}, "stiffness": {"fixed": 4.10e5}}
@@ -43,7 +43,7 @@ def fitted(seed: int) -> bw.Fit:
     )
 
 
-def on_the_stand(fit: bw.Fit) -> Tracking:
+def on_the_stand(fit: bw.Run) -> Tracking:
     """Return how well the true actuator follows, in as many runs as there were draws."""
     one = fit.problem.posterior.only
     stand = bw.VirtualTestStand()

@@ -123,7 +123,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 import numpy as np
-from bwbayes import Fit, InputError
+from bwbayes import InputError, Run
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.errors import ExitStatus
 from bwbayes.report.report import Product, Report, Text, standing_banner
@@ -135,7 +135,7 @@ class Far(Reach):
     shortfall = "it does not move far enough"
     exit_status = ExitStatus.VALIDATION_INCONCLUSIVE
 
-def far(fit: Fit, least: float, watch: WatchSteps = unwatched) -> Far:
+def far(fit: Run, least: float, watch: WatchSteps = unwatched) -> Far:
     """Say whether it moves far."""
     return Far(least, fit.standing)
 '''
@@ -162,7 +162,7 @@ for line in json.loads(sys.argv[1]):
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     um = bwbayes.open_run("failed").reach(after=1.0).um
-text = pydoc.plain(pydoc.render_doc(bwbayes.Fit.reach))
+text = pydoc.plain(pydoc.render_doc(bwbayes.Run.reach))
 method = um, [str(warning.message) for warning in caught], text
 print(json.dumps((said, method)))
 """
@@ -240,5 +240,5 @@ def test_a_product_gets_its_method(product: tuple[dict[int, Any], tuple[Any, ...
     said, (um, warned, text) = product
     assert f"It moves by {um:.3g} um." in said[2][1]
     assert ["VALIDATION FAILED: held-out: it does not hold"] == warned
-    assert re.search(r"\(fit: [\w.]*Fit, \*, after: float = 0\.0", text)
+    assert re.search(r"\(fit: [\w.]*Run, \*, after: float = 0\.0", text)
     assert "Time from which on it counts, s." in text

@@ -59,6 +59,11 @@ def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
         _ = bwbayes.hysterese  # type: ignore[attr-defined]  # this must be an error there too
 
 
+def test_an_earlier_name_is_told_the_new_one() -> None:
+    with pytest.raises(AttributeError, match=r"no attribute 'Fit'; it is bwbayes\.Run now"):
+        _ = bwbayes.Fit  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     ("code", "unwanted"),
     [

@@ -3,7 +3,7 @@
 A verb is a function of a ``fit`` and a ``watch`` that returns a
 :class:`~bwbayes.report.report.Product`. Its command takes the FOLDER of a run, shows how far it is,
 saves and shows the product, and ends with the worse of the run's and the product's status. Its
-method of :class:`bwbayes.Fit` warns of what the command shows. Positional arguments are words,
+method of :class:`bwbayes.Run` warns of what the command shows. Positional arguments are words,
 keyword arguments are options of the same names, types and defaults. The docstring is the help: what
 stands before the parameters, of each parameter the first sentence, and the first command among the
 examples.

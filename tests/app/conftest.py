@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def fit(run: Path) -> bw.Fit:
+def fit(run: Path) -> bw.Run:
     """Return the small run in Python."""
     return bw.open_run(run)
 

@@ -16,7 +16,7 @@ import pytest
 
 import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import resolve
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
@@ -62,7 +62,7 @@ def measured(alpha: float = 0.36) -> Record:
 
 
 @pytest.fixture(scope="module")
-def fits() -> tuple[Fit, Fit]:
+def fits() -> tuple[Run, Run]:
     """Return fits of Bouc-Wen and of a straight line, whose bands do not hold."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
@@ -73,7 +73,7 @@ def fits() -> tuple[Fit, Fit]:
     return bouc_wen, linear
 
 
-def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> None:
+def test_fits_are_compared_and_saved(fits: tuple[Run, Run], tmp_path: Path) -> None:
     """By a method, and at the top; fits of one name by number."""
     bouc_wen, linear = fits
     comparison = linear.compare(bouc_wen, future=False, workers=1)
@@ -104,7 +104,7 @@ def test_fits_are_compared_and_saved(fits: tuple[Fit, Fit], tmp_path: Path) -> N
 
 
 def test_a_comparison_tells_what_share_of_its_steps_is_done(
-    fits: tuple[Fit, Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fits: tuple[Run, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steps = Steps.of_commands(monkeypatch)
     fits[0].compare(fits[1], workers=1, folder=tmp_path / "out", progress=False)
@@ -114,7 +114,7 @@ def test_a_comparison_tells_what_share_of_its_steps_is_done(
     steps.require(*judged, "figures")
 
 
-def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
+def test_what_cannot_be_compared_is_one_line(fits: tuple[Run, Run]) -> None:
     record = measured()
     for given, options, line in (
         ([fits[0]], {}, "compare: one fit alone; give two or more, or a record"),
@@ -140,7 +140,7 @@ def test_what_cannot_be_compared_is_one_line(fits: tuple[Fit, Fit]) -> None:
     ],
 )
 def test_other_readings_are_refused(
-    fits: tuple[Fit, Fit], record: Record, keys: dict[str, Any], line: str
+    fits: tuple[Run, Run], record: Record, keys: dict[str, Any], line: str
 ) -> None:
     """Before anything is worked out, so that it does not matter what the draws are of."""
     config, records = config_of(record, KEYS | keys)

@@ -20,7 +20,7 @@ from tests.app.conftest import Type
 @pytest.mark.filterwarnings(
     "ignore:the reference is smoothed", "ignore:between samples", "ignore:voltage and last reversal"
 )
-def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: Path) -> None:
+def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Run, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
     made = fit.compensate(shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
     files = made.save(tmp_path / "new")
@@ -45,7 +45,7 @@ def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Fit, tmp_path: P
 
 
 @pytest.mark.filterwarnings("ignore:between samples", "ignore:voltage and last reversal")
-def test_a_file_and_an_array_give_one_command(fit: bw.Fit, tmp_path: Path) -> None:
+def test_a_file_and_an_array_give_one_command(fit: bw.Run, tmp_path: Path) -> None:
     """Units of a file's columns are converted; the same seed gives the same bits."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
     path = tmp_path / "asked.csv"
@@ -63,7 +63,7 @@ def test_a_file_and_an_array_give_one_command(fit: bw.Fit, tmp_path: Path) -> No
 
 
 def test_a_shape_is_that_of_the_command_line(
-    bwbayes: Type, run: Path, fit: bw.Fit, tmp_path: Path
+    bwbayes: Type, run: Path, fit: bw.Run, tmp_path: Path
 ) -> None:
     """By its name, with the same numbers; with options left out, the same defaults."""
     shape = "triangle", "--amplitude", 30, "--frequency", 1, "--periods", 2
@@ -85,7 +85,7 @@ def test_a_shape_is_that_of_the_command_line(
 
 @pytest.mark.parametrize(("limit", "status", "kept"), [(1e-3, 3, False), (1e3, 0, True)])
 def test_a_limit_that_is_not_kept_is_no_success(
-    bwbayes: Type, run: Path, fit: bw.Fit, limit: float, status: int, kept: bool
+    bwbayes: Type, run: Path, fit: bw.Run, limit: float, status: int, kept: bool
 ) -> None:
     """The run's validation passed: it ends as a failure alone for the limit, and says why."""
     shape = "triangle", "--amplitude", 30, "--frequency", 1, "--from-rest"
@@ -121,7 +121,7 @@ def test_a_limit_that_is_not_kept_is_no_success(
     ],
 )
 def test_what_is_no_reference_is_one_line(
-    fit: bw.Fit, reference: Any, options: dict[str, Any], line: str
+    fit: bw.Run, reference: Any, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=re.escape(line)) as refused:
         fit.compensate(reference, from_rest=True, voltage=(-100.0, 100.0), **options)
@@ -129,7 +129,7 @@ def test_what_is_no_reference_is_one_line(
 
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
-def test_a_command_after_any_drive_says_what_a_demagnetized_start_would_change(fit: bw.Fit) -> None:
+def test_a_command_after_any_drive_says_what_a_demagnetized_start_would_change(fit: bw.Run) -> None:
     """Where that at least halves the largest error; and nothing of one that is declared so."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
     waited, rested = (fit.compensate(values, from_rest=declared) for declared in (False, True))

@@ -45,7 +45,7 @@ def test_the_best_of_a_file_is_written_for_the_generator(
     bwbayes(*command).assert_refused("best.csv: exists")
 
 
-def test_the_preset_keeps_to_the_amplifiers_limits(fit: bw.Fit) -> None:
+def test_the_preset_keeps_to_the_amplifiers_limits(fit: bw.Run) -> None:
     limits = {"voltage": (0.0, 150.0), "current": 2e-3, "capacitance": 5e-6}
     ranking = fit.design(Path("verification"), **limits)  # type: ignore[arg-type]
     assert not any(promise.refused for promise in ranking if "sine" in promise.name)

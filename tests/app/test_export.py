@@ -35,7 +35,7 @@ def test_the_files_are_the_posteriors_mean(bwbayes: Type, run: Path, tmp_path: P
     assert numbers["limits_V"] == pytest.approx([-100, 100], abs=1)
 
 
-def test_the_controllers_pace_is_an_option(fit: bw.Fit, tmp_path: Path) -> None:
+def test_the_controllers_pace_is_an_option(fit: bw.Run, tmp_path: Path) -> None:
     exported = fit.export(tmp_path, voltage=(-20, 80), rate=1e4, hold="first")
     numbers, code = (tmp_path / name for name in FILES)
     assert code.read_text(encoding="ascii") == exported.c_code()
@@ -60,7 +60,7 @@ def test_the_controllers_pace_is_an_option(fit: bw.Fit, tmp_path: Path) -> None:
     ],
 )
 def test_options_that_make_no_sense_are_one_line(
-    fit: bw.Fit, tmp_path: Path, options: dict[str, Any], line: str
+    fit: bw.Run, tmp_path: Path, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line):
         fit.export(tmp_path / "out", **options)

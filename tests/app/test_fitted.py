@@ -15,7 +15,7 @@ import bwbayes as bw
 from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import run
 from bwbayes.diagnosis.validation import Standing
 from bwbayes.record import Record, read_record
@@ -35,12 +35,12 @@ def record(folder: Path) -> Record:
 
 
 @pytest.fixture(scope="module")
-def opened(folder: Path) -> Fit:
+def opened(folder: Path) -> Run:
     return bw.open_run(folder)
 
 
 @pytest.fixture(scope="module")
-def keys(folder: Path, opened: Fit) -> dict[str, Any]:
+def keys(folder: Path, opened: Run) -> dict[str, Any]:
     """Return tests/app/small.py's config as keyword arguments."""
     return {
         "name": "small",
@@ -61,7 +61,7 @@ def keys(folder: Path, opened: Fit) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def fit(record: Record, keys: dict[str, Any]) -> Fit:
+def fit(record: Record, keys: dict[str, Any]) -> Run:
     """Return a fit of the small run's arrays."""
     arrays = record.voltage, record.displacement
     made = bw.Record.from_arrays(*arrays, interval=record.interval, voltage_is="command")
@@ -70,7 +70,7 @@ def fit(record: Record, keys: dict[str, Any]) -> Fit:
         return bw.fit(replace(made, origin=record.origin, truth=record.truth), **keys)
 
 
-def stopped(folder: Path, steps: int = 25) -> Fit:
+def stopped(folder: Path, steps: int = 25) -> Run:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
     outcome = replace(made.outcome, converged=False, stop_reason=f"step limit {steps} reached")
@@ -80,7 +80,7 @@ def stopped(folder: Path, steps: int = 25) -> Fit:
 # Arrays to bands
 
 
-def test_draws_and_summary_are_labeled_and_agree(fit: Fit) -> None:
+def test_draws_and_summary_are_labeled_and_agree(fit: Run) -> None:
     assert ("chain", "draw") == tuple(fit.draws.sizes)
     table = fit.summary
     assert set(fit.draws.data_vars) == set(table.index)
@@ -91,7 +91,7 @@ def test_draws_and_summary_are_labeled_and_agree(fit: Fit) -> None:
     assert set(fit.posterior.children) >= {"posterior", "sample_stats", "log_likelihood"}
 
 
-def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
+def test_residuals_are_the_readings_less_the_bands_mean(fit: Run) -> None:
     record = fit.problem.record
     assert record.displacement is not None
     residuals = fit.residuals
@@ -105,7 +105,7 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Fit) -> None:
 # What it shows
 
 
-def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
+def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Run) -> None:
     said, page = str(fit), fit._repr_html_()
     for name, row in fit.summary.iterrows():
         for text in (str(name), digits(row["mean"], row["sd"]), digits(row["sd"], row["sd"])):
@@ -119,7 +119,7 @@ def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Fit) -> None:
 
 @pytest.mark.parametrize("holds", [True, False, None])
 def test_the_heading_says_for_which_drives_validation_passed(
-    opened: Fit, holds: bool | None
+    opened: Run, holds: bool | None
 ) -> None:
     heading = opened.knowing(standing=Standing(holds)).heading
     drives = f" for drives like the training record's ({opened.problem.facts['drive']})"
@@ -127,13 +127,13 @@ def test_the_heading_says_for_which_drives_validation_passed(
     assert (drives in heading) == bool(holds)
 
 
-def test_the_notebooks_html_shows_names_as_they_are(opened: Fit) -> None:
+def test_the_notebooks_html_shows_names_as_they_are(opened: Run) -> None:
     config = opened.problem.config.model_copy(update={"name": "<b>x</b>"})
     shown = opened.knowing(problem=replace(opened.problem, config=config), result=opened.result)
     assert "&lt;b&gt;x" in shown._repr_html_()
 
 
-def test_every_figure_is_one_of_matplotlib(opened: Fit) -> None:
+def test_every_figure_is_one_of_matplotlib(opened: Run) -> None:
     names = "loop loops bands coverage innovations spectrum corner trace ranks record"
     for name in names.split():
         assert getattr(opened.plot, name)().axes, name
@@ -147,7 +147,7 @@ def test_every_figure_is_one_of_matplotlib(opened: Fit) -> None:
 
 @pytest.mark.usefixtures("_without_pictures")
 def test_saved_it_is_the_command_lines_run_bit_by_bit(
-    folder: Path, fit: Fit, tmp_path: Path
+    folder: Path, fit: Run, tmp_path: Path
 ) -> None:
     path = fit.save(tmp_path / "copy")
     small.assert_same_end(folder, path)
@@ -175,7 +175,7 @@ def test_saved_it_is_the_command_lines_run_bit_by_bit(
     ],
 )
 def test_a_prediction_is_the_command_lines(
-    folder: Path, opened: Fit, tmp_path: Path, words: tuple[str, ...], options: dict[str, Any]
+    folder: Path, opened: Run, tmp_path: Path, words: tuple[str, ...], options: dict[str, Any]
 ) -> None:
     copy, out = tmp_path / "sine.h5", tmp_path / "theirs.csv"
     shutil.copyfile(folder / "records/sine.h5", copy)
@@ -188,7 +188,7 @@ def test_a_prediction_is_the_command_lines(
 
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
-def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Fit) -> None:
+def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Run) -> None:
     """Not one that is declared so, that starts elsewhere, or whose readings tell its state."""
     sine = 60 * np.sin(np.linspace(0, 12, 200))
     for voltage, declared, expected in (
@@ -207,7 +207,7 @@ def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Fit)
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 @pytest.mark.parametrize(("held", "said"), [(True, True), (False, False)])
 def test_a_lead_in_that_is_only_a_hold_is_said_to_tell_little(
-    opened: Fit, held: bool, said: bool
+    opened: Run, held: bool, said: bool
 ) -> None:
     """With the length of one that moves; nothing where the state is known."""
     first = opened.problem.record
@@ -298,7 +298,7 @@ def test_remarks_of_the_record_are_warnings(
     assert {__file__} == {warning.filename for warning in caught}
 
 
-def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None:
+def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Run) -> None:
     other = read_record(folder / "records/sine.h5")
     assert other.displacement is not None
     turned = replace(other, displacement=-other.displacement)
@@ -311,7 +311,7 @@ def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Fit) -> None
     assert "VALIDATION FAILED" in repr(bands)
 
 
-def test_what_is_no_record_is_not_predicted(opened: Fit) -> None:
+def test_what_is_no_record_is_not_predicted(opened: Run) -> None:
     array: Any = np.zeros(20)
     with pytest.raises(bw.InputError, match="ndarray is no record; give a file, or "):
         opened.predict(array)

@@ -17,7 +17,7 @@ TRUTH = {"alpha": 0.35, "beta": 0.03, "gamma": 0.015}
 EXACT = 0.7 * VOLTAGE - np.ravel(bw.hysteresis(VOLTAGE, **TRUTH))
 
 
-def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Fit:
+def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
     record = bw.Record.from_arrays(voltage, displacement, interval=0.005)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -24,7 +24,7 @@ from tests.population.test_population import drawn
 
 
 @pytest.fixture(scope="module")
-def objects(fit: bw.Fit, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+def objects(fit: bw.Run, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     """Return what public calls return."""
     folder, rng = tmp_path_factory.mktemp("shown"), np.random.default_rng(1)
     time = np.arange(300) / 50

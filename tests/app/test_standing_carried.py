@@ -31,7 +31,7 @@ COMMANDS = {
     "export": (),
     "predict": ("--signal", "step50", "--from-rest"),
 }
-IN_PYTHON: dict[str, Callable[[bw.Fit, Path], Any]] = {
+IN_PYTHON: dict[str, Callable[[bw.Run, Path], Any]] = {
     "compensate": lambda fit, _: fit.compensate("sine", amplitude=20, frequency=1, from_rest=True),
     "design": lambda fit, _: fit.design("d"),
     "export": lambda fit, folder: fit.export(folder),
@@ -99,7 +99,7 @@ def test_each_command_says_it_first_and_ends_with_its_status(
 
 @pytest.mark.parametrize("name", IN_PYTHON)
 def test_python_warns_of_it(
-    name: str, fit: bw.Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, fit: bw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     verdicts = fit.verdicts | {"held-out": verdict(False)}
     monkeypatch.setitem(fit.__dict__, "standing", Standing.of(verdicts.values()))

@@ -18,12 +18,12 @@ from tests.app.conftest import Type
 
 
 def test_numbers_table_and_picture_agree(
-    bwbayes: Type, run: Path, fit: bw.Fit, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    bwbayes: Type, run: Path, fit: bw.Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """As the command writes what Python gives; it is worked out once for both."""
     tracking, asked = fit.track(frequencies=(5.0,), draws=5), dict[str, Any]()
 
-    def track(_: bw.Fit, **options: Any) -> Any:
+    def track(_: bw.Run, **options: Any) -> Any:
         asked.update(options)
         return tracking
 
@@ -71,7 +71,7 @@ def test_numbers_table_and_picture_agree(
     ],
 )
 def test_options_that_make_no_sense_are_one_line(
-    fit: bw.Fit, options: dict[str, Any], line: str
+    fit: bw.Run, options: dict[str, Any], line: str
 ) -> None:
     with pytest.raises(InputError, match=line) as error:
         fit.track(**options)

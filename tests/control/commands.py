@@ -13,7 +13,7 @@ import numpy as np
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
@@ -40,9 +40,9 @@ LIMITS = Limits(-100.0, 100.0)
 SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
 
 
-def fit_of(problem: Problem, flat: FloatArray) -> Fit:
+def fit_of(problem: Problem, flat: FloatArray) -> Run:
     """Return a fit with draws (draws, free) that come from no chain."""
-    fit = Fit(cast(Any, None), RunFolder(Path()))
+    fit = Run(cast(Any, None), RunFolder(Path()))
     return fit.knowing(problem=problem, flat_draws=flat, standing=Standing())
 
 

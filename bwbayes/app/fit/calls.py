@@ -19,7 +19,7 @@ from bwbayes.errors import InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
-    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.fit.fitted import Run
     from bwbayes.app.running.campaign import Campaign
     from bwbayes.comparison.compared import Comparison
     from bwbayes.record import Record
@@ -35,7 +35,7 @@ def fit(
     executor: Any = None,
     progress: bool = True,
     **keys: Any,
-) -> Fit:
+) -> Run:
     """Fit a record: sample the posterior until it has converged, predict and judge.
 
     Parameters
@@ -161,7 +161,7 @@ def compare(
         comparison = bwbayes.compare(fit, other_fit, "results/bender")
     """
     from bwbayes.app.config.keywords import models_of
-    from bwbayes.app.fit.fitted import Fit
+    from bwbayes.app.fit.fitted import Run
     from bwbayes.app.jobs import compare as job
     from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
     from bwbayes.app.running.progress import ProgressLine, StepProgress
@@ -173,7 +173,7 @@ def compare(
     compared_runs = runs[0] if len(runs) == 1 else list(runs)
     listed = compared_runs if isinstance(compared_runs, list | tuple) else [compared_runs]
     if any(
-        isinstance(run, Fit) or (isinstance(run, str | Path) and Path(run).is_dir())
+        isinstance(run, Run) or (isinstance(run, str | Path) and Path(run).is_dir())
         for run in listed
     ):
         for name in [*keys] if models is None else ["models"]:
@@ -223,8 +223,8 @@ def _asked(
     return load(path).renamed(path.stem, None), path.parent, {}
 
 
-def open_run(folder: str | Path) -> Fit:
-    """Open a run's folder, written by :func:`fit`, :meth:`bwbayes.Fit.save` or ``bwbayes run``.
+def open_run(folder: str | Path) -> Run:
+    """Open a run's folder, written by :func:`fit`, :meth:`bwbayes.Run.save` or ``bwbayes run``.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def resume(
     workers: int | None = None,
     executor: Any = None,
     progress: bool = True,
-) -> Fit:
+) -> Run:
     """Continue a run in a folder that was interrupted or is short of its target.
 
     Parameters

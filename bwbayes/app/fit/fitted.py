@@ -1,7 +1,8 @@
-"""A fit as Python users have it: one object with the posterior, its bands, figures and remarks.
+"""A run as Python users have it: one object with the posterior, its bands, figures and remarks.
 
-A :class:`Fit` is a run's folder with the run in memory; ``bwbayes run`` makes the same one by the
-same functions. Without a folder of one's own it lives in a temporary one, as long as the fit does.
+:func:`bwbayes.fit` returns a :class:`Run`, :func:`bwbayes.open_run` opens one, and ``bwbayes run``
+makes the same one by the same functions. Without a folder of one's own it lives in a temporary one,
+as long as the object does.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ class _Method:
     def __init__(self, verb: Verb) -> None:
         self.verb = verb
 
-    def __get__(self, fit: Fit | None, _: object = None) -> Any:
+    def __get__(self, fit: Run | None, _: object = None) -> Any:
         from bwbayes.app.jobs.at_work import at_work
 
         method = at_work(self.verb.load())
         return method if fit is None else MethodType(method, fit)
 
 
-class Fit(Shown, Stages):
-    """A record that was fitted: its posterior, its bands, and what to know of them.
+class Run(Shown, Stages):
+    """What was fitted, with all that is computed of it: posterior, bands, what to know of them.
 
     Attributes
     ----------
@@ -201,7 +202,7 @@ class Fit(Shown, Stages):
         export = at_work(export_fit)
         track = at_work(track_fit)
 
-    def compare(self, *others: Fit, **options: Any) -> Comparison:
+    def compare(self, *others: Run, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.
 
         Options and errors are as in :func:`bwbayes.compare`, which fits models, too.
@@ -210,7 +211,7 @@ class Fit(Shown, Stages):
 
         return compare(self, *others, **options)
 
-    def resume(self, *, progress: bool = True, **options: Any) -> Fit:
+    def resume(self, *, progress: bool = True, **options: Any) -> Run:
         """Continue the sampling, with a new target or budget, and return what comes of it.
 
         Options and errors are as in :func:`bwbayes.resume`.
@@ -262,10 +263,10 @@ class Fit(Shown, Stages):
 
 
 for verb in VERBS:
-    setattr(Fit, verb.name, _Method(verb))
+    setattr(Run, verb.name, _Method(verb))
 
 
-def finished(folder: RunFolder) -> Fit:
+def finished(folder: RunFolder) -> Run:
     """Return the fit that a run's folder holds, as far as its chain goes: only that is read.
 
     Raises InputError: the chain is missing, damaged or still in its pilot.
@@ -273,10 +274,10 @@ def finished(folder: RunFolder) -> Fit:
     chain = ChainFile.read(folder.chain)
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
-    return Fit(chain, folder, folder.numbers().get("wall_s", 0.0))
+    return Run(chain, folder, folder.numbers().get("wall_s", 0.0))
 
 
-def converged(path: Path) -> Fit:
+def converged(path: Path) -> Run:
     """Return the fit in a folder, if it is finished and has converged.
 
     Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
@@ -30,7 +30,7 @@ class Plots:
     without convergence.
     """
 
-    def __init__(self, fit: Fit) -> None:
+    def __init__(self, fit: Run) -> None:
         self._fit = fit
 
     def __getattr__(self, kind: str) -> Callable[..., Figure]:

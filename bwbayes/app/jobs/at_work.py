@@ -19,15 +19,15 @@ from typing import Concatenate
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
 
 
 def at_work[**P, R](
-    job: Callable[Concatenate[Fit, P], R],
-) -> Callable[Concatenate[Fit, P], R]:
+    job: Callable[Concatenate[Run, P], R],
+) -> Callable[Concatenate[Run, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints.
 
     It warns of what the run's bands do not hold, unless its product has bands to judge, and of its
@@ -36,7 +36,7 @@ def at_work[**P, R](
     options = [*signature(job).parameters][1:]
 
     @wraps(job)
-    def method(fit: Fit, /, *args: P.args, **kwargs: P.kwargs) -> R:
+    def method(fit: Run, /, *args: P.args, **kwargs: P.kwargs) -> R:
         for name in kwargs:
             if name not in options:
                 raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")

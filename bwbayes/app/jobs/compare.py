@@ -23,7 +23,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
-from bwbayes.app.fit.fitted import Fit, finished
+from bwbayes.app.fit.fitted import Run, finished
 from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator, joined, training_records
@@ -46,7 +46,7 @@ from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.watching import WatchSteps, unwatched
 
 
-def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:
+def fits_of(runs: Iterable[Any]) -> dict[str, Run]:
     """Return fits by their names, and the runs in folders by the folders'.
 
     Where two would have the same name, folders go by their path, and fits by number too.
@@ -58,7 +58,7 @@ def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:
     if len(set(folders)) < len(folders):
         raise InputError("compare: the same run is there twice; leave one out")
     for number, run in enumerate(runs, start=1):
-        if isinstance(run, Fit):
+        if isinstance(run, Run):
             fits.append(run)
             names.append((run.name, f"{run.name} {number}"))
         elif isinstance(run, str | Path):
@@ -74,7 +74,7 @@ def fits_of(runs: Iterable[Any]) -> dict[str, Fit]:
 
 
 def compare(
-    fits: Mapping[str, Fit],
+    fits: Mapping[str, Run],
     console: Console | None = None,
     *,
     future: bool = True,
@@ -213,7 +213,7 @@ def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison
 
 
 def _candidate(
-    name: str, fit: Fit, pool: Executor, watch: WatchSteps = unwatched, *, future: bool
+    name: str, fit: Run, pool: Executor, watch: WatchSteps = unwatched, *, future: bool
 ) -> Candidate:
     """Work out all that a comparison knows of a fit, but for its validation."""
     problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed

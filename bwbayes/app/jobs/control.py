@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import generator
@@ -44,7 +44,7 @@ from bwbayes.watching import WatchSteps, unwatched
 
 
 def compensate(
-    fit: Fit,
+    fit: Run,
     reference: Literal["sine", "triangle", "staircase", "raster"] | Any,
     *,
     amplitude: float | None = None,
@@ -244,7 +244,7 @@ def _reference(
 
 
 def export(
-    fit: Fit,
+    fit: Run,
     folder: str | Path | None = None,
     *,
     voltage: tuple[float, float] | None = None,
@@ -319,7 +319,7 @@ def at_rate(actuator: Actuator, rate: float | None, hold: Hold) -> Actuator:
 
 
 def track(
-    fit: Fit,
+    fit: Run,
     *,
     frequencies: tuple[float, ...] | None = None,
     amplitude: float | None = None,

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import generator, sampled_waveform
@@ -43,7 +43,7 @@ from bwbayes.watching import WatchSteps, unwatched
 
 
 def design(
-    fit: Fit,
+    fit: Run,
     target: str | Path | ArrayLike,
     *,
     candidates: Mapping[str, ArrayLike] | str | Path = "standard",

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bwbayes.app.fit.fitted import Fit
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
@@ -23,7 +23,7 @@ from bwbayes.watching import Watch, WatchSteps, part, unwatched
 
 
 def predict(
-    fit: Fit,
+    fit: Run,
     record: Record | str | Path | None = None,
     *,
     signal: str | None = None,

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from bwbayes.app.fit.fitted import Fit, finished
+from bwbayes.app.fit.fitted import Run, finished
 from bwbayes.app.problem.alike import options_alike
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
@@ -219,7 +219,7 @@ class Campaign(Product):
         ]
         return pd.DataFrame(lines).astype({"steps": "Int64"}).set_index("record")
 
-    def fit(self, name: str) -> Fit:
+    def fit(self, name: str) -> Run:
         """Return the fit of one record.
 
         Raises
@@ -235,7 +235,7 @@ class Campaign(Product):
         """Predict a specimen that was not measured, along a record or a planned voltage.
 
         Its parameters are drawn from the population; noise and offset are those of the campaign's
-        first record that has converged. `from_rest` and `lead_in` are as in :meth:`Fit.predict`.
+        first record that has converged. `from_rest` and `lead_in` are as in :meth:`Run.predict`.
 
         Raises
         ------

@@ -18,7 +18,7 @@ from functools import partial
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import Fit, finished
+from bwbayes.app.fit.fitted import Run, finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.draws import voltage_noise
@@ -63,8 +63,8 @@ def resume(
     executor: str | Executor | None = None,
     artist: Artist | None = None,
     problem: Problem | None = None,
-    answer: Callable[[Fit], None] | None = None,
-) -> Fit:
+    answer: Callable[[Run], None] | None = None,
+) -> Run:
     """Finish a run, from wherever it stands; progress goes to the console.
 
     ``workers`` and ``executor`` are as of :func:`~bwbayes.app.running.workers.open_executor`; the
@@ -92,7 +92,7 @@ def resume(
             artist.rehearse(problem.posterior)
             problem, chain = _open_chain(folder, problem, console, engine)
             plan = problem.plan
-            fit = Fit(chain, folder).knowing(problem=problem)
+            fit = Run(chain, folder).knowing(problem=problem)
             with Progress(console, plan) as progress:
                 if not fit.kept:
                     # It is written last, as the sign that all is done; now there is more to do.
@@ -119,7 +119,7 @@ def resume(
     return fit
 
 
-def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Fit:
+def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Run:
     """Write the files of a finished run again, from its chain.
 
     ``watch`` is called with the name of a step and the share of it that is done.
@@ -178,7 +178,7 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def write_files(fit: Fit, folder: RunFolder, artist: Artist, watch: WatchSteps = unwatched) -> None:
+def write_files(fit: Run, folder: RunFolder, artist: Artist, watch: WatchSteps = unwatched) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done.
 
     ``watch`` is called with the name of a step and the share of it that is done.
