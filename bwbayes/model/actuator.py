@@ -202,7 +202,7 @@ class Actuator:
         drive, hysteresis = self.drive(column, driven, memory)
         result, equilibrium, filtered = self._follow(column, drive, path, state, unrest)
         if state is None:
-            outputs = self.begin_outputs(column, result[:, :2], from_rest=from_rest)
+            outputs = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
         else:
             outputs = state.outputs
         result, outputs = pass_stages(self.outputs, column, result, outputs, self.clock)
@@ -269,14 +269,14 @@ class Actuator:
         """Return the memories of the stages before the hysteresis at a record's first voltage."""
         models = column["offset"].size
         rest = np.zeros(models) if from_rest else None
-        return begin_stages(self.inputs, column, np.tile(path[:2], (models, 1)), self.clock, rest)
+        return begin_stages(self.inputs, column, np.full(models, path[0]), self.clock, rest)
 
     def begin_outputs(
         self, column: Values, first: FloatArray, *, from_rest: bool
     ) -> tuple[FloatArray, ...]:
-        """Return the memories of the stages behind the dynamics at first displacements.
+        """Return the memories of the stages behind the dynamics at a first displacement (models,).
 
-        (models, few), um, without the offset.
+        Displacements are in um, without the offset.
         """
         rest = self.level_at_rest(column) if from_rest else None
         return begin_stages(self.outputs, column, first, self.clock, rest)

@@ -53,7 +53,9 @@ class Stage(ABC):
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
     starts: ClassVar[Sequence[Mapping[str, float]]] = ({},)
-    """Where to climb from in a search for it: normal scores of its parameters by name."""
+    """Where to climb from in a search: normal scores of parameters by name, also of others that may
+    have taken its place.
+    """
     advice: ClassVar[str] = ""
     """What can be done on the test stand, instead of making it a part of the model."""
 
@@ -98,12 +100,12 @@ class Stage(ABC):
         column: Values,  # noqa: ARG002
         numbers: FloatArray,
         first: FloatArray,
-        slope: FloatArray,  # noqa: ARG002
+        clock: Clock,  # noqa: ARG002
     ) -> FloatArray:
         """Return the memory (models, any) before a first value (models,), not from rest.
 
-        The values rise by ``slope`` (models,) a sample, and did so before. By default as it would
-        be at rest; a parameter of a record's own (in ``column``) may say more.
+        By default as it would be at rest; a parameter of a record's own (in ``column``) may say
+        more.
         """
         return self.settled(numbers, first)[1]
 
@@ -166,7 +168,7 @@ def begin_stages(
     clock: Clock,
     rest: FloatArray | None = None,
 ) -> tuple[FloatArray, ...]:
-    """Return the memories of stages in a row just before a record's first values (models, few).
+    """Return the memories of stages in a row just before a record's first value (models,).
 
     ``rest`` (models,) is the value at zero volts, where the actuator was at rest, if it came
     straight from there; otherwise what was before is not known.
@@ -175,15 +177,14 @@ def begin_stages(
     for stage in stages:
         numbers = stage.numbers(column, clock)
         if rest is None:
-            slope = first[:, 1] - first[:, 0] if first.shape[1] > 1 else np.zeros(len(first))
-            memory = stage.begin(column, numbers, first[:, 0], slope)
+            memory = stage.begin(column, numbers, first, clock)
         else:
             rested, at_rest = stage.settled(numbers, rest)
             # What has no pace has come along the whole path from there.
-            memory = at_rest if stage.rate_independent else stage.settled(numbers, first[:, 0])[1]
+            memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
             rest = rested
         memories.append(memory)
-        first, _ = stage.advance(numbers, memory, first)
+        first = stage.advance(numbers, memory, first[:, np.newaxis])[0][:, 0]
     return tuple(memories)
 
 
@@ -210,12 +211,12 @@ def undo_stages(
         if rest is not None:
             rest = stage.settled(stage.numbers(column, clock), rest)[0]
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
-        numbers, first = stage.numbers(column, clock), values[:, :2].copy()
+        numbers, first = stage.numbers(column, clock), values[:, 0].copy()
         memories = begin_stages((stage,), column, first, clock, rested)
         # What comes out first hangs on what goes in first.
         for _ in range(40):
-            out, _ = stage.advance(numbers, memories[0], first)
-            first = first + (values[:, :2] - out)
+            out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
+            first = first + (values[:, 0] - out[:, 0])
             memories = begin_stages((stage,), column, first, clock, rested)
         values = stage.inverse(numbers, memories[0], values)
     return values

@@ -20,7 +20,7 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 
 # ε, the probability of a specimen to be an outlier, and how many times as wide these are spread.
-ODD, WIDER = 0.1, 10.0
+ODD, WIDER = 0.15, 10.0
 
 
 def population_density(z: FloatArray) -> FloatArray:

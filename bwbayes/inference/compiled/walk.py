@@ -55,7 +55,7 @@ def walk(
         nonlocal memories
         moved = core(last)
         if memories is None:
-            memories = actuator.begin_outputs(column, moved[:, :2], from_rest=from_rest)
+            memories = actuator.begin_outputs(column, moved[:, 0], from_rest=from_rest)
         moved, memories = pass_stages(
             actuator.outputs, column, moved, memories, actuator.clock, advance_stage
         )

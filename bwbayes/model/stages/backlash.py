@@ -74,7 +74,7 @@ class Backlash(Stage):
         column: Values,
         numbers: FloatArray,
         first: FloatArray,
-        slope: FloatArray,  # noqa: ARG002  # where in its play it is, a parameter says
+        clock: Clock,  # noqa: ARG002  # no pace
     ) -> FloatArray:
         """Return y = x + s b, and x."""
         y = first + np.clip(column["backlash_start"], -1.0, 1.0) * numbers[:, 0]

@@ -13,7 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, check, lognormal
+from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal, normal
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import ComplexArray, first_order_lag
 from bwbayes.model.stage import Clock, Side, Stage
 
@@ -62,13 +63,10 @@ class _Lag(Stage):
         return value
 
     def begin(
-        self,
-        column: Values,  # noqa: ARG002
-        numbers: FloatArray,
-        first: FloatArray,
-        slope: FloatArray,
+        self, column: Values, numbers: FloatArray, first: FloatArray, clock: Clock
     ) -> FloatArray:
-        """Return y as far behind x as it falls if x rises steadily."""
+        """Return y as far behind x as it is where x has long moved at the stated speed."""
+        slope = column[self.parameters[1].name] * clock.interval
         before, keep = numbers.T[4:]
         # y = x − g s solves the recursion with x before and y before a slope s less.
         behind = (before + keep) / np.maximum(1.0 - keep, 1e-300)
@@ -95,7 +93,13 @@ class _Lag(Stage):
         return response
 
 
-def _time_constant(name: str, label: str, whose: str) -> tuple[Declaration, ...]:
+def _declared(name: str, label: str, whose: str, unit: str, range_: str) -> tuple[Declaration, ...]:
+    """Declare time constant and speed before the record."""
+
+    def speed(context: Context) -> Distribution:
+        # Of a triangle's slope, twice.
+        return normal(0.0, 4 * getattr(context.ranges, range_) / context.ranges.time)
+
     return (
         Declaration(
             name,
@@ -105,6 +109,15 @@ def _time_constant(name: str, label: str, whose: str) -> tuple[Declaration, ...]
             lambda context: lognormal(0.02 * context.ranges.time, 1.5),
             floor=0.0,
         ),
+        Declaration(
+            f"{name}_speed",
+            f"{unit}/s",
+            rf"v_{{{label[-2]}}}",
+            f"speed before the record of what the {whose} follows",
+            speed,
+            scope="record",
+            at_rest=0.0,
+        ),
     )
 
 
@@ -112,10 +125,10 @@ class AmplifierLag(_Lag):
     """A slow amplifier: τ y′ + y = x, with the command x and the actuator's voltage y, V."""
 
     name: ClassVar = "amplifier-lag"
-    starts: ClassVar = ({}, {"amplifier_lag": 1.0})
+    starts: ClassVar = ({}, {"amplifier_lag": 1.0}, {"amplifier_lag": -0.5, "lag": 0.0})
     advice: ClassVar = "record the amplifier's output voltage"
     side: ClassVar[Side] = "input"
-    parameters = _time_constant("amplifier_lag", r"\tau_a", "amplifier")
+    parameters = _declared("amplifier_lag", "\\tau_{a}", "amplifier", "V", "voltage")
 
     def is_held(self, clock: Clock) -> bool:
         """Tell whether the command is."""
@@ -126,7 +139,7 @@ class SensorLag(_Lag):
     """A slow sensor: τ y′ + y = x, with the displacement x and what is read y, um."""
 
     name: ClassVar = "sensor-lag"
-    starts: ClassVar = ({}, {"sensor_lag": 1.0})
+    starts: ClassVar = ({}, {"sensor_lag": 1.0}, {"sensor_lag": -0.5, "lag": 0.0})
     advice: ClassVar = "widen the sensor's filter"
     side: ClassVar[Side] = "output"
-    parameters = _time_constant("sensor_lag", r"\tau_s", "sensor")
+    parameters = _declared("sensor_lag", "\\tau_{s}", "sensor", "um", "displacement")

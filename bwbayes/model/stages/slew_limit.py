@@ -21,7 +21,7 @@ class SlewLimit(Stage):
     name: ClassVar = "slew-limit"
     side: ClassVar[Side] = "input"
     remembers: ClassVar = 1
-    starts: ClassVar = tuple({"slew_limit": z} for z in (-0.4, -0.6, -0.8, -1.0, -1.5))
+    starts: ClassVar = tuple({"slew_limit": z} for z in (0.5, 0.2, 0.0, -0.3, -0.8))
     advice: ClassVar = "record the amplifier's output voltage, or drive more slowly"
 
     parameters: tuple[Declaration, ...] = (
@@ -30,8 +30,8 @@ class SlewLimit(Stage):
             "V/s",
             "r",
             "largest slope of the amplifier's output",
-            # About half of a triangle's slope: where the drive is slower it says nothing.
-            lambda context: lognormal(4 * context.ranges.voltage / context.ranges.time, 0.7),
+            # A triangle's slope: a limit above the drive's fastest says nothing.
+            lambda context: lognormal(2 * context.ranges.voltage / context.ranges.time, 0.7),
             floor=0.0,
         ),
     )
