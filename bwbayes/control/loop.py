@@ -69,7 +69,8 @@ class LoopNoise(NamedTuple):
         scores = generator.standard_normal((len(theta), model.states))
         state = np.einsum("dj,dji->di", scores, root(model.stationary(theta)))
         while True:
-            yield state @ model.observe, theta[:, 0] * generator.standard_normal(len(theta))
+            sensor = model.sensor_noise(theta, generator.standard_normal((len(theta), 1)))
+            yield state @ model.observe, sensor[:, 0]
             scores = generator.standard_normal(state.shape)
             state = np.einsum("dij,dj->di", kept, state) + np.einsum("dj,dji->di", scores, shocks)
 

@@ -144,10 +144,10 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
     residual = readings.values - posterior.simulate(theta, readings.rows)
     parameters = record.table.noise(theta)
     noise, interval = posterior.likelihood.spaced, record.actuator.interval
-    white, _ = posterior.likelihood.whiten(parameters, residual[:, np.newaxis])
+    white = posterior.likelihood.innovations(parameters, residual)
     return Innovations(
         begin + interval * readings.rows.astype(np.float64),
-        white[0, 0],
+        white[0],
         record.voltage[readings.rows],
         rate(record.voltage, interval)[readings.rows],
         residual[0],

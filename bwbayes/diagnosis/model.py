@@ -20,6 +20,7 @@ from bwbayes.diagnosis.conflict import conflict_fix
 from bwbayes.diagnosis.scene import Explanation, Scene
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.outliers import LIMIT, MOST
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
@@ -193,7 +194,7 @@ def _lines(before: ModelSpec, after: ModelSpec) -> str:
 
 
 def heavy_tails(scene: Scene) -> Iterator[Explanation]:
-    """Try innovations of a Student t distribution, of whatever scale, if any might be set aside."""
+    """Try innovations of a Student t distribution, of whatever scale, if any is an outlier."""
     white = scene.innovations
     far = np.abs(white) > 5
     if not far.any():
@@ -201,9 +202,24 @@ def heavy_tails(scene: Scene) -> Iterator[Explanation]:
     text = f"outliers ({np.sum(far)} of {white.size} innovations beyond 5 SD)"
     others = (scene.posterior.only.readings.values - scene.fit.displacement)[~far]
     rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
-    fix = "set outliers = true in [model]"
-    nats = tail_nats(white) - scene.lead
-    yield Explanation("heavy tails", text, fix, nats=nats, rmse=rmse, foreign=True, noise=True)
+    fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
+    # Not where they are few and far off: tails that hold those would be too heavy for the others.
+    study = scene.study
+    tailed = study is not None and scene.posterior.only.noise.tailed
+    if study is not None and not tailed and nats > isolated_nats(white):
+        before = study.spec
+        spec = before.with_parts(noise=f"{before.noise} + student")
+        fix = _lines(before, spec)
+    yield Explanation(
+        "heavy tails",
+        text,
+        fix,
+        nats=nats - scene.lead,
+        rmse=rmse,
+        foreign=True,
+        noise=True,
+        spec=spec,
+    )
 
 
 def tail_nats(white: FloatArray) -> float:
@@ -221,6 +237,23 @@ def tail_nats(white: FloatArray) -> float:
     # The scale is paid for as its sd of a half over the root of the readings, of a prior's of one.
     cost_of_scale = 0.5 * np.log(2 * white.size)
     return float(scipy.special.logsumexp(densities) - np.log(len(tried)) - cost_of_scale) - normal
+
+
+def isolated_nats(white: FloatArray) -> float:
+    """Return the nats of normal innovations (readings,), in sds, of which some may be anything.
+
+    Each with the same probability, uniform over their range; beyond 6 sds of the others.
+    """
+    far = np.abs(white) > LIMIT * min(1.0, np.median(np.abs(white)) / scipy.special.ndtri(0.75))
+    others, share, size = white[~far], np.mean(far), white.size
+    if share > MOST:
+        return -np.inf  # so many are not set aside
+    density = float(np.sum(scipy.stats.norm.logpdf(others, 0, np.std(others))))
+    density -= float(np.sum(scipy.stats.norm.logpdf(white)))
+    density -= float(np.sum(far) * np.log(np.ptp(white)))
+    # Share and sd are paid for as the scale of `tail_nats` is.
+    cost = size * float(scipy.stats.bernoulli(share).entropy()) + float(np.log(2 * size))
+    return density - cost
 
 
 def growing_noise(scene: Scene) -> Iterator[Explanation]:

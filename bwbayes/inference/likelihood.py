@@ -17,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference import heavy_tails
 from bwbayes.inference.engine import Engine
+from bwbayes.inference.heavy_tails import Followed
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
@@ -131,6 +133,8 @@ class Likelihood:
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """Log density (models,) of the readings at θ (models, parameters)."""
+        if self.noise.tailed:
+            return self._followed(theta).log_density
         return self.start(theta).log_density
 
     def start(self, theta: FloatArray) -> LinearStart:
@@ -140,7 +144,19 @@ class Likelihood:
 
             log p = −½ (|z₀ − Z μ|² + μᵀ P⁻¹ μ + log det V + log det(1 + P Zᵀ Z) + n log 2π),
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
+
+        Where the sensor's noise has heavy tails, by the filter of
+        :mod:`~bwbayes.inference.heavy_tails`, to which the start is a state.
         """
+        if self.noise.tailed:
+            found, states = self._followed(theta), self.noise.states
+            scores = heavy_tails.normal_scores(self.spaced, self.table.noise(theta), found)
+            return LinearStart(
+                found.log_density,
+                np.sum(scores**2, axis=1),
+                found.mean[:, states:],
+                found.covariance[:, states:, states:],
+            )
         if self.engine == "numpy":
             products = self.products_of_series(theta, np.empty((0, self.readings.rows.size)))
         else:
@@ -160,6 +176,9 @@ class Likelihood:
 
             u = Sᵀ (z₀ − Z μ),   I = Sᵀ S − Sᵀ Z C Zᵀ S.
 
+        Where the sensor's noise has heavy tails they are those of normal noise of the variances
+        that it has in effect.
+
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
         at θ, if it is given.
         """
@@ -169,6 +188,9 @@ class Likelihood:
         across = products[:, 1:end][:, :, series]
         explained = np.einsum("mui,muv,mvj->mij", across, start.covariance, across)
         unexplained = products[:, series][:, :, series] - explained
+        if self.noise.tailed:
+            density = self._followed(theta, displacement).log_density
+            return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], density)
         return Score(unexplained[:, 1:, 0], unexplained[:, 1:, 1:], start.log_density)
 
     def _integrated(
@@ -257,12 +279,27 @@ class Likelihood:
         Beside them the log determinant (models,) of the noise's covariance. Shapes are (shapes,
         readings); ``displacement`` is as in :meth:`score`.
         """
+        results = []
+        for rows, noise, series in self._series(theta, shapes, displacement):
+            sensor = None
+            if self.noise.tailed:
+                known = series[:, : 1 + self.unknowns]
+                sensor = self.follow(noise, known, self.start_sd(theta[rows])).sensor
+            white, log_determinant = self.whiten(noise, series, sensor)
+            # Sums, not dot products: a linear algebra library may split those over threads.
+            results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
+        products, determinants = zip(*results, strict=True)
+        return np.concatenate(products), np.concatenate(determinants)
+
+    def _series(
+        self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray | None
+    ) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+        """Yield rows of θ, their noise's parameters, and residual, responses and shapes, um."""
         readings, n_series = self.readings, 1 + self.unknowns + shapes.shape[-2]
         # Shapes are many: NumPy is to have a model's series in the cache. Compiled code takes many
         # models in the time of one.
         elements = 1 << 16 if shapes.size and self.engine == "numpy" else 1 << 23
         every = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
-        results = []
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:
@@ -276,23 +313,55 @@ class Likelihood:
                 sections = self.actuator.sections(self.actuator.columns(model))
                 parts.append(sections.free_responses(readings.samples)[..., readings.where])
             parts.append(every[batch])
-            series = np.concatenate(parts, axis=1)
-            white, log_determinant = self.whiten(noise, series)
-            # Sums, not dot products: a linear algebra library may split those over threads.
-            results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
-        products, determinants = zip(*results, strict=True)
-        return np.concatenate(products), np.concatenate(determinants)
+            yield batch, noise, np.concatenate(parts, axis=1)
 
-    def whiten(self, noise: FloatArray, series: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def whiten(
+        self, noise: FloatArray, series: FloatArray, sensor: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Whiten series (models, series, readings), um, as :meth:`Noise.whiten` does.
 
-        ``noise`` is (models, parameters of the noise).
+        ``noise`` is (models, parameters of the noise); ``sensor`` as in :meth:`Noise.filter`.
         """
+        if self.noise.tailed and sensor is None:
+            sensor = self.follow(noise, series[:, :1], np.empty((len(noise), 0))).sensor
         if self.engine == "numba" and self.noise.states:
             from bwbayes.inference import compiled  # noqa: PLC0415  # as for the products
 
-            return compiled.whiten(self.spaced, noise, series, self.readings.gaps)
+            return compiled.whiten(self.spaced, noise, series, self.readings.gaps, sensor)
+        if sensor is not None:
+            filtered = self.spaced.filter(noise, series, self.readings.skipped, sensor)
+            return filtered.white, filtered.log_determinant
         return self.spaced.whiten(noise, series, self.readings.skipped)
+
+    def innovations(self, noise: FloatArray, residual: FloatArray) -> FloatArray:
+        """Turn residuals (models, readings), um, into innovations, standard normal if all is right.
+
+        ``noise`` is (models, parameters of the noise).
+        """
+        series = residual[:, np.newaxis]
+        if self.noise.tailed:
+            found = self.follow(noise, series, np.empty((len(noise), 0)))
+            return heavy_tails.normal_scores(self.spaced, noise, found)
+        return self.whiten(noise, series)[0][:, 0]
+
+    def follow(self, noise: FloatArray, series: FloatArray, start_sd: FloatArray) -> Followed:
+        """Filter series as :func:`bwbayes.inference.heavy_tails.follow` does."""
+        along = heavy_tails.run
+        if self.engine == "numba":
+            from bwbayes.inference.compiled import tails  # noqa: PLC0415  # as for the products
+
+            along = tails.run
+        skipped = self.readings.skipped
+        return heavy_tails.follow(self.spaced, noise, series, start_sd, skipped, along)
+
+    def _followed(self, theta: FloatArray, displacement: FloatArray | None = None) -> Followed:
+        """Filter the readings at θ (models, parameters); ``displacement`` as in :meth:`score`."""
+        nothing = np.empty((0, self.readings.rows.size))
+        found = [
+            self.follow(noise, series, self.start_sd(theta[rows]))
+            for rows, noise, series in self._series(theta, nothing, displacement)
+        ]
+        return Followed(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def _solved(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

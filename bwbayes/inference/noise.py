@@ -1,6 +1,7 @@
-"""The noises: white, with a rough discrepancy, with a smooth one, or one's own by its import path.
+"""The noises: white, with a rough discrepancy, with a smooth one, with a sensor of heavy tails.
 
-Each is a :class:`~bwbayes.inference.state_space.Noise` that says how its discrepancy goes on.
+Or one's own by its import path. Each is a :class:`~bwbayes.inference.state_space.Noise` that says
+how its discrepancy goes on.
 """
 
 from __future__ import annotations
@@ -67,6 +68,16 @@ DISCREPANCY_QUALITY = Declaration(
     floor=0.0,
     pressed={"upper": "try other parts of the model; what it misses oscillates"},
 )
+# Uniform, so that neither a normal distribution (0) nor a Cauchy (1) is far from anything.
+SENSOR_TAIL = Declaration(
+    "sensor_tail",
+    "",
+    r"1/\nu",
+    "1 over the degrees of freedom of the sensor noise, 0 if it is normal",
+    lambda _: Distribution("uniform", {"lower": 0.0, "upper": 1.0}),
+    floor=0.0,
+    pressed={"upper": "find out what spoils so many readings; a loose contact, a lost bit"},
+)
 
 # The integral over a time, by Gauss and Legendre, where the fast rate times it is below one.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -98,15 +109,52 @@ class WhiteNoise(Noise):
         self,
         theta: FloatArray,
         series: FloatArray,
-        skipped: FloatArray | None = None,  # noqa: ARG002  # nothing is remembered over a gap
+        skipped: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Divide by the sensor's sd."""
+        if self.tailed:
+            return super().whiten(theta, series, skipped)
         log_determinant: FloatArray = 2 * series.shape[2] * np.log(theta[:, 0])
         return series / theta[:, :1, np.newaxis], log_determinant
 
     def correlation_time(self, theta: FloatArray) -> FloatArray:
         """Zero."""
         return np.zeros(len(theta))
+
+
+@dataclass(frozen=True)
+class StudentNoise(WhiteNoise):
+    """Sensor noise of a Student t distribution: now and then a reading is far off.
+
+    Its density with ν degrees of freedom and the scale s is
+
+        p(e) ∝ (1 + e²/(ν s²))^(−(ν + 1)/2),   ``sensor_tail`` = 1/ν.
+
+    1/ν = 0 is the normal one, 1 Cauchy's. It has no sd at ν ≤ 2: ``sensor_sd`` is half the width
+    that holds 68% of it, which is the sd of a normal one, and hardly depends on outliers. Beside a
+    discrepancy, ``"discrepancy + student"``, an outlier is told from it by the readings around: see
+    :mod:`~bwbayes.inference.heavy_tails`.
+
+    Notes
+    -----
+    K. L. Lange, R. J. A. Little, J. M. G. Taylor, Robust statistical modeling using the t
+    distribution, Journal of the American Statistical Association 84, 881-896 (1989),
+    doi:10.1080/01621459.1989.10478852.
+    """
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """The size of the sensor's noise, and one over its degrees of freedom."""
+        return (SENSOR_SD, SENSOR_TAIL)
+
+    @property
+    def tailed(self) -> bool:
+        """It is."""
+        return True
+
+    def inverse_df(self, theta: FloatArray) -> FloatArray:
+        """Return 1/ν."""
+        return theta[:, 1]
 
 
 @dataclass(frozen=True)
@@ -262,6 +310,7 @@ def _oscillation(theta: FloatArray, time: float | FloatArray) -> FloatArray:
 NOISES: Mapping[str, Callable[..., Noise]] = {
     "discrepancy": DiscrepancyNoise,
     "smooth": SmoothNoise,
+    "student": StudentNoise,
     "white": WhiteNoise,
 }
 

@@ -28,6 +28,9 @@ from bwbayes.inference.readings import Readings
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0
 
+# Part of the readings that may be outliers.
+MOST = 0.05
+
 
 def outliers(
     without: Callable[[Mapping[str, IntArray]], Posterior],
@@ -52,7 +55,10 @@ def outliers(
     InputError
         More than one in twenty of a record's readings would be.
     """
-    readings_of = {dataset.name: dataset.readings for dataset in without({}).datasets}
+    datasets = without({}).datasets
+    if any(dataset.noise.tailed for dataset in datasets):
+        raise InputError("model.outliers: noise has heavy tails, which are for outliers; remove it")
+    readings_of = {dataset.name: dataset.readings for dataset in datasets}
     aside: dict[str, BoolArray] = {
         name: np.isin(readings.rows, (suspects or {}).get(name, []))
         for name, readings in readings_of.items()
@@ -76,7 +82,7 @@ def outliers(
         if all(np.array_equal(aside[name], before[name]) for name in aside):
             break
     for mask in aside.values():
-        _require_few(mask, 0.05)
+        _require_few(mask, MOST)
     return {name: readings_of[name].rows[mask] for name, mask in aside.items()}
 
 

@@ -10,7 +10,8 @@ A noise states three things: the stationary covariance P of its states, by which
 on over a time, and the row h that reads the discrepancy from them. The process covariance that
 they gain over that time follows, Q = P − F P Fᵀ. A Kalman filter turns residuals into independent
 innovations, whatever readings are missing; their log density is that of the residuals, exact in
-O(readings). Two noises add up: ``first + second`` has the states of both.
+O(readings). Two noises add up: ``first + second`` has the states of both. The sensor's noise e may
+have heavier tails than a normal distribution, see :mod:`~bwbayes.inference.heavy_tails`.
 
 R. E. Kalman, A new approach to linear filtering and prediction problems, Journal of Basic
 Engineering 82, 35-45 (1960), doi:10.1115/1.3662552.
@@ -29,6 +30,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.inference import heavy_tails
 from bwbayes.model.declaration import Declaration
 
 LOG_TWO_PI = float(np.log(2 * np.pi))
@@ -75,6 +77,15 @@ class Noise(ABC):
     def observe(self) -> FloatArray:
         """The row h (states,) that reads the discrepancy, um, from the states."""
 
+    @property
+    def tailed(self) -> bool:
+        """Whether the sensor's noise has a Student t distribution; by default it is normal."""
+        return False
+
+    def inverse_df(self, theta: FloatArray) -> FloatArray:
+        """Return 1/ν (models,), ν the sensor noise's degrees of freedom; 0 if it is normal."""
+        return np.zeros(len(theta))
+
     @abstractmethod
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return P, the covariance of the states at any time, (models, states, states)."""
@@ -118,7 +129,7 @@ class Noise(ABC):
         return self.observe.size
 
     def marginal_sd(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Stationary sd of the discrepancy and sd of the sensor, each (models,), um."""
+        """Stationary sd of the discrepancy and sd (or scale) of the sensor, each (models,), um."""
         variance = self.observe @ self.stationary(theta) @ self.observe
         return np.sqrt(variance), theta[:, 0]
 
@@ -151,10 +162,15 @@ class Noise(ABC):
     def __add__(self, other: Noise) -> Noise:
         """Return the noise with both discrepancies, and one sensor."""
         terms = [t for n in (self, other) for t in (n.terms if isinstance(n, SumNoise) else (n,))]
+        if sum(term.tailed for term in terms) > 1:
+            raise InputError("noise: two terms with heavy tails, but one sensor; leave one out")
         return SumNoise(self.interval, tuple(term.at(self.interval) for term in terms))
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
         """Log density (models,) of residuals (models, samples) in um."""
+        if self.tailed:
+            nothing = np.empty((len(theta), 0))
+            return heavy_tails.follow(self, theta, residual[:, np.newaxis], nothing).log_density
         white, log_determinant = self.whiten(theta, residual[:, np.newaxis])
         squares = np.sum(white**2, axis=(1, 2))
         density: FloatArray = -0.5 * (squares + log_determinant + residual.shape[1] * LOG_TWO_PI)
@@ -174,13 +190,26 @@ class Noise(ABC):
         return filtered.white, filtered.log_determinant
 
     def filter(
-        self, theta: FloatArray, series: FloatArray, skipped: FloatArray | None = None
+        self,
+        theta: FloatArray,
+        series: FloatArray,
+        skipped: FloatArray | None = None,
+        sensor: FloatArray | None = None,
     ) -> Filtered:
         """Whiten series, and return what is known of the states then; arguments as of `whiten`.
 
+        ``sensor`` (models, readings), um², are variances of each reading's own, by default s²; if
+        the sensor's noise has heavy tails, those in effect where the first series is the residual.
         Once the covariance of all models stays as it is, readings are taken in blocks.
         """
-        observe, sensor, readings = self.observe, theta[:, 0] ** 2, series.shape[2]
+        observe, readings = self.observe, series.shape[2]
+        if self.tailed and sensor is None:
+            nothing = np.empty((len(theta), 0))
+            sensor = heavy_tails.follow(self, theta, series[:, :1], nothing, skipped).sensor
+        varies = sensor is not None
+        sensors = np.broadcast_to(
+            theta[:, :1] ** 2 if sensor is None else sensor, series[:, 0].shape
+        )
         white, log_determinant = np.empty_like(series), np.zeros(len(series))
         mean = np.zeros((*series.shape[:2], self.states))
         predicted = self.stationary(theta)
@@ -190,7 +219,7 @@ class Noise(ABC):
             stays, t = False, first
             while t < last:
                 shared = predicted @ observe
-                variance = shared @ observe + sensor
+                variance = shared @ observe + sensors[:, t]
                 if stays and t < last - 1:
                     # But for the last, after which the step may be another one.
                     ahead = slice(t, last - 1)
@@ -201,7 +230,7 @@ class Noise(ABC):
                     white[..., ahead] = innovations / np.sqrt(variance)[:, np.newaxis, np.newaxis]
                     log_determinant += (last - 1 - t) * np.log(variance)
                     t = last - 1
-                innovation = series[..., t] - mean @ observe
+                innovation, sd = series[..., t] - mean @ observe, np.sqrt(sensors[:, t])
                 white[..., t] = innovation / np.sqrt(variance)[:, np.newaxis]
                 log_determinant += np.log(variance)
                 t += 1
@@ -218,10 +247,10 @@ class Noise(ABC):
                 # Joseph's form, which has no negative eigenvalue however it is rounded.
                 forced = forced.swapaxes(1, 2)
                 onwards = kept - forced * observe
-                forced = forced * np.sqrt(sensor)[:, np.newaxis, np.newaxis]
+                forced = forced * sd[:, np.newaxis, np.newaxis]
                 before, predicted = predicted, onwards @ predicted @ onwards.swapaxes(1, 2)
                 predicted += forced * forced.swapaxes(1, 2) + gained
-                stays = (t - first) % 8 == 0 and _stays(before, predicted)
+                stays = not varies and (t - first) % 8 == 0 and _stays(before, predicted)
         return Filtered(white, log_determinant, mean, predicted)
 
     def density(self, theta: FloatArray, frequency: FloatArray) -> FloatArray:
@@ -254,7 +283,7 @@ class Noise(ABC):
         if self.states == 1:
             for model, (a,) in enumerate(kept[:, 0]):
                 states[model, :, 0] = scipy.signal.lfilter((1.0,), (1.0, -a), states[model, :, 0])
-            return states @ self.observe, theta[:, :1] * scores[:, -1]
+            return states @ self.observe, self.sensor_noise(theta, scores[:, -1])
         for model, matrix in enumerate(kept):
             # F = U T U* with T triangular: from the last one on, each is a recursion by itself.
             triangle, basis = scipy.linalg.schur(matrix, output="complex")
@@ -264,7 +293,13 @@ class Noise(ABC):
                 taps = (1.0, -triangle[row, row])
                 parts[:, row] = scipy.signal.lfilter((1.0,), taps, parts[:, row])
             states[model] = (parts @ basis.T).real
-        return states @ self.observe, theta[:, :1] * scores[:, -1]
+        return states @ self.observe, self.sensor_noise(theta, scores[:, -1])
+
+    def sensor_noise(self, theta: FloatArray, scores: FloatArray) -> FloatArray:
+        """Turn standard normal scores (models, samples) into the sensor's noise, um."""
+        if self.tailed:
+            scores = heavy_tails.quantiles(self.inverse_df(theta), scores)
+        return theta[:, :1] * scores
 
 
 @dataclass(frozen=True)
@@ -293,6 +328,16 @@ class SumNoise(Noise):
                 )
                 declared.append(renamed if declaration.name in taken else declaration)
         return tuple(declared)
+
+    @property
+    def tailed(self) -> bool:
+        """Whether a term's is."""
+        return any(term.tailed for term in self.terms)
+
+    def inverse_df(self, theta: FloatArray) -> FloatArray:
+        """Return that of the term that has heavy tails, if any."""
+        found = [term.inverse_df(own) for term, own in self._split(theta) if term.tailed]
+        return found[0] if found else np.zeros(len(theta))
 
     @property
     def observe(self) -> FloatArray:

@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, Floating
+from bwbayes.inference.heavy_tails import scale_of
 
 
 def stratified_scores(draws: int, rng: np.random.Generator) -> FloatArray:
@@ -43,16 +44,34 @@ def ranked_values(means: Floating, sds: Floating, scores: Floating) -> Floating:
     means
         (samples, draws) mean given a draw, um.
     sds
-        (samples, draws) or (1, draws) standard deviation given a draw, um. If all are zero the
-        values are the means.
+        (samples, draws) or (1, draws) standard deviation given a draw, um, or (samples or 1,
+        scores, draws) of each score. If all are zero the values are the means.
     scores
         (scores, draws) from :func:`stratified_scores`.
     """
     if not sds.any():
         return np.sort(means, axis=1)
-    values = (means[:, np.newaxis] + sds[:, np.newaxis] * scores).reshape(len(means), -1)
+    sds = sds if sds.ndim == 3 else sds[:, np.newaxis]
+    values = (means[:, np.newaxis] + sds * scores).reshape(len(means), -1)
     values.sort(axis=1)
     return values
+
+
+def stratified_scales(scores: FloatArray, inverse_df: FloatArray) -> FloatArray:
+    """Return values of u (scores, draws) for normal scores: √u z has a Student t distribution.
+
+    With 1/ν (draws,) of each draw, scaled as in :mod:`~bwbayes.inference.heavy_tails`. The i-th of
+    the scores in ascending order gets the quantile of the golden ratio's i-th multiple, less its
+    whole part: so any part of the plane of both probabilities holds its share of them, and
+    quantiles of the products are as sure as those of the scores.
+    """
+    ranks = np.argsort(np.argsort(scores, axis=None)).reshape(scores.shape)
+    probability = (0.5 + (np.sqrt(5) - 1) / 2 * ranks) % 1
+    half = 0.5 / np.maximum(inverse_df, 1e-9)
+    scales: FloatArray = (
+        scale_of(inverse_df) ** 2 * half / scipy.special.gammaincinv(half, probability)
+    )
+    return scales
 
 
 def quantile(ranked: Floating, probability: float) -> Floating:
@@ -94,13 +113,13 @@ def crps(ranked: Floating, values: Floating) -> Floating:
     return score
 
 
-def log_density(z: Floating, sds: Floating) -> Floating:
-    """Return the log density (samples,), nats, per um: log (1/S) Σ φ(z) / sd over the S draws.
+def log_density(z: Floating, sds: Floating, log_weights: Floating | float = 0.0) -> Floating:
+    """Return the log density (samples,), nats, per um: log (1/S) Σ a φ(z) / sd over the S draws.
 
     ``z`` (samples, draws) is (value - mean) / sd, and ``sds``, all above zero, as in
-    :func:`ranked_values`. nan where a value is missing.
+    :func:`ranked_values`; ``log_weights`` (draws,) are log a. nan where a value is missing.
     """
-    by_draw = -0.5 * z**2 - np.log(sds)
+    by_draw = -0.5 * z**2 - np.log(sds) + log_weights
     largest = np.max(by_draw, axis=1)
     mean = np.mean(np.exp(by_draw - largest[:, np.newaxis]), axis=1)
     density: Floating = largest + np.log(mean) - 0.5 * math.log(2 * math.pi)

@@ -1,10 +1,10 @@
 """Prediction: from posterior draws to displacement bands, for any voltage.
 
 Every draw simulates the record from its first sample; given a draw, a reading is normal around its
-simulation, and the bands are quantiles of the mixture over all draws. The record is walked through
-in pieces, so memory does not grow with its length. But for a forecast, the discrepancy enters by
-its marginal distribution, on training windows too, where the smoothed one would promise more than a
-new record can keep.
+simulation, or has the heavy tails of its sensor's noise, and the bands are quantiles of the mixture
+over all draws. The record is walked through in pieces, so memory does not grow with its length. But
+for a forecast, the discrepancy enters by its marginal distribution, on training windows too, where
+the smoothed one would promise more than a new record can keep.
 
 Windows of the training record share its simulation and its offset. Another record has a start of
 its own, see :mod:`bwbayes.prediction.initial_state`.
@@ -16,11 +16,13 @@ from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
+from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
@@ -43,6 +45,18 @@ PIECE = 400
 
 # Share of a prediction's time that goes into the states that it starts from, about.
 STATES_SHARE = 0.4
+
+
+class Tails(NamedTuple):
+    """How much larger than s² the variance of a sensor's noise with heavy tails may be.
+
+    ``scales`` (scores, draws) is that of each score of a draw; ``values`` (draws, values) and their
+    ``logs``, the logarithms of their shares, are those of :func:`scale_mixture`.
+    """
+
+    scales: FloatArray
+    values: FloatArray
+    logs: FloatArray
 
 
 def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
@@ -191,7 +205,12 @@ def _bands(
     """Walk through a record from every draw's start, and summarize the mixture over a window."""
     # The same for all predictions: bands differ by what is predicted, not by chance.
     scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
-    sds = posterior.only.noise.marginal_sd(posterior.noise_of_new(theta))
+    noise, parameters = posterior.only.noise, posterior.noise_of_new(theta)
+    sds, tails = noise.marginal_sd(parameters), None
+    if noise.tailed:
+        inverse_df = noise.inverse_df(parameters)
+        scales = mixture.stratified_scales(scores, inverse_df)
+        tails = Tails(scales, *scale_mixture(inverse_df))
     variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
@@ -214,7 +233,9 @@ def _bands(
             if begin <= first:
                 continue
             inside = simulated[:, first - begin :]
-            work = executor.submit(_summarized, start, variances, scores, record, first, inside)
+            work = executor.submit(
+                _summarized, start, variances, scores, tails, record, first, inside
+            )
             pending.append((first - window.start, work))
             totals += inside.sum(axis=1)
             # A few pieces at a time: all of them would not fit into memory.
@@ -246,6 +267,7 @@ def _summarized(
     start: InitialStates,
     variances: Sequence[FloatArray],
     scores: FloatArray,
+    tails: Tails | None,
     record: Record,
     first: int,
     simulated: FloatArray,
@@ -253,7 +275,7 @@ def _summarized(
     """Mean, band edges, and the judgment of the readings, each (samples,).
 
     ``variances`` (draws, 1), um², of offset, discrepancy and sensor are added to the draws with
-    ``scores`` (scores, draws), the same along the whole record.
+    ``scores`` (scores, draws), the same along the whole record, and the sensor's with its tails.
     """
     samples, unknown = simulated.shape[1], np.ones(1)
     expected = simulated
@@ -277,8 +299,11 @@ def _summarized(
     variance = np.zeros(1)
     for kind, added in zip(KINDS, (offset, slow * unknown, white), strict=True):
         means = apart if kind == "parameter" else away
-        variance = variance + added
+        rest, variance = variance, variance + added
         sds = np.sqrt(variance).astype(np.float32).T
+        heavy = tails if kind == "sensor" else None
+        if heavy is not None:
+            sds = np.sqrt(rest.T[:, np.newaxis] + white.T * heavy.scales).astype(np.float32)
         ranked = mixture.ranked_values(means, sds, scores)
         for level in LEVELS:
             tail = (100 - level) / 200
@@ -286,8 +311,15 @@ def _summarized(
             summarized[f"{kind} {level} upper"] = mean + mixture.quantile(ranked, 1 - tail)
         if kind == "sensor" and record.displacement is not None:
             reading = (record.displacement[first : first + samples] - mean).astype(np.float32)
-            z = (reading[:, np.newaxis] - means) / sds
+            z, log_weights = reading[:, np.newaxis] - means, np.zeros(1, dtype=np.float32)
+            if heavy is not None:
+                # Every draw as often as its noise has values, which hold all of the tails.
+                n_values = heavy.values.shape[1]
+                parts = rest.T[..., np.newaxis] + white * heavy.values
+                sds = np.sqrt(parts).astype(np.float32).reshape(len(parts), -1)
+                z = np.repeat(z, n_values, axis=1)
+                log_weights = (heavy.logs.ravel() + np.log(n_values)).astype(np.float32)
             summarized["pit"] = mixture.probability(ranked, reading)
             summarized["crps"] = mixture.crps(ranked, reading)
-            summarized["log_score"] = mixture.log_density(z, sds)
+            summarized["log_score"] = mixture.log_density(z / sds, sds, log_weights)
     return summarized

@@ -73,7 +73,7 @@ def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
     coarse = np.zeros(3000)
     coarse[::7], coarse[3::7] = 3.0, -3.0
     assert model.tail_nats(coarse) > LIMIT
-    seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0)
+    seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0, study=None)
     readings = SimpleNamespace(values=coarse)
     seen.posterior = SimpleNamespace(only=SimpleNamespace(readings=readings))
     seen.fit = SimpleNamespace(displacement=np.zeros(3000))
@@ -81,6 +81,21 @@ def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
     coarse[8] = 600.0
     (found,) = model.heavy_tails(seen)
     assert found.rmse[1] == pytest.approx(np.sqrt(2 * 9 / 7), rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["tails", "few far", "many far"])
+def test_outliers_are_set_aside_where_they_are_few_and_far(kind: str) -> None:
+    """Else the noise gets tails that hold them: those of a t distribution with 2 to 4 df."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        white = rng.standard_normal(2000)
+        if kind == "tails":
+            white = rng.standard_t(rng.uniform(2, 4), size=2000)
+        count = {"tails": 0, "few far": int(rng.integers(5, 60)), "many far": 200}[kind]
+        white[:count] += rng.uniform(8, 100) * rng.choice([-1, 1], count)
+        white /= np.std(white)
+        aside = model.isolated_nats(white) > model.tail_nats(white)
+        assert aside == (kind == "few far")
 
 
 FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import logsumexp, ndtr
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 from bwbayes.arrays import FloatArray, Floating
+from bwbayes.inference.heavy_tails import scale_mixture, scale_of
 from bwbayes.prediction.mixture import (
     crps,
     log_density,
     quantile,
     ranked_values,
+    stratified_scales,
     stratified_scores,
 )
 
@@ -103,3 +105,37 @@ def test_the_log_density_is_that_of_all_components() -> None:
     y = np.array([0.0, 1.0, -3.0, 40.0, 1e4, np.nan])[:, np.newaxis]
     expected = logsumexp(norm.logpdf(y, means, sds), axis=1) - np.log(300)
     np.testing.assert_allclose(log_density((y - means) / sds, sds), expected, rtol=1e-12)
+
+
+def test_heavy_tails_are_in_the_values_and_the_density() -> None:
+    """Quantiles and log density of a mixture of t distributions, to what the draws allow.
+
+    The twin, tails that go with the scores instead of beside them, has other quantiles.
+    """
+    number = 700
+    generator = np.random.default_rng(5)
+    means = 0.2 * generator.normal(size=(3, number))
+    inverse_df = generator.uniform(0.1, 0.9, number)
+    law = t(1 / inverse_df, loc=means, scale=0.5 * scale_of(inverse_df))
+    scores = stratified_scores(number, random())
+    scales = stratified_scales(scores, inverse_df)
+
+    def worst(scales: FloatArray) -> float:
+        ranked = ranked_values(means, 0.5 * np.sqrt(scales)[np.newaxis], scores)
+        errors = [
+            np.abs(law.cdf(quantile(ranked, p)[:, np.newaxis]).mean(axis=1) - p)
+            / np.sqrt(p * (1 - p) / ranked.shape[1])
+            for p in LEVELS
+        ]
+        return float(np.max(errors))
+
+    assert worst(scales) < ALARM / 3
+    order = np.argsort(np.argsort(np.abs(scores), axis=None)).reshape(scores.shape)
+    assert worst(np.sort(scales, axis=None)[order]) > ALARM
+    values, logs = scale_mixture(inverse_df)
+    sds = 0.5 * np.sqrt(values).reshape(1, -1)
+    y = np.array([0.0, 3.0, -60.0])[:, np.newaxis]
+    z = np.repeat(y - means, values.shape[1], axis=1) / sds
+    found = log_density(z, sds, (logs + np.log(values.shape[1])).ravel())
+    expected = logsumexp(law.logpdf(y), axis=1) - np.log(number)
+    np.testing.assert_allclose(found, expected, atol=2e-3)

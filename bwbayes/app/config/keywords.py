@@ -186,8 +186,10 @@ def _changes(name: str) -> dict[str, Any]:
             changes["creep"] = True
         elif word in STAGES:
             changes["stages"] = [*changes["stages"], word]
-        elif word in DYNAMICS or word in NOISES:
-            changes["dynamics" if word in DYNAMICS else "noise"] = word
+        elif word in DYNAMICS:
+            changes["dynamics"] = word
+        elif word in NOISES:
+            changes["noise"] = f"{noise} + {word}" if (noise := changes.get("noise")) else word
         else:
             words = [*TERMS, "creep", *DYNAMICS, *STAGES, *NOISES]
             raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, words)}")

@@ -100,7 +100,9 @@ def chosen_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) ->
     # Innovations less likely than this by chance may be explained by another noise.
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
-    others = [n for n in NOISES if n not in evidence and (n == "white" or p < colored)]
+    # That outliers spoil a record is an explanation, which has its own evidence.
+    known = {*evidence, "student"}
+    others = [n for n in NOISES if n not in known and (n == "white" or p < colored)]
     for noise in watched(others, part(watch, 1 / len(NOISES), 1.0)):
         other = problem.study.with_model(problem.study.spec.with_parts(noise=noise)).posterior
         # What only the other noise has starts at its prior's median.
@@ -175,7 +177,7 @@ def improve_model(
             chosen = max(needless, key=lambda each: each.nats)
             del notes[chosen.kind]
             said = f"left out again: {chosen.kind}"
-        elif parts and not followed_causes(found):
+        elif parts and all(cause.spec is not None for cause in followed_causes(found)):
             chosen, chain = parts[0], problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)

@@ -83,7 +83,11 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
 
 
 def whiten(
-    noise: Noise, theta: FloatArray, series: FloatArray, gaps: tuple[FloatArray, IntArray]
+    noise: Noise,
+    theta: FloatArray,
+    series: FloatArray,
+    gaps: tuple[FloatArray, IntArray],
+    sensor: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return what :meth:`~bwbayes.inference.state_space.Noise.whiten` does, of a noise with states.
 
@@ -94,7 +98,8 @@ def whiten(
     transitions, gained = (np.stack(matrices) for matrices in zip(*steps, strict=True))
     # Each layout of an array would be compiled by itself.
     return whitening.whitened(
-        transitions, gained, noise.stationary(theta), noise.observe, theta[:, 0] ** 2, gaps[1],
+        transitions, gained, noise.stationary(theta), noise.observe,
+        np.ascontiguousarray(theta[:, :1] ** 2 if sensor is None else sensor), gaps[1],
         np.ascontiguousarray(series),
     )  # fmt: skip
 

@@ -36,7 +36,8 @@ def whitened(
     transitions, gained
         F and Q (gaps, models, states, states) over each gap; the first misses no reading.
     stationary, observe, sensor
-        P (models, states, states), h (states,), and the sensor's variance (models,), um².
+        P (models, states, states), h (states,), and the sensor's variance, um², (models, 1), or
+        that of each reading (models, readings).
     gaps
         (readings,) which of the gaps is just before a reading; 0 if none is.
     series
@@ -66,6 +67,7 @@ def _whiten(
 ) -> None:
     """Write what is whitened of models that go together; their covariance goes on in its place."""
     models, count, readings = series.shape
+    varies = sensor.shape[1] > 1
     states, columns = observe.size, models * count
     work, shared = np.empty((3, states, states)), np.empty((models, states))
     variance, log_variance = np.ones(models), np.zeros(models)
@@ -82,9 +84,10 @@ def _whiten(
         for t in range(size):
             step = gaps[first + t + 1] if first + t + 1 < readings else 0
             for model in range(models):
+                at = first + t if varies else 0
                 if not settled[model]:
                     variance[model] = _observe(
-                        covariance[model], observe, sensor[model], shared[model]
+                        covariance[model], observe, sensor[model, at], shared[model]
                     )
                     log_variance[model] = math.log(variance[model])
                 if not settled[model] or step != before:
@@ -103,8 +106,9 @@ def _whiten(
                     # After a gap the covariance is another one, and so are its gains.
                     settled[model] = _advance(
                         covariance[model], transitions[step, model], gained[step, model],
-                        shared[model], observe, sensor[model], variance[model], work,
-                    ) and step == 0  # fmt: skip
+                        shared[model], observe, sensor[model, first + t if varies else 0],
+                        variance[model], work,
+                    ) and step == 0 and not varies  # fmt: skip
         for model in range(models):
             for k in range(count):
                 white[model, k, first : first + size] = values[:size, model * count + k]
