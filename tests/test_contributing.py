@@ -117,7 +117,7 @@ def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(
     assert 0.1 < np.mean(sampler.acceptance_fraction)
 
 
-# What the example of a product imports, and a second product, which is not what was asked for.
+# The imports of the example of a product, and a second product, which falls short.
 IMPORTS = """
 from dataclasses import dataclass
 from functools import partial

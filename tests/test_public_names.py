@@ -24,6 +24,7 @@ import bwbayes as bw
 from bwbayes.app.commands import cli
 from bwbayes.app.commands.shared import as_typed
 from bwbayes.app.jobs.simulate import simulate
+from bwbayes.app.verbs import VERBS
 from bwbayes.errors import InputError, one_line
 from tests.api_reference import every_module
 
@@ -52,6 +53,19 @@ def test_each_public_name_is_documented_and_loaded_from_where_type_checkers_find
         assert module == result.__module__, f"{name} is defined in {result.__module__}"
         # A dataclass without a docstring of its own gets its signature for one.
         assert not (inspect.getdoc(result) or f"{name}(").startswith(f"{name}("), name
+
+
+def test_type_checkers_see_the_methods_that_come_from_verbs() -> None:
+    """The package says that it is typed, and a line in ``Run`` stands for a verb in the table."""
+    assert Path(bwbayes.__file__).with_name("py.typed").exists()
+    source = Path(inspect.getfile(bw.Run)).read_text(encoding="utf-8")
+    typed = set(re.findall(r"^        (\w+) = at_work\(\w+\)$", source, re.MULTILINE))
+    assert typed
+    assert typed <= {verb.name for verb in VERBS}
+    for verb in VERBS:
+        method, function = getattr(bw.Run, verb.name), verb.load()
+        assert inspect.signature(method) == inspect.signature(function)
+        assert inspect.getdoc(method) == inspect.getdoc(function)
 
 
 def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:

@@ -1,15 +1,15 @@
-"""What can be asked of a run, a line each: commands, methods and their help are made of these.
+"""The verbs of a run, a line each, from which their commands, methods and help come.
 
 A verb is a function of a ``fit`` and a ``watch`` that returns a
-:class:`~bwbayes.report.report.Product`. Its command takes the FOLDER of a run, shows how far it is,
+:class:`~bwbayes.report.report.Product`. Its command takes the FOLDER of a run, shows the progress,
 saves and shows the product, and ends with the worse of the run's and the product's status. Its
-method of :class:`bwbayes.Run` warns of what the command shows. Positional arguments are words,
-keyword arguments are options of the same names, types and defaults. The docstring is the help: what
-stands before the parameters, of each parameter the first sentence, and the first command among the
+method of :class:`bwbayes.Run` warns where the command shows a note. Positional arguments are words;
+keyword arguments are options of the same names, types and defaults. The help is the docstring: its
+text before the parameters, the first sentence on each parameter, and the first command among the
 examples.
 
-All that is read from the source: to load it takes a second, for which neither ``--help`` nor
-completion should wait.
+A verb's source is read, not loaded: loading it takes a second, and neither ``--help`` nor
+completion should wait for that.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Verb:
-    """A function, and what the command line calls otherwise.
+    """A function of a run, and its names on the command line where they differ.
 
     Parameters
     ----------
     place
         Where it is: ``"package.module:name"``.
     flags
-        Options that are called otherwise than their arguments.
+        Names of options that differ from their arguments'.
     either
-        Of several ways to give the argument after the fit the one that is meant: a word, an option,
-        or an option with a FILE; and what each is called where none or two are given. The
-        argument's description has a sentence for each.
+        The ways to give the argument after the fit: a word, an option, or an option with a FILE;
+        and how the error for none or two of them calls each. The argument's description has a
+        sentence on each way, in their order.
     below
-        Where below FOLDER the files go, if not where the verb says; NAME is that of the argument.
+        Subfolder of FOLDER for the files, by default the verb's name; NAME is the argument's.
     """
 
     place: str

@@ -28,7 +28,7 @@ from bwbayes.app.commands.shared import as_typed
 from bwbayes.app.verbs import VERBS, Verb
 from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
 
-# What does more than a verb, by the module that it is in.
+# Commands that are more than a verb of a run, by their modules.
 COMMANDS = {
     "fitting": ("check", "init", "report", "resume", "run"),
     "products": ("predict",),

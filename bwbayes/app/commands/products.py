@@ -1,4 +1,4 @@
-"""What is made of a run: the commands of verbs, and ``predict``, which writes bands and no page."""
+"""The commands of a run's verbs, and ``predict``, which writes bands instead of a page."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from bwbayes.errors import ColumnsError, InputError, path_text
 
 
 def command_of(verb: Verb) -> click.Command:
-    """Return the command of a verb: it saves and shows what the verb makes of the run in FOLDER."""
+    """Return the command of a verb, which saves and shows the product of the run in FOLDER."""
     words = _words(verb)
     below = verb.below or verb.name
-    # What is told of the file that it reads, if it reads one.
-    files = [word for word in words if word.type is FILE]
-    told = files if any(name == "reading" for name, *_ in verb.options()) else []
+    # A verb that reads a file takes the options on its columns.
+    reads = any(name == "reading" for name, *_ in verb.options())
+    files = [word for word in words if reads and word.type is FILE]
 
     def command(
         folder: Path, out: Path | None, overwrite: bool, quiet: bool, **options: Any
     ) -> int:
-        for file in told:
+        for file in files:
             options["reading"] = reading_of(options, options[str(file.name)], file.opts[0])
         given = [options.pop(str(word.name)) for word in words]
         arguments = [value for value in given if value is not None]
@@ -52,7 +52,7 @@ def command_of(verb: Verb) -> click.Command:
             from bwbayes.app.fit.fitted import converged
             from bwbayes.report.outputs import refuse_existing
 
-            # What takes long is refused at once, and every single file when it is saved.
+            # Refuse before the computation; saving refuses every single file.
             kind = verb.load(verb.product)
             refuse_existing([out / f"{kind.NAME}.json"], overwrite=overwrite)
             fit = converged(folder)
@@ -60,8 +60,8 @@ def command_of(verb: Verb) -> click.Command:
                 product = verb.load()(fit, *arguments, watch=watch, **options)
             except ColumnsError as error:
                 raise error.in_command(command_as_typed()) from None
-            files = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
-        return present(product, files, fit.standing, quiet=quiet)
+            saved = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
+        return present(product, saved, fit.standing, quiet=quiet)
 
     where = f"Where the files go; default: FOLDER/{below}."
     out_option = click.Option(["--out"], type=FILE, help=where)
@@ -70,13 +70,13 @@ def command_of(verb: Verb) -> click.Command:
     about, *example = verb.help
     text = [about, "FOLDER has the run, with whose status the command ends.", *example]
     decorated = options(overwrite_option(quiet_option(command)))
-    if told:
+    if reads:
         decorated = column_options(decorated)
     return click.command(verb.name, params=first, help="\n\n".join(text))(decorated)
 
 
 def _words(verb: Verb) -> list[click.Parameter]:
-    """Return what gives a verb's arguments after the fit: words, or what it says instead."""
+    """Return the words and options that give a verb's arguments after the fit."""
     words: list[click.Parameter] = []
     for name, hint in verb.words.items():
         kind = type_of(name, hint)

@@ -30,7 +30,7 @@ def at_work[**P, R](
 ) -> Callable[Concatenate[Run, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints.
 
-    It warns of what the run's bands do not hold, unless its product has bands to judge, and of its
+    It warns of a failed validation, the run's unless its product has one of its own, and of the
     product's notes.
     """
     options = [*signature(job).parameters][1:]
