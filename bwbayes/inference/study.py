@@ -116,6 +116,17 @@ class Study:
         )
         return replace(self, spec=spec, stated=stated, per_record=per_record, shared=shared)
 
+    def alone(self, record: str) -> Self:
+        """Return the study of one of the records, with what is stated of its own parameters."""
+        stated = {name.removesuffix(f"[{record}]"): said for name, said in self.stated.items()}
+        return replace(
+            self,
+            records={record: self.records[record]},
+            stated={name: said for name, said in stated.items() if "[" not in name},
+            per_record=(),
+            shared=(),
+        )
+
     @cached_property
     def extent(self) -> Extent:
         """What the model takes from all records."""

@@ -61,6 +61,9 @@ class Bands:
     ``time_offset`` is what the file's own clock adds to the times, s; ``common_sd`` the sd of what
     the parameters leave unsure of all samples alike, as an offset does, um; ``separate`` says that
     it is another record than any that was fitted. The voltage is the path that drives the model.
+    ``model_error_sd`` is what displacement and sensor bands have in them of how much more other
+    models differ on this drive than in training, um; None of a drive like those of training, and
+    where the model's error does not follow the drive.
     """
 
     __repr__ = brief
@@ -84,6 +87,24 @@ class Bands:
     time_offset: float = 0.0
     common_sd: float = 0.0
     separate: bool = False
+    model_error_sd: float | None = None
+
+    @property
+    def model_error_note(self) -> str:
+        """By how much the bands are wider for the model's error, and why; nothing if they are not.
+
+        Of normal distributions.
+        """
+        if not self.model_error_sd:
+            return ""
+        wide = self.sd("sensor")[self.scored_from :]
+        narrow = np.sqrt(np.maximum(wide**2 - self.model_error_sd**2, 0.0))
+        width, before = 2 * scipy.special.ndtri(0.975) * np.array([np.mean(wide), np.mean(narrow)])
+        return (
+            f"what the model misses follows the drive, and other models that fit the training "
+            f"record differ by {self.model_error_sd:.2g} um more on this drive: the 95% sensor "
+            f"band is {width:.2g} um wide instead of {before:.2g} um"
+        )
 
     @property
     def windows(self) -> list[slice]:

@@ -156,6 +156,7 @@ def predict_record(
     name: str = "prediction",
     window: Window | None = None,
     watch: Watch = unwatched,
+    model_error_sd: float | None = None,
 ) -> Bands:
     """Predict another record, or a planned voltage without a measurement.
 
@@ -174,6 +175,8 @@ def predict_record(
     window
         Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
         its first sample in any case.
+    model_error_sd
+        What displacement and sensor bands have in them besides, um.
 
     Raises
     ------
@@ -188,9 +191,23 @@ def predict_record(
     if predicted_window.stop <= start_states.scored_from:
         raise InputError(f"{name}: its lead-in leaves nothing of the window; choose another one")
     predicting = part(watch, STATES_SHARE, 1.0)
-    bands = _bands(name, posterior, theta, start_states, record, predicted_window, predicting)
-    scored_from = max(start_states.scored_from - predicted_window.start, 0)
-    return replace(bands, scored_from=scored_from, lead_in=start_states.lead_in, separate=True)
+    bands = _bands(
+        name,
+        posterior,
+        theta,
+        start_states,
+        record,
+        predicted_window,
+        predicting,
+        model_error_sd or 0.0,
+    )
+    return replace(
+        bands,
+        scored_from=max(start_states.scored_from - predicted_window.start, 0),
+        lead_in=start_states.lead_in,
+        separate=True,
+        model_error_sd=model_error_sd,
+    )
 
 
 def _bands(
@@ -201,6 +218,7 @@ def _bands(
     record: Record,
     window: slice,
     watch: Watch = unwatched,
+    model_error_sd: float = 0.0,
 ) -> Bands:
     """Walk through a record from every draw's start, and summarize the mixture over a window."""
     # The same for all predictions: bands differ by what is predicted, not by chance.
@@ -212,6 +230,7 @@ def _bands(
         scales = mixture.stratified_scales(scores, inverse_df)
         tails = Tails(scales, *scale_mixture(inverse_df))
     variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
+    variances.append(np.full((1, 1), model_error_sd**2))
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(theta))
@@ -274,8 +293,9 @@ def _summarized(
 ) -> dict[str, Floating]:
     """Mean, band edges, and the judgment of the readings, each (samples,).
 
-    ``variances`` (draws, 1), um², of offset, discrepancy and sensor are added to the draws with
-    ``scores`` (scores, draws), the same along the whole record, and the sensor's with its tails.
+    ``variances`` (draws, 1), um², of offset, discrepancy, sensor and the model's error are added to
+    the draws with ``scores`` (scores, draws), the same along the whole record, and the sensor's
+    with its tails.
     """
     samples, unknown = simulated.shape[1], np.ones(1)
     expected = simulated
@@ -295,9 +315,9 @@ def _summarized(
 
     away = about_mean(expected)
     apart = away if expected is simulated else about_mean(simulated)
-    offset, slow, white = variances
+    offset, slow, white, error = variances
     variance = np.zeros(1)
-    for kind, added in zip(KINDS, (offset, slow * unknown, white), strict=True):
+    for kind, added in zip(KINDS, (offset, slow * unknown + error, white), strict=True):
         means = apart if kind == "parameter" else away
         rest, variance = variance, variance + added
         sds = np.sqrt(variance).astype(np.float32).T

@@ -38,7 +38,9 @@ from bwbayes.app.problem.records import (
 from bwbayes.arrays import IntArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.laplace import LocalFit
 from bwbayes.diagnosis.record_checks import isolated_outliers
+from bwbayes.diagnosis.rivals import fit_rivals
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import Parameter
@@ -181,6 +183,12 @@ class Problem:
             part = validation.record is None
             found[name] = [each for each in beyond if not (part and each.kind == "reversals")]
         return found
+
+    @cached_property
+    def rivals(self) -> dict[str, tuple[LocalFit, ...]]:
+        """Models of other families, fitted to each training record alone, by its name."""
+        rng = generator(self.config.seed, "rivals")
+        return {name: fit_rivals(self.study.alone(name), rng) for name in self.records}
 
     def with_noise(self, chosen: str) -> Problem:
         """Return the problem of a run whose noise, ``auto``, came to this one.

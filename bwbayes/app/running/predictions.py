@@ -20,6 +20,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.rivals import disagreement
 from bwbayes.diagnosis.scene import Explanation
 from bwbayes.diagnosis.validation import Background, Standing, Verdict, assess
 from bwbayes.inference.posterior import Posterior
@@ -155,27 +156,10 @@ def predict_another(
         *[noise] * bool(noise),
         *[rest] * bool(rest),
         *[held] * bool(held),
-        *_model_error_remarks(problem, subset, other.of, beyond),
+        *[bands.model_error_note] * bool(bands.model_error_note),
         *(finding.note for finding in beyond),
     )
     return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
-
-
-def _model_error_remarks(
-    problem: Problem, draws: FloatArray, of: str, beyond: Iterable[Finding]
-) -> tuple[str, ...]:
-    """Say of an unlike drive that what the model misses follows the drive, where it does."""
-    locks = (
-        drive_locks(problem.posterior, draws, generator(problem.config.seed, "drive lock"))
-        if beyond
-        else {}
-    )
-    return tuple(
-        "what the model misses follows the drive, and this drive is unlike the training record's: "
-        "the bands may miss it"
-        for name, lock in locks.items()
-        if name == of and lock.locked
-    )
 
 
 def planned_noise(record: Record) -> str:
@@ -318,7 +302,20 @@ def _of_another(
     assert record is not None
     alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
     source = generator(problem.config.seed, f"predict {record.sha256}")
-    return predict_record(alone, own_draws, record, other.start, source, name, other.judged, watch)
+    error = None
+    if beyond and _locked(problem, draws, other.of):
+        rng = generator(problem.config.seed, f"rivals {record.sha256}")
+        rivals = problem.rivals[other.of]
+        error = disagreement(alone, own_draws, rivals, record, other.start, rng)
+    return predict_record(
+        alone, own_draws, record, other.start, source, name, other.judged, watch, error
+    )
+
+
+def _locked(problem: Problem, draws: FloatArray, of: str) -> bool:
+    """Tell whether what the model misses of a training record follows the drive."""
+    rng = generator(problem.config.seed, "drive lock")
+    return drive_locks(problem.posterior, draws, rng)[of].locked
 
 
 def _reaching(

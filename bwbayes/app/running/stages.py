@@ -369,6 +369,8 @@ class Stages:
             remarks += [f"{of[name]}{finding}" for finding in lock.findings]
         for name, explanations in self.explanations.items():
             remarks += [of[name] + line for line in lines(likely_causes(explanations))]
+        for bands in self.predictions:
+            remarks += [f"{bands.name}: {bands.model_error_note}"] * bool(bands.model_error_note)
         for name, verdict in self.verdicts.items():
             remarks += [f"{name}: {note}" for note in verdict.notes]
         return tuple(remarks)

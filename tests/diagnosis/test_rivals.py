@@ -1,0 +1,129 @@
+"""Where what a model misses follows the drive, rivals widen the bands of unlike drives alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bwbayes.app.config.config import parse
+from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.running.predictions import Prediction, predict_another
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.laplace import climb
+from bwbayes.diagnosis.rivals import families
+from bwbayes.inference import map_estimate
+from bwbayes.model.spec import ModelSpec
+from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.record import Record
+from bwbayes.record.io.formats import write_record
+from tests.prediction.runs import covered
+from tests.stand import Stand, play
+
+STAND = Stand(lag=0.005, discrepancy=0.0, sensor=0.05)
+TIME = np.arange(600) / STAND.rate
+DRIVES = {
+    "record": 50 * (1 - np.cos(2 * np.pi * TIME)) * np.exp(-0.1 * TIME),
+    "like": 50 * (1 - np.cos(2 * np.pi * TIME)) * np.exp(-0.1 * TIME),
+    "unlike": 25 * (2 - np.cos(2 * np.pi * 0.9 * TIME) - np.cos(2 * np.pi * 0.23 * TIME)),
+}
+CONFIG = """
+[record]
+file = "record.h5"
+from_rest = true
+[model]
+noise = "smooth"
+[validation.like]
+file = "like.h5"
+[validation.unlike]
+file = "unlike.h5"
+"""
+
+
+def measured(kind: str, voltage: FloatArray, rng: np.random.Generator) -> Record:
+    """Measure a good actuator, or the same behind a mount with backlash."""
+    record = replace(STAND, sensor=0.0).measure(voltage, rng)
+    assert record.displacement is not None
+    moved = record.displacement if kind == "good" else play(record.displacement, 1.0)
+    return replace(record, displacement=moved + STAND.sensor * rng.standard_normal(moved.size))
+
+
+def fitted(kind: str, folder: Path) -> tuple[Problem, FloatArray]:
+    """Return a problem and draws (draws, free) of Laplace's approximation."""
+    rng = np.random.default_rng(54)
+    for name, voltage in DRIVES.items():
+        write_record(measured(kind, voltage, rng), folder / f"{name}.h5")
+    problem = resolve(parse(CONFIG, "config"), folder)
+    posterior = problem.posterior
+    fit = climb(posterior, map_estimate.valleys(posterior, rng, 1))
+    drawn = rng.multivariate_normal(fit.coordinates, fit.covariance, 300, method="eigh")
+    free, density = posterior.prior.constrain(drawn)
+    return problem, free[np.isfinite(density)]
+
+
+def predicted(problem: Problem, draws: FloatArray, name: str) -> Prediction:
+    return predict_another(problem, draws, problem.validations[name], name)
+
+
+def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None:
+    """Like drives have not; the parameters' bands stay, and a note says both widths."""
+    problem, draws = fitted("backlash", tmp_path)
+    assert predicted(problem, draws, "like").model_error_sd is None
+    wide = predicted(problem, draws, "unlike")
+    assert wide.model_error_sd is not None
+    assert wide.model_error_sd > 0
+    assert [note for note in wide.remarks if "um wide instead of" in note] == [
+        wide.model_error_note
+    ]
+    # Rivals that agree.
+    object.__setattr__(problem, "rivals", {"record": ()})
+    narrow = predicted(problem, draws, "unlike")
+    assert narrow.model_error_sd == 0.0
+    assert not narrow.model_error_note
+    for level in LEVELS:
+        for edges in ("lower", "upper"):
+            band = getattr(wide, edges)["parameter", level]
+            assert np.array_equal(band, getattr(narrow, edges)["parameter", level])
+    for kind in KINDS[1:]:
+        added = wide.sd(kind) ** 2 - narrow.sd(kind) ** 2
+        assert np.mean(added) == pytest.approx(wide.model_error_sd**2, rel=0.1)
+    assert np.array_equal(wide.mean, narrow.mean)
+    assert covered(wide) > covered(narrow)
+    assert covered(wide) > covered(narrow)
+
+
+def test_right_model_keeps_its_bands(tmp_path: Path) -> None:
+    """No rival is fitted: the property would be there."""
+    problem, draws = fitted("good", tmp_path)
+    for name in ("like", "unlike"):
+        prediction = predicted(problem, draws, name)
+        assert prediction.model_error_sd is None
+        assert not any("follows the drive" in remark for remark in prediction.remarks)
+    assert "rivals" not in vars(problem)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        ModelSpec(),
+        ModelSpec("duhem", creep=True, creep_growth=True),
+        ModelSpec(gain=("quadratic", "cubic"), stages=("backlash",)),
+        ModelSpec("plays", gain=("cubic",), stages=("backlash", "saturation", "sensor-curve")),
+    ],
+)
+def test_there_is_one_rival_of_each_family(spec: ModelSpec) -> None:
+    """Other operators, each place of the nonlinearity, with creep and without; never the model."""
+    rivals = list(families(spec))
+    assert spec not in rivals
+    assert len({rival.sha256 for rival in rivals}) == len(rivals) >= 5
+    assert {rival.hysteresis for rival in rivals} >= {"bouc-wen", "duhem", "plays"} - {
+        spec.hysteresis
+    }
+    assert {bool(rival.creep) for rival in rivals} == {True, False}
+    assert any("saturation" in rival.stages for rival in rivals)
+    assert any("sensor-curve" in rival.stages for rival in rivals)
+    for rival in rivals:
+        assert ("backlash" in rival.stages) is ("backlash" in spec.stages)
+        assert rival.dynamics == spec.dynamics
