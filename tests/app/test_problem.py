@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import bwbayes
 from bwbayes.app.config.config import parse
+from bwbayes.app.problem import problem as problem_module
 from bwbayes.app.problem.problem import Problem, resolve
-from bwbayes.app.problem.records import generator
+from bwbayes.app.problem.records import generator, windows_of
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
 from bwbayes.record import Record, write_record
+from bwbayes.record.io import formats
+from bwbayes.record.io.fields import record_fields
 from tests.app import small
 from tests.record.spoilt import SPOILT, looping
 
@@ -91,6 +98,26 @@ def test_resolved_config_resolves_to_the_same_numbers(tmp_path: Path) -> None:
             assert one.record.sha256 == other.record.sha256
     z = np.random.default_rng(1).standard_normal((5, first.posterior.prior.dimensions))
     np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
+
+
+def test_a_run_resolves_once_and_reads_each_record_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = small.begun(tmp_path / "made")
+    calls: Counter[str] = Counter()
+
+    def counted(call: Any, *args: Any, **options: Any) -> Any:
+        calls[call.__name__] += 1
+        return call(*args, **options)
+
+    for call, module in ((windows_of, problem_module), (record_fields, formats)):
+        monkeypatch.setattr(module, call.__name__, partial(counted, call))
+    fit = bwbayes.fit(made.config, folder=tmp_path / "run", workers=1, progress=False)
+    assert calls == {"windows_of": 1, "record_fields": 2}
+    # What is in its folder is what was fitted.
+    read = bwbayes.open_run(tmp_path / "run").problem
+    for name in ("config", "digests", "remarks", "facts", "defaults", "plan", "parameters"):
+        assert getattr(read, name) == getattr(fit.problem, name), name
 
 
 @pytest.mark.parametrize("train", ["train = [[1.0, 2.0]]\n", ""])

@@ -121,10 +121,10 @@ def run(
             RunFolder.require_free(path, overwrite)
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
         with working():
-            folder = RunFolder.create(path, resolve(chosen, config.parent), overwrite)
+            problem = resolve(chosen, config.parent)
+            folder = RunFolder.create(path, problem, overwrite)
         with resumable(f"`bwbayes resume {path}`"):
             with working():
-                problem = folder.problem()
                 remarks = problem.remarks
             if not quiet:
                 # Of a record alone the remarks are shown already.

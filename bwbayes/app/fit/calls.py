@@ -97,6 +97,7 @@ def fit(
         workers=workers,
         files=scratch is None,
         executor=executor,
+        problem=problem,
     )
     warn([note for note in result.notes if note not in problem.remarks], 3)
     return result.knowing(_scratch=scratch)

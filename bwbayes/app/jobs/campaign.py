@@ -22,7 +22,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import checked, dump, parse, read_toml
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
@@ -152,8 +152,9 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
         warnings.simplefilter("ignore", InputWarning)
         try:
             digests = campaign.digests(file)
-            folder = _run_folder(file, campaign)
-            fit = resume_run(folder, Console(quiet=True), workers=1, files=origin.pictures)
+            folder, problem = _run_folder(file, campaign)
+            console, files = Console(quiet=True), origin.pictures
+            fit = resume_run(folder, console, workers=1, files=files, problem=problem)
             if not origin.pictures:
                 write_summary(folder.summary, fit.numbers)
             if fit.converged:
@@ -170,7 +171,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
             return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
 
 
-def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
+def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Problem]:
     """Return a record's run as it stands, if it is of this record and config; a new one if not."""
     where = Path(campaign.origin().where)
     if text := campaign.config.read_text(encoding="utf-8"):
@@ -190,8 +191,8 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> RunFolder:
             expected = problem.with_noise(found.config.model.noise)
             same_posterior = fingerprint(found) == fingerprint(expected)
             if same_posterior and found.digests == problem.digests:
-                return existing
+                return existing, found
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)
-    return RunFolder.create(path, problem, overwrite=False)
+    return RunFolder.create(path, problem, overwrite=False), problem

@@ -17,7 +17,6 @@ from functools import cached_property
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig
@@ -61,19 +60,22 @@ from bwbayes.shown import brief
 class Problem:
     """All that a run needs, and the config that says the same in explicit numbers.
 
-    ``records`` are those that are fitted, by name; ``defaults`` what the default priors of these
-    records would be, by the parameters' name.
+    ``defaults`` are what the default priors of its records would be, by the parameters' name.
     """
 
     __repr__ = brief
 
     config: Config
-    records: Mapping[str, Record]
     study: Study
     posterior: Posterior
     plan: SamplingPlan
     validations: Mapping[str, Validation]
     defaults: Mapping[str, Distribution] = field(default_factory=dict)
+
+    @cached_property
+    def records(self) -> dict[str, Record]:
+        """The records that are fitted, by name."""
+        return {name: training.record for name, training in self.study.records.items()}
 
     @cached_property
     def findings(self) -> dict[str, tuple[Finding, ...]]:
@@ -203,7 +205,7 @@ class Problem:
         named = config.model.model_copy(update={"noise": chosen})
         config = config.model_copy(update={"model": named})
         if spec != self.study.spec:
-            return resolve(config, Path(), {**self.records, **self.others})
+            return _problem(config, self.study.with_model(spec), self.validations)
         same = copy(self)  # with all that is known of it
         object.__setattr__(same, "config", config)
         return same
@@ -245,20 +247,36 @@ def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None =
     if config.model.outliers:
         aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
     study = study_of(config, fitted, training)
-    posterior = study.posterior
-    require_known("truth", config.truth, posterior.table, elsewhere=True)
-    plan = _plan(config, posterior)
-    truth = recoverable(stand, posterior.datasets[0].actuator) if stand else {}
-    truth |= config.truth
-    noted = {
-        name: source.read_as or (None if name in in_memory else record_naming(source, folder))
+    require_known("truth", config.truth, study.posterior.table, elsewhere=True)
+    truth = recoverable(stand, study.posterior.datasets[0].actuator) if stand else {}
+    sources = {
+        name: source.model_copy(
+            update={
+                "outliers": aside[name],
+                "read_as": source.read_as
+                or (None if name in in_memory else record_naming(source, folder)),
+                # Said while all were read: the first has them.
+                "remarks": list(dict.fromkeys(remarks))
+                if name == next(iter(config.records))
+                else None,
+            }
+        )
         for name, source in config.records.items()
     }
-    defaults = study.defaults
-    explicit = _explicit(config, study, plan, truth, aside, noted, list(dict.fromkeys(remarks)))
+    alone = isinstance(config.record, RecordConfig)
+    noted = {"record": sources[ALONE] if alone else sources, "truth": {**truth, **config.truth}}
+    return _problem(config.model_copy(update=noted), study, validations)
+
+
+def _problem(config: Config, study: Study, validations: Mapping[str, Validation]) -> Problem:
+    """Return the problem of a study, which a config describes, though not in explicit numbers."""
+    plan = _plan(config, study.posterior)
+    explicit = _explicit(config, study, plan)
+    records = {name: training.record for name, training in study.records.items()}
+    windows = {name: training.windows for name, training in study.records.items()}
     # As the config says it from now on, in explicit numbers.
-    study = study_of(explicit, fitted, training)
-    return Problem(explicit, fitted, study, posterior, plan, validations, defaults)
+    stated = study_of(explicit, records, windows)
+    return Problem(explicit, stated, study.posterior, plan, validations, study.defaults)
 
 
 def _start(record: Record, from_rest: bool) -> str:
@@ -319,28 +337,19 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
     )
 
 
-def _explicit(
-    config: Config,
-    study: Study,
-    plan: SamplingPlan,
-    truth: Mapping[str, float],
-    outliers: Mapping[str, list[float] | None],
-    read_as: Mapping[str, dict[str, Any] | None],
-    remarks: list[str],
-) -> Config:
+def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
     """Return the config in explicit numbers and words, with records as files beside it."""
-    posterior = study.posterior
-    first, parameters = next(iter(config.records)), posterior.prior.parameters
+    posterior, truth = study.posterior, config.truth
+    parameters = posterior.prior.parameters
     records = {
         name: RecordConfig(
             file=f"records/{name}.h5",
             train=source.train,
             from_rest=source.from_rest,
             missing=source.missing,
-            outliers=outliers[name],
-            read_as=read_as[name],
-            # Said while all were read: the first has them.
-            remarks=remarks or None if name == first else None,
+            outliers=source.outliers,
+            read_as=source.read_as,
+            remarks=source.remarks or None,
         )
         for name, source in config.records.items()
     }

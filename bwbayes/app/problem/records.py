@@ -105,8 +105,12 @@ def training_records(
             record = record.exclude([(start, stop) for start, stop in source.exclude])
         if source.start is not None or source.stop is not None:
             record = record.upto(end if source.stop is None else source.stop, source.start)
-        records[name] = record.decimate(source.decimate) if source.decimate > 1 else record
-        require_readable(records[name], table)
+        if source.decimate > 1:
+            record = record.decimate(source.decimate)
+        as_read = record is records[name] and not (source.missing or source.signal)
+        if name in in_memory or not as_read:
+            require_readable(record, table)
+        records[name] = record
     return records, stand
 
 

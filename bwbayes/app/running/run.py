@@ -79,7 +79,7 @@ def resume(
     start_time = time.monotonic()
     artist = artist or Artist()
     with folder.locked(), one_thread():
-        config = load(folder.config)
+        config = problem.config if problem else load(folder.config)
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
         sampling = config.sampling.model_copy(update=targets)
