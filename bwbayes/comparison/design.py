@@ -102,7 +102,7 @@ def promises(
     def targeted(places: FloatArray) -> FloatArray:
         if isinstance(target, str):
             return prior.constrain(places)[0][:, [prior.free_names.index(target)]]
-        return band.displacement(places)
+        return band.displacement(*prior.theta_at(places))
 
     band = _planned(posterior, posterior.only.voltage if isinstance(target, str) else target)
     factor = np.linalg.cholesky(covariance)
@@ -117,7 +117,7 @@ def promises(
         planned, remaining = _planned(posterior, voltage), []
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
-            informations = linearize(planned, chosen[batch]).fisher_information
+            informations = linearize(planned, chosen[batch], expected=True).fisher_information
             for gradient, whole in zip(gradients[batch], informations, strict=True):
                 information = _left_open(whole, columns, new)
                 # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.

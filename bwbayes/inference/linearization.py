@@ -112,25 +112,28 @@ def gradient_and_hessian(
     return (forth - back)[:free] / (2 * step), hessian / step**2
 
 
-def linearize(posterior: Posterior, coordinates: FloatArray) -> Linearization:
+def linearize(
+    posterior: Posterior, coordinates: FloatArray, *, expected: bool = False
+) -> Linearization:
     """Linearize a posterior at coordinates (models, free) that are possible.
 
     :meth:`~bwbayes.inference.likelihood.Likelihood.score` has the equations of each record; what
-    several say adds up. All models and steps are simulated side by side.
+    several say adds up. All models and steps are simulated side by side. If ``expected``, readings
+    are those that each model predicts: of a record that is not measured yet.
     """
     physical = np.flatnonzero([name in posterior.table.physical for name in posterior.names])
-    displacement, slopes = value_and_jacobian(posterior.displacement, coordinates, physical)
-    theta = posterior.prior.theta(posterior.prior.constrain(coordinates)[0])
+
+    def displace(places: FloatArray) -> FloatArray:
+        return posterior.displacement(*posterior.prior.theta_at(places))
+
+    displacement, slopes = value_and_jacobian(displace, coordinates, physical)
+    readings = np.concatenate([dataset.readings.values for dataset in posterior.datasets])
+    residual = np.zeros_like(displacement) if expected else readings - displacement
+    theta, _ = posterior.prior.theta_at(coordinates)
+    score = posterior.score(theta, slopes, readings - residual)
     models, free = coordinates.shape
-    gradient, information = np.zeros((models, free)), np.zeros((models, free, free))
-    residuals, end = [], 0
-    for dataset, likelihood in zip(posterior.datasets, posterior.likelihoods, strict=True):
-        rows = slice(end, end := end + dataset.readings.rows.size)
-        record_theta = posterior.table.of(theta, dataset.name)
-        score = likelihood.score(record_theta, slopes[..., rows], displacement[:, rows])
-        gradient[:, physical] += score.gradient
-        information[:, physical[:, np.newaxis], physical] += score.fisher_information
-        residuals.append(dataset.readings.values - displacement[:, rows])
-    all_slopes = np.zeros((models, free, end))
-    all_slopes[:, physical] = slopes
-    return Linearization(all_slopes, np.concatenate(residuals, axis=1), gradient, information)
+    all_slopes, gradient = np.zeros((models, free, displacement.shape[1])), np.zeros((models, free))
+    information = np.zeros((models, free, free))
+    all_slopes[:, physical], gradient[:, physical] = slopes, score.gradient
+    information[:, physical[:, np.newaxis], physical] = score.fisher_information
+    return Linearization(all_slopes, residual, gradient, information)

@@ -286,6 +286,11 @@ class JointPrior:
             log_prior = np.log(room) - 0.5 * np.sum(safe * safe, axis=0)
         return free.T, np.where(possible, log_prior, -np.inf)
 
+    def theta_at(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates (models, free) to θ (models, parameters) and the log prior (models,)."""
+        free, log_prior = self.constrain(coordinates)
+        return self.theta(free), log_prior
+
     def _values(self, free: FloatArray) -> dict[str, FloatArray]:
         values = {name: np.full(len(free), value) for name, value in self._fixed.items()}
         return values | dict(zip(self.free_names, free.T, strict=True))

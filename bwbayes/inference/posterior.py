@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.likelihood import Likelihood, batches
+from bwbayes.inference.likelihood import Likelihood, Score, batches
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
@@ -240,24 +241,45 @@ class Posterior:
             moving = None if unrest is None else unrest[batch]
             yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
-    def displacement(self, coordinates: FloatArray) -> FloatArray:
-        """Displacement (models, readings), um, from rest, at coordinates (models, free).
+    @cached_property
+    def _columns(self) -> tuple[slice, ...]:
+        """Which columns of readings are each record's, where those of all come one by one."""
+        ends = np.cumsum([0, *(dataset.readings.rows.size for dataset in self.datasets)]).tolist()
+        return tuple(slice(*pair) for pair in pairwise(ends))
 
-        Readings are those of all records, one after the other; nan where the prior is zero.
+    def displacement(self, theta: FloatArray, log_prior: FloatArray) -> FloatArray:
+        """Displacement (models, readings), um, from rest, at θ (models, parameters).
+
+        Readings are those of all records, one after the other; nan where the log prior (models,)
+        is −∞.
         """
-        free, log_prior = self.prior.constrain(coordinates)
         possible = np.flatnonzero(np.isfinite(log_prior))
-        theta, sizes = self.prior.theta(free), [d.readings.rows.size for d in self.datasets]
-        result = np.full((len(theta), sum(sizes)), np.nan)
-        parts = np.split(result, np.cumsum(sizes)[:-1], axis=1)
-        for dataset, likelihood, part in zip(self.datasets, self.likelihoods, parts, strict=True):
+        result = np.full((len(theta), self._columns[-1].stop), np.nan)
+        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
+        for dataset, likelihood, columns in of_records:
             readings = likelihood.readings
             model = likelihood.table.actuator(self.table.of(theta, dataset.name))
             voltage = dataset.voltage[: readings.samples]
             for batch in batches(possible.size, voltage.size):
                 models = possible[batch]
-                part[models] = likelihood.simulate(model[models], voltage)[:, readings.where]
+                moved = likelihood.simulate(model[models], voltage)
+                result[models, columns] = moved[:, readings.where]
         return result
+
+    def score(self, theta: FloatArray, shapes: FloatArray, displacement: FloatArray) -> Score:
+        """Return the sum of :meth:`Likelihood.score` over the records.
+
+        ``shapes`` (models, shapes, readings) and ``displacement`` (models, readings), um, are of
+        the readings of all records, one after the other.
+        """
+        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
+        scores = [
+            likelihood.score(
+                self.table.of(theta, dataset.name), shapes[..., columns], displacement[:, columns]
+            )
+            for dataset, likelihood, columns in of_records
+        ]
+        return Score(*(np.sum(parts, axis=0) for parts in zip(*scores, strict=True)))
 
     def noise_of_new(self, theta: FloatArray) -> FloatArray:
         """Return the noise's parameters (models, its own) for readings that were not fitted.

@@ -1,0 +1,280 @@
+"""Mode finding: up from starts nearby to the modes of a posterior, several side by side.
+
+The physical parameters enter the displacement, the noise's parameters do not, so that at the mode
+the information about the two separates: Fisher scoring climbs in the physical ones, Newton steps in
+the noise's ones with the residual as it is, until neither gains (:func:`climb`). Newton steps in
+all of them then lead to the mode itself, and give the Hessian there (:func:`refine`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.linearization import gradient_and_hessian, value_and_jacobian
+from bwbayes.inference.posterior import Posterior
+
+# A round that gains less, nats, is the last one; and rounds at most.
+GAIN, ROUNDS = 0.05, 20
+
+# Steps in the noise's coordinates a round.
+NOISE_STEPS = 6
+
+# Rounds from every start, and how many times what a round gained all later ones may gain.
+FIRST_ROUNDS, AHEAD = 2, 10.0
+
+# Steps of differences: in the noise's coordinates, whose sds are hundredths of the prior's; and in
+# the posterior's sds.
+NOISE_STEP, STEP = 2e-2, 0.1
+
+# Parts of a step that are tried.
+FRACTIONS = 0.5 ** np.arange(8)
+
+# Newton steps at most, and the least curvature of units that the last ones left.
+REFINEMENTS, FLATTEST = 40, 1e-2
+
+# A density of zero, nats: a finite wall keeps differences numbers.
+WALL = -1e12
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a climb is: coordinates (size,), log density, displacement (readings,), um."""
+
+    coordinates: FloatArray
+    density: float
+    displacement: FloatArray
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode: coordinates (free,), covariance (free, free) by the Hessian, log density, nats."""
+
+    coordinates: FloatArray
+    covariance: FloatArray
+    log_density: float
+
+
+@dataclass(frozen=True)
+class Target:
+    """The log density of a posterior in its coordinates (models, size), and steps to its modes."""
+
+    posterior: Posterior
+
+    @property
+    def size(self) -> int:
+        """How many coordinates there are; those of the posterior come first."""
+        return len(self.posterior.names)
+
+    @cached_property
+    def noise(self) -> IntArray:
+        """Which coordinates are those of the noise's parameters."""
+        physical = self.posterior.table.physical
+        return np.flatnonzero([name not in physical for name in self.posterior.names])
+
+    @cached_property
+    def physical(self) -> IntArray:
+        """Which coordinates move the displacement."""
+        return np.setdiff1d(np.arange(self.size), self.noise)
+
+    def prior(self, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """θ (models, parameters) and log prior (models,) of coordinates (models, size)."""
+        return self.posterior.prior.theta_at(coordinates)
+
+    def simulate(
+        self,
+        theta: FloatArray,
+        log_prior: FloatArray,
+        coordinates: FloatArray,  # noqa: ARG002  # of more than the posterior's
+    ) -> FloatArray:
+        """Displacement (models, readings), um, nan where the prior is zero."""
+        return self.posterior.displacement(theta, log_prior)
+
+    def simulated_density(
+        self,
+        theta: FloatArray,
+        displacement: FloatArray,  # noqa: ARG002  # which is the posterior's
+    ) -> FloatArray:
+        """Log likelihood (models,) of a displacement (readings,), by simulating it once more."""
+        return self.posterior.log_likelihood(theta)
+
+    def noise_density(self, coordinates: FloatArray, displacement: FloatArray) -> FloatArray:
+        """Log density (models,) where all models have the displacement (readings,)."""
+        theta, density = self.prior(coordinates)
+        possible = np.isfinite(density)
+        if possible.any():
+            likelihoods = self.posterior.likelihoods
+            dense = any(2 * of.readings.rows.size > of.readings.samples for of in likelihoods)
+            if dense and self.posterior.engine == "numba":
+                # To simulate again is faster than to pass whitened series through the memory.
+                density[possible] += self.simulated_density(theta[possible], displacement)
+            else:
+                moved = np.tile(displacement, (int(np.sum(possible)), 1))
+                score = self.posterior.score(theta[possible], moved[:0], moved)
+                density[possible] += score.log_density
+        return np.where(np.isfinite(density), density, -np.inf)
+
+    def at(self, coordinates: FloatArray) -> list[State]:
+        """Return the states at coordinates (states, size)."""
+        theta, density = self.prior(coordinates)
+        possible, moved = np.isfinite(density), self.simulate(theta, density, coordinates)
+        if possible.any():
+            score = self.posterior.score(theta[possible], moved[:0], moved[possible])
+            density[possible] += score.log_density
+        density = np.where(np.isfinite(density), density, -np.inf)
+        return [State(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
+
+    def round(self, states: Sequence[State], noise_steps: int) -> list[State]:
+        """Climb a round from states side by side: in the noise's coordinates, then in the others.
+
+        So many steps at most in the noise's, one of Fisher scoring in the others.
+        """
+        states = [self.step_noise(state, noise_steps) for state in states]
+        gradients, informations = self.linearize(states)
+        steps = np.zeros((len(states), self.size))
+        steps[:, self.physical] = np.linalg.solve(informations, gradients[..., np.newaxis])[..., 0]
+        left = [*range(len(states))]
+        for fraction in FRACTIONS:
+            tried = np.stack([states[i].coordinates + fraction * steps[i] for i in left])
+            for i, ahead in zip([*left], self.at(tried), strict=True):
+                if ahead.density > states[i].density:
+                    states[i] = ahead
+                    left.remove(i)
+            if not left:
+                break
+        return states
+
+    def linearize(self, states: Sequence[State]) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Fisher information of states' log density in the physical coordinates.
+
+        The prior's information is that of its normal scores.
+        """
+        coordinates = np.stack([state.coordinates for state in states])
+        here = np.stack([state.displacement for state in states])
+
+        def displacement(places: FloatArray) -> FloatArray:
+            return self.simulate(*self.prior(places), places)
+
+        _, slopes = value_and_jacobian(displacement, coordinates, self.physical, here)
+        score = self.posterior.score(self.prior(coordinates)[0], slopes, here)
+        gradient = score.gradient - coordinates[:, self.physical]
+        return gradient, score.fisher_information + np.eye(self.physical.size)
+
+    def covariance(self, state: State) -> tuple[FloatArray, float]:
+        """Covariance (size, size) at a mode, and its log determinant.
+
+        Noise and physical parameters are uncorrelated. What the record does not tell keeps its
+        prior; the noise's Hessian is of differences. A state that is not possible has that of the
+        prior.
+        """
+        covariance, log_determinant = np.eye(self.size), 0.0
+        if not np.isfinite(state.density):
+            return covariance, log_determinant
+        information = self.linearize([state])[1][0]
+        _, hessian = self._noise_hessian(state)
+        for rows, curvature, flattest in (
+            (self.physical, information, 1.0),
+            (self.noise, -hessian, 1e-2),
+        ):
+            values, vectors = np.linalg.eigh(curvature)
+            values = np.maximum(values, flattest)
+            covariance[np.ix_(rows, rows)] = (vectors / values) @ vectors.T
+            log_determinant -= float(np.sum(np.log(values)))
+        return covariance, log_determinant
+
+    def step_noise(self, state: State, count: int = NOISE_STEPS) -> State:
+        """Step in the noise's coordinates, by Newton's method where the density bends down."""
+        for _ in range(count if self.noise.size else 0):
+            gradient, hessian = self._noise_hessian(state)
+            step = newton_step(gradient, hessian, 1.0)
+            step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
+            if gradient @ step <= GAIN / 4:
+                break
+            steps = FRACTIONS[:, np.newaxis] * step
+            gains = self._noise_gains(state, steps)
+            best = int(np.argmax(gains))
+            if gains[best] <= GAIN / 4:
+                break
+            coordinates = state.coordinates.copy()
+            coordinates[self.noise] += steps[best]
+            state = State(coordinates, state.density + float(gains[best]), state.displacement)
+        return state
+
+    def _noise_gains(self, state: State, steps: FloatArray) -> FloatArray:
+        """By how much steps (steps, noise) in the noise's coordinates raise the log density."""
+        coordinates = np.tile(state.coordinates, (len(steps), 1))
+        coordinates[:, self.noise] += steps
+        density = self.noise_density(coordinates, state.displacement)
+        return np.maximum(density, WALL) - state.density
+
+    def _noise_hessian(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of the log density in the noise's coordinates."""
+        return gradient_and_hessian(
+            lambda steps: self._noise_gains(state, steps), self.noise.size, NOISE_STEP, 0.0
+        )
+
+
+def climb(
+    target: Target, starts: FloatArray, least: float = -np.inf, many_steps: int = NOISE_STEPS
+) -> State:
+    """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
+
+    The one that leads after :data:`FIRST_ROUNDS` goes on alone, until it gains so little that it
+    would never reach a log density of ``least``. A round has ``many_steps`` in the noise's
+    coordinates while there are several. Where no start is possible, that is the state.
+    """
+    begun = target.at(starts)
+    states = [state for state in begun if np.isfinite(state.density)]
+    for number in range(1, ROUNDS + FIRST_ROUNDS + 1) if states else ():
+        ahead = target.round(states, many_steps if len(states) > 1 else NOISE_STEPS)
+        best = int(np.argmax([state.density for state in ahead]))
+        gain = ahead[best].density - states[best].density
+        states = ahead if number < FIRST_ROUNDS else [ahead[best]]
+        missing = least - ahead[best].density
+        if len(states) == 1 and gain < max(GAIN, missing / AHEAD):
+            break
+    return max(states or begun, key=lambda state: state.density)
+
+
+def refine(posterior: Posterior, coordinates: FloatArray, covariance: FloatArray) -> Mode:
+    """Find the mode that coordinates (free,) lead to by Newton steps in all of them.
+
+    In units of a ``covariance`` (free, free) that is about that of the mode, and then of that of
+    each step. A direction that is flat, or bends the wrong way, grows tenfold at most.
+    """
+    axes = np.linalg.cholesky(covariance)
+    log_density = float(posterior.log_density(coordinates[np.newaxis])[0])
+
+    def gains(w: FloatArray) -> FloatArray:
+        density = posterior.log_density(coordinates + w @ axes.T)
+        return np.asarray(np.maximum(density, WALL) - log_density)
+
+    longest = 1.0  # sds; it grows while it leads up, so that the mode is that of the start's valley
+    for _ in range(REFINEMENTS):
+        gradient, hessian = gradient_and_hessian(gains, coordinates.size, STEP, 0.0)
+        step = newton_step(gradient, hessian, FLATTEST)
+        step *= min(1.0, longest / max(float(np.linalg.norm(step)), 1e-12))
+        steps = FRACTIONS[:, np.newaxis] * step
+        gained = gains(steps)
+        best = int(np.argmax(gained))
+        longest *= 1.0 if best else 2.0
+        values, vectors = np.linalg.eigh(-hessian)
+        if gained[best] > 0:
+            coordinates = coordinates + axes @ steps[best]
+            log_density += float(gained[best])
+        axes = axes @ (vectors / np.sqrt(np.maximum(values, FLATTEST)))
+        there = gained[best] <= 0 or np.linalg.norm(step) < 1e-2
+        if there and np.allclose(values, 1.0, atol=0.2):
+            break
+    return Mode(coordinates, axes @ axes.T, log_density)
+
+
+def newton_step(gradient: FloatArray, hessian: FloatArray, flattest: float) -> FloatArray:
+    """Step (size,) up a density, with curvatures by their size, and ``flattest`` at least."""
+    values, vectors = np.linalg.eigh(-hessian)
+    step: FloatArray = vectors @ (vectors.T @ gradient / np.maximum(np.abs(values), flattest))
+    return step

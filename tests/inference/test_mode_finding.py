@@ -1,0 +1,69 @@
+"""Modes are those of closed forms, and what is simulated once is what is simulated each time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bwbayes.inference.engine import Engine
+from bwbayes.inference.mode_finding import Target, climb, refine
+from tests.inference.linear import CASES, Linear, every_case
+from tests.inference.problems import short_posterior
+
+LINEAR = {noise: Linear(free, noise) for free, noise in CASES}
+
+
+@pytest.mark.parametrize("noise", LINEAR)
+@settings(deadline=None, max_examples=25)
+@given(
+    start=st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3), width=st.sampled_from([0.01, 1.0])
+)
+def test_a_normal_posteriors_mode_is_the_closed_form(
+    noise: str, start: list[float], width: float
+) -> None:
+    """From anywhere, in units far from those of the mode: to 1e-5 sds, its covariance to 1e-4."""
+    model = LINEAR[noise]
+    place = np.array(start[: model.mean.size])
+    mode = refine(model.posterior, place, width * np.eye(place.size))
+    exact = model.exact
+    np.testing.assert_allclose(
+        (model.mean + mode.coordinates * model.sd - exact.mean) / exact.sd, 0.0, atol=1e-5
+    )
+    covariance = mode.covariance * np.outer(model.sd, model.sd) / np.outer(exact.sd, exact.sd)
+    correlation = exact.covariance / np.outer(exact.sd, exact.sd)
+    np.testing.assert_allclose(covariance, correlation, atol=1e-4)
+
+
+@every_case
+def test_a_climb_to_a_normal_posterior_ends_at_its_mode(free: tuple[str, ...], noise: str) -> None:
+    """Of several starts the best, with the Fisher information's covariance."""
+    model, target = LINEAR[noise], Target(LINEAR[noise].posterior)
+    state = climb(target, np.array([[3.0, -2.0, 1.0], [0.5, 4.0, -1.0]])[:, : len(free)])
+    away = (model.mean + state.coordinates * model.sd - model.exact.mean) / model.exact.sd
+    np.testing.assert_allclose(away, 0.0, atol=1e-5)
+    covariance, log_determinant = target.covariance(state)
+    exact = model.exact.covariance / np.outer(model.sd, model.sd)
+    np.testing.assert_allclose(covariance, exact, rtol=1e-6)
+    assert log_determinant == pytest.approx(np.linalg.slogdet(exact)[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "numba"])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_a_displacement_that_is_held_gives_the_density_of_the_noise(
+    engine: Engine, sparse: bool
+) -> None:
+    posterior = replace(short_posterior(samples=200), engine=engine)
+    if sparse:
+        reading = np.full_like(posterior.only.displacement, np.nan)
+        reading[::4] = posterior.only.displacement[::4]
+        posterior = posterior.altered(displacement=reading)
+    target = Target(posterior)
+    places = np.tile(np.random.default_rng(1).normal(0, 0.5, len(posterior.names)), (5, 1))
+    places[:, target.noise] += np.random.default_rng(2).normal(0, 0.5, (5, target.noise.size))
+    places[4, target.noise] = 1e4  # beyond anything that is possible
+    held = target.noise_density(places, target.at(places[:1])[0].displacement)
+    np.testing.assert_allclose(held, posterior.log_density(places), rtol=1e-9)
