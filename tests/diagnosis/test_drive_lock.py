@@ -1,7 +1,7 @@
 """A residual that follows the drive is told from one that does not.
 
 False alarms: at most 3% of residuals of white, rough and smooth noise (2% by the test's level; fits
-of 160 good actuators had none). Power: 95% of misfits as large as that noise, where the drive comes
+of 100 good actuators had none). Power: 95% of misfits as large as that noise, where the drive comes
 back to where it was; of a multisine, which hardly does in 12 s, of those twice as large.
 """
 

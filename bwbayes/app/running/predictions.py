@@ -95,6 +95,7 @@ class Prediction(Shown, Bands):
             "to_s": float(self.time[-1] + self.interval),
             "samples": self.time.size,
             "remarks": list(self.remarks),
+            "model_error_sd_um": self.model_error_sd,
             "lead_in": None if self.lead_in is None else asdict(self.lead_in),
             "scores": None if self.scores is None else self.scores.numbers,
             **held,
@@ -253,7 +254,10 @@ def predict_after(
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
     bands = forecast(alone, own_draws, record, voltage, source, name, watch)
-    return Prediction(**vars(bands), remarks=tuple(finding.note for finding in beyond))
+    remarks = [finding.note for finding in beyond]
+    if beyond and _locked(problem, subset, of):
+        remarks.insert(0, "what the model misses follows the drive: this one may be missed by more")
+    return Prediction(**vars(bands), remarks=tuple(remarks))
 
 
 def predictions(
