@@ -76,8 +76,9 @@ class States:
     the highest state that drives of its range leave. The last sweep of an earlier drive ends, as
     often as not, at the record's first voltage: a quarter of the states are the lowest, a quarter
     the highest. Where one number holds all states, and a history is ``single``, they are what
-    drives of any amplitude leave that were running when the record began, on the branches of their
-    loops, the lowest and the highest as far out as any drive leaves them.
+    drives leave that were running when the record began, on the branches of their loops, the lowest
+    and the highest as far out as any drive leaves them: half of the drives went over the whole
+    range, half were of any amplitude.
     """
 
     def __init__(self, likelihood: Likelihood, theta: FloatArray, *, single: bool) -> None:
@@ -93,7 +94,8 @@ class States:
         if single:
             ranges = narrower(span, further=(1.0,))
             states = [actuator.hysteresis.left(column, voltage, swept) for swept in ranges]
-            self.ordered = np.sort(np.concatenate(states), axis=0)
+            widest = [actuator.hysteresis.left(column, voltage, span)] * len(ranges)
+            self.ordered = np.sort(np.concatenate(states + widest), axis=0)
             self.ordered[0] = np.minimum(self.ordered[0], low)
             self.ordered[-1] = np.maximum(self.ordered[-1], high)
             self.quantiles = np.linspace(0.0, 1.0, len(self.ordered))
