@@ -47,7 +47,8 @@ class Backlash(Stage):
             "-",
             r"s_b",
             "where in its play a record starts, from -1 to 1",
-            lambda _: Distribution("uniform", {"lower": -1.0, "upper": 1.0}),
+            # As a swing is found: most often near one of its ends.
+            lambda _: Distribution("beta", {"a": 0.5, "b": 0.5, "lower": -1.0, "upper": 1.0}),
             bounds=lambda _: (-1.0, 1.0),
             stated_bounds="-1 <= backlash_start <= 1",
             scope="record",
