@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 STEPS, STRETCH = 0.85 * np.arange(-17, 7), 0.1
 
 
-# What one sd of a normal distribution is above.
-ONE_SD = float(scipy.special.ndtr(1.0))
+# Φ(1), what one sd of a normal distribution is above; to compute it loads a library.
+ONE_SD = 0.8413447460685429
 
 
 class Followed(NamedTuple):
