@@ -7,12 +7,14 @@ which it keeps all that is stated of parameters that both have.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from itertools import chain
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -51,6 +53,14 @@ class Stated:
     unit: str | None = None
     label: str | None = None
     description: str | None = None
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """What a config's [parameters.NAME] says of it, by key."""
+        keys = {name: value for name, value in vars(self).items() if value is not None}
+        if self.prior is not None:
+            keys["prior"] = {"distribution": self.prior.name, **self.prior.arguments}
+        return keys
 
 
 @dataclass(frozen=True)
@@ -126,6 +136,42 @@ class Study:
             per_record=(),
             shared=(),
         )
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """What makes its posterior another one, besides the readings: values by a config's keys.
+
+        The names that people read of parameters do not, nor does the engine.
+        """
+        keys: dict[str, Any] = {f"model.{key}": value for key, value in self.spec.keys.items()}
+        keys |= {"model.per_record": [*self.per_record], "model.shared": [*self.shared]}
+        for name, stated in self.stated.items():
+            for key, value in stated.keys.items():
+                if key not in ("label", "description"):
+                    keys[f"parameters.{name}.{key}"] = value
+        for name, training in self.records.items():
+            record, table = training.record, place_of(name)
+            edges = np.array([[window.start, window.stop] for window in training.windows])
+            keys[f"{table}.train"] = (record.start + record.interval * edges).tolist()
+            keys[f"{table}.from_rest"] = training.from_rest
+            if record.path.noise_sd:
+                keys[f"voltage of {name}"] = "without its noise"
+        return keys
+
+    @property
+    def data_sha256(self) -> str:
+        """A digest of all readings: that of the record, or of several with their names."""
+        digests = {name: training.record.sha256 for name, training in self.records.items()}
+        if len(digests) == 1:
+            return next(iter(digests.values()))
+        return sha256(json.dumps(digests).encode()).hexdigest()
+
+    @property
+    def sha256(self) -> str:
+        """A digest: the same for the same posterior."""
+        return sha256(
+            json.dumps([self.data_sha256, self.keys], sort_keys=True).encode()
+        ).hexdigest()
 
     @cached_property
     def extent(self) -> Extent:

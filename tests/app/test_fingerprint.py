@@ -14,24 +14,19 @@ import pytest
 from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import finished
-from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running import fingerprint as fingerprint_module
-from bwbayes.app.running.fingerprint import fingerprint, require_own, version_remarks, versions
+from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
+from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
 
-@pytest.fixture(scope="module")
-def problem(run: Path) -> Problem:
-    return RunFolder(run).problem()
-
-
-def require(problem: Problem, changed: Config) -> None:
-    """Hold a config against the chain of a problem."""
-    noted = {"data_sha256": problem.sha256, "posterior": fingerprint(problem)}
-    require_own(replace(problem, config=changed), Path("x"), noted)
+def require(run: Path, changed: Config) -> None:
+    """Hold a config in the place of a run's own against the run's chain."""
+    require_own(resolve(changed, run), Path("x"), ChainFile.read(run / "chain").attributes())
 
 
 def with_d(config: Config, **changes: Any) -> Config:
@@ -66,43 +61,42 @@ def test_edited_prior_is_refused(copy: RunFolder, use: Callable[[RunFolder], obj
     ("old", "new", "key"),
     [
         ("[[0.0, 5.0]]", "[[0.0, 4.0]]", "record.train"),
-        ('dynamics = "lag"', 'dynamics = "none"', "model.dynamics"),
+        ("passive = true", "passive = false", "model.passive"),
         ('hold = "auto"', 'hold = "first"', "model.hold"),
         ("fixed = 0.0172", "fixed = 0.0173", "parameters.gamma.fixed"),
         ("seed = 3", "seed = 4", "seed"),
         ("block = 25", "block = 30", "sampling.block"),
     ],
 )
-def test_what_changes_the_posterior_is_named(
-    problem: Problem, old: str, new: str, key: str
-) -> None:
-    text = dump(problem.config)
+def test_what_changes_the_posterior_is_named(run: Path, old: str, new: str, key: str) -> None:
+    text = dump(load(run / "config.toml"))
     assert old in text
     with pytest.raises(InputError, match=f"x: {key} was .* when the chain was sampled, is "):
-        require(problem, parse(text.replace(old, new), ""))
+        require(run, parse(text.replace(old, new), ""))
 
 
-def test_a_bound_and_all_else_that_differs_are_named(problem: Problem) -> None:
-    config = problem.config
-    white = {"seed": 5, "model": config.model.model_copy(update={"noise": "white"})}
+def test_a_bound_and_all_else_that_differs_are_named(run: Path) -> None:
+    config = load(run / "config.toml")
+    held = {"seed": 5, "model": config.model.model_copy(update={"hold": "first"})}
     for changed, said in (
         (with_d(config, lower=0.5), r"parameters.d.lower was not set when .* is 0\.5; undo"),
-        (config.model_copy(update=white), r"seed was 3 .*, is 5 \(also model.noise\); undo"),
+        (config.model_copy(update=held), r"seed was 3 .*, is 5 \(also model.hold\); undo"),
     ):
         with pytest.raises(InputError, match=said):
-            require(problem, changed)
+            require(run, changed)
 
 
-def test_what_leaves_the_posterior_may_change(problem: Problem) -> None:
+def test_what_leaves_the_posterior_may_change(run: Path) -> None:
+    config = load(run / "config.toml")
     sampling = {"ess": 9.0, "steps": 7, "pilot_steps": 9, "engine": "auto"}
     changes = {
         "name": "other",
-        "sampling": problem.config.sampling.model_copy(update=sampling),
+        "sampling": config.sampling.model_copy(update=sampling),
         "validation": {},
         "truth": {},
     }
-    relabeled = with_d(problem.config, label="D", description="gain")
-    require(problem, relabeled.model_copy(update=changes))
+    relabeled = with_d(config, label="D", description="gain")
+    require(run, relabeled.model_copy(update=changes))
 
 
 def test_chain_without_a_fingerprint_is_refused(copy: RunFolder) -> None:
@@ -128,3 +122,35 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     remarks = finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
+
+
+def test_a_studys_digest_is_that_of_its_posterior(run: Path) -> None:
+    config = load(run / "config.toml")
+    study = resolve(config, run).study
+    prior = config.parameters["d"].prior
+    assert prior is not None
+    (training,) = study.records.values()
+    record = training.record
+    assert record.displacement is not None
+    moved = replace(record, displacement=record.displacement + 1e-9)
+    same = (
+        resolve(with_d(config, label="D", description="gain"), run).study,
+        resolve(config.model_copy(update={"name": "other", "validation": {}}), run).study,
+        replace(study, engine="numpy"),
+    )
+    others = (
+        resolve(with_d(config, prior=prior | {"sigma": 0.7}), run).study,
+        resolve(with_d(config, upper=9.0), run).study,
+        study.with_model(study.spec.with_parts(noise="smooth")),
+        replace(study, per_record=("offset",)),
+        *(
+            replace(study, records={"record": changed})
+            for changed in (
+                replace(training, record=moved),
+                replace(training, from_rest=not training.from_rest),
+                replace(training, windows=(slice(0, 200),)),
+            )
+        ),
+    )
+    assert {study.sha256} == {other.sha256 for other in same}
+    assert len({study.sha256, *(other.sha256 for other in others)}) == 1 + len(others)

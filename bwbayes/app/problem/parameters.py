@@ -77,7 +77,9 @@ def with_model(
     return config.model_copy(
         update={
             "model": config.model.with_spec(spec).model_copy(update=scopes),
-            "parameters": {name: _as_config(stated) for name, stated in study.stated.items()},
+            "parameters": {
+                name: ParameterConfig(**stated.keys) for name, stated in study.stated.items()
+            },
             "truth": {
                 name: value
                 for name, value in config.truth.items()
@@ -87,27 +89,18 @@ def with_model(
     )
 
 
-def _as_config(stated: Stated) -> ParameterConfig:
-    """Write what is stated of a parameter as a config does."""
-    values = {name: value for name, value in vars(stated).items() if name != "prior"}
-    if stated.prior is not None:
-        values["prior"] = {"distribution": stated.prior.name, **stated.prior.arguments}
-    return ParameterConfig(**values)
-
-
 def as_config(parameter: Parameter) -> ParameterConfig:
     """Write a parameter as a config does, in explicit numbers."""
-    return _as_config(
-        Stated(
-            parameter.prior,
-            parameter.fixed,
-            parameter.lower if np.isfinite(parameter.lower) else None,
-            parameter.upper if np.isfinite(parameter.upper) else None,
-            parameter.unit,
-            parameter.label,
-            parameter.description,
-        )
+    stated = Stated(
+        parameter.prior,
+        parameter.fixed,
+        parameter.lower if np.isfinite(parameter.lower) else None,
+        parameter.upper if np.isfinite(parameter.upper) else None,
+        parameter.unit,
+        parameter.label,
+        parameter.description,
     )
+    return ParameterConfig(**stated.keys)
 
 
 def stand_of(config: Config, training: Sequence[Record]) -> VirtualTestStand:

@@ -8,13 +8,11 @@ moved, continued and run again by itself.
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 
@@ -125,11 +123,8 @@ class Problem:
 
     @property
     def sha256(self) -> str:
-        """A digest of all that was measured: that of the record, or of several with their names."""
-        if len(self.records) == 1:
-            return self.record.sha256
-        digests = {name: record.sha256 for name, record in self.records.items()}
-        return sha256(json.dumps(digests).encode()).hexdigest()
+        """A digest of all that was measured."""
+        return self.study.data_sha256
 
     @property
     def digests(self) -> dict[str, str]:

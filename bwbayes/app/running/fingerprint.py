@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import json
 import platform
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
 from importlib import import_module
@@ -39,22 +38,18 @@ from bwbayes.sampling.storage import ChainFile
 
 
 def fingerprint(problem: Problem) -> str:
-    """Return what a chain notes of a problem: its resolved config's keys and values, as JSON.
-
-    And which voltages drive the model without their noise.
-    """
-    values = dict(_flat(problem.config.model_dump(exclude_none=True)))
-    # Keys that a chain does not depend on; of tables, everything in them. The record is compared by
-    # its readings, not by its file's name.
-    free_to_change = re.compile(
-        r"(name|stand|truth|validation|sampling\.(engine|ess|steps|pilot_steps)"
-        r"|record\.([^.]+\.)?(file|missing|remarks|signal|read_as)|parameters\..*\.(label|description))(\..*)?"
+    """Return what a chain notes of a problem as JSON: its posterior, and how it is sampled."""
+    plan = problem.plan
+    return json.dumps(
+        {
+            "coordinates": COORDINATES,
+            "seed": problem.config.seed,
+            "sampling.ensembles": plan.ensembles,
+            "sampling.walkers": plan.walkers,
+            "sampling.block": plan.block,
+            **problem.study.keys,
+        }
     )
-    noted = {key: value for key, value in values.items() if not free_to_change.fullmatch(key)}
-    for name, record in problem.records.items():
-        if record.path.noise_sd:
-            noted[f"voltage of {name}"] = "without its noise"
-    return json.dumps({"coordinates": COORDINATES, **noted})
 
 
 def require_own(problem: Problem, chain: Path, attributes: Mapping[str, str | int]) -> None:
@@ -98,15 +93,6 @@ def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:
         if before.get(name, now[name]) != now[name]
     ]
     return (f"the chain was begun with other versions: {'; '.join(changed)}",) if changed else ()
-
-
-def _flat(table: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yield keys with their tables' names before them, and values; a prior counts as one."""
-    for name, value in table.items():
-        if isinstance(value, Mapping) and name != "prior":
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _shown(value: object) -> str:
