@@ -23,7 +23,8 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.comparison.designed import Promise
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import batches
-from bwbayes.inference.linearization import linearize, value_and_jacobian
+from bwbayes.inference.linearization import value_and_jacobian
+from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.limits import Limits
 from bwbayes.watching import Watch, part, unwatched, watched
@@ -43,7 +44,7 @@ def promises(
     With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
     sampling, and I the information of the candidate's readings about them and about the initial
     state and offset of its record, whose prior is standard normal there
-    (:func:`~bwbayes.inference.linearization.linearize`),
+    (:meth:`~bwbayes.inference.mode_finding.Target.linearize`),
 
         Σ' = (Σ⁻¹ + Iₐₐ − Iₐᵣ (1 + Iᵣᵣ)⁻¹ Iᵣₐ)⁻¹.
 
@@ -114,12 +115,14 @@ def promises(
         if refused:
             scores.append(Promise(name, np.nan, np.nan, refused))
             continue
-        planned, remaining = _planned(posterior, voltage), []
+        planned, remaining = Target(_planned(posterior, voltage)), []
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
-            informations = linearize(planned, chosen[batch], expected=True).fisher_information
+            informations = planned.linearize(chosen[batch], expected=True).fisher_information
             for gradient, whole in zip(gradients[batch], informations, strict=True):
-                information = _left_open(whole, columns, new)
+                information = _left_open(
+                    whole, *(np.searchsorted(planned.physical, c) for c in (columns, new))
+                )
                 # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
                 inner = np.eye(len(factor)) + factor.T @ information @ factor
                 after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")

@@ -11,43 +11,15 @@ for h = :data:`STEP` about 2e-9 of f‴ and 2e-12 of f.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray
 
-if TYPE_CHECKING:
-    from bwbayes.inference.posterior import Posterior
-
 # Step of first derivatives, in prior sds.
 STEP = 1e-4
 
 Function = Callable[[FloatArray], FloatArray]
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """A posterior's displacement and log likelihood, linearized at coordinates z (models, free).
-
-    Attributes
-    ----------
-    slopes
-        ∂x/∂z, (models, free, readings), um; the readings of all records, one after the other.
-    residual
-        (models, readings), um, from rest.
-    gradient
-        ∂ log p(readings | z)/∂z, (models, free), for the noise and the unknown starts held; zero in
-        the noise's coordinates.
-    fisher_information
-        (models, free, free), the same, in the noise's coordinates zero too.
-    """
-
-    slopes: FloatArray
-    residual: FloatArray
-    gradient: FloatArray
-    fisher_information: FloatArray
 
 
 def value_and_jacobian(
@@ -110,30 +82,3 @@ def gradient_and_hessian(
     hessian = np.diag(second[:free])
     hessian[i, j] = hessian[j, i] = (second[free:] - second[i] - second[j]) / 2
     return (forth - back)[:free] / (2 * step), hessian / step**2
-
-
-def linearize(
-    posterior: Posterior, coordinates: FloatArray, *, expected: bool = False
-) -> Linearization:
-    """Linearize a posterior at coordinates (models, free) that are possible.
-
-    :meth:`~bwbayes.inference.likelihood.Likelihood.score` has the equations of each record; what
-    several say adds up. All models and steps are simulated side by side. If ``expected``, readings
-    are those that each model predicts: of a record that is not measured yet.
-    """
-    physical = np.flatnonzero([name in posterior.table.physical for name in posterior.names])
-
-    def displace(places: FloatArray) -> FloatArray:
-        return posterior.displacement(*posterior.prior.theta_at(places))
-
-    displacement, slopes = value_and_jacobian(displace, coordinates, physical)
-    readings = np.concatenate([dataset.readings.values for dataset in posterior.datasets])
-    residual = np.zeros_like(displacement) if expected else readings - displacement
-    theta, _ = posterior.prior.theta_at(coordinates)
-    score = posterior.score(theta, slopes, readings - residual)
-    models, free = coordinates.shape
-    all_slopes, gradient = np.zeros((models, free, displacement.shape[1])), np.zeros((models, free))
-    information = np.zeros((models, free, free))
-    all_slopes[:, physical], gradient[:, physical] = slopes, score.gradient
-    information[:, physical[:, np.newaxis], physical] = score.fisher_information
-    return Linearization(all_slopes, residual, gradient, information)

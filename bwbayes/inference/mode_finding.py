@@ -42,6 +42,28 @@ WALL = -1e12
 
 
 @dataclass(frozen=True)
+class Linearization:
+    """A displacement and a log likelihood, linearized at models, in the physical coordinates.
+
+    Attributes
+    ----------
+    slopes
+        ∂x/∂z, (models, physical, readings), um; the readings of all records one after the other.
+    residual
+        (models, readings), um, from rest.
+    gradient
+        ∂ log p(readings | z)/∂z, (models, physical), the noise and the unknown starts held.
+    fisher_information
+        (models, physical, physical), the same held.
+    """
+
+    slopes: FloatArray
+    residual: FloatArray
+    gradient: FloatArray
+    fisher_information: FloatArray
+
+
+@dataclass(frozen=True)
 class State:
     """Where a climb is: coordinates (size,), log density, displacement (readings,), um."""
 
@@ -134,8 +156,11 @@ class Target:
         So many steps at most in the noise's, one of Fisher scoring in the others.
         """
         states = [self.step_noise(state, noise_steps) for state in states]
-        gradients, informations = self.linearize(states)
-        steps = np.zeros((len(states), self.size))
+        coordinates = np.stack([state.coordinates for state in states])
+        linear = self.linearize(coordinates, np.stack([state.displacement for state in states]))
+        gradients = linear.gradient - coordinates[:, self.physical]
+        informations = linear.fisher_information + np.eye(self.physical.size)
+        steps = np.zeros_like(coordinates)
         steps[:, self.physical] = np.linalg.solve(informations, gradients[..., np.newaxis])[..., 0]
         left = [*range(len(states))]
         for fraction in FRACTIONS:
@@ -148,21 +173,29 @@ class Target:
                 break
         return states
 
-    def linearize(self, states: Sequence[State]) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Fisher information of states' log density in the physical coordinates.
+    def linearize(
+        self,
+        coordinates: FloatArray,
+        displacement: FloatArray | None = None,
+        *,
+        expected: bool = False,
+    ) -> Linearization:
+        """Linearize at coordinates (models, size) that are possible, all steps side by side.
 
-        The prior's information is that of its normal scores.
+        :meth:`~bwbayes.inference.likelihood.Likelihood.score` has the equations. ``displacement``
+        (models, readings), um, is given where it is known. If ``expected``, readings are those that
+        each model predicts: of a record that is not measured yet.
         """
-        coordinates = np.stack([state.coordinates for state in states])
-        here = np.stack([state.displacement for state in states])
 
-        def displacement(places: FloatArray) -> FloatArray:
+        def simulate(places: FloatArray) -> FloatArray:
             return self.simulate(*self.prior(places), places)
 
-        _, slopes = value_and_jacobian(displacement, coordinates, self.physical, here)
-        score = self.posterior.score(self.prior(coordinates)[0], slopes, here)
-        gradient = score.gradient - coordinates[:, self.physical]
-        return gradient, score.fisher_information + np.eye(self.physical.size)
+        here, slopes = value_and_jacobian(simulate, coordinates, self.physical, displacement)
+        readings = np.concatenate([record.readings.values for record in self.posterior.datasets])
+        read = np.broadcast_to(readings, here.shape)
+        theta, _ = self.prior(coordinates)
+        score = self.posterior.score(theta, slopes, read if expected else here)
+        return Linearization(slopes, read - here, score.gradient, score.fisher_information)
 
     def covariance(self, state: State) -> tuple[FloatArray, float]:
         """Covariance (size, size) at a mode, and its log determinant.
@@ -174,7 +207,8 @@ class Target:
         covariance, log_determinant = np.eye(self.size), 0.0
         if not np.isfinite(state.density):
             return covariance, log_determinant
-        information = self.linearize([state])[1][0]
+        linear = self.linearize(state.coordinates[np.newaxis], state.displacement[np.newaxis])
+        information = linear.fisher_information[0] + np.eye(self.physical.size)
         _, hessian = self._noise_hessian(state)
         for rows, curvature, flattest in (
             (self.physical, information, 1.0),

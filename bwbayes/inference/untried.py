@@ -11,7 +11,7 @@ The coordinates z of the longer model are found from the fit's by Gauss and Newt
     H = I + Q,   z → z + H⁻¹ (u − Q z),
 
 where u and I are the likelihood's gradient and Fisher information in z, the noise held
-(:func:`~bwbayes.inference.linearization.linearize`), and Q is the prior's precision: one, but
+(:meth:`~bwbayes.inference.mode_finding.Target.linearize`), and Q is the prior's precision: one, but
 between the strengths, which are alike. Strengths c are drawn from the normal distribution of that
 mode, and each draw of the fit moves with its own, by the mode's move and −H_φφ⁻¹ H_φc (c − ĉ): the
 gain of a fast drive gives way to the creep in it, and what is predicted of such a drive stays as it
@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.linearization import linearize
+from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.creep import Creep, creep_times
@@ -58,28 +58,29 @@ def with_creep(
     columns = dict(zip(posterior.names, draws.T, strict=True))
     columns |= {name: np.zeros(len(draws)) for name in creep.names}
     places = extended.prior.unconstrain(np.stack([columns[n] for n in extended.names], axis=1))
-    strengths = np.array([extended.names.index(name) for name in creep.names])
-    moving = [i for i, n in enumerate(extended.names) if n in extended.table.physical]
-    others = np.setdiff1d(moving, strengths)
+    target = Target(extended)
+    moving = target.physical
+    crept = np.array([moving.tolist().index(extended.names.index(n)) for n in creep.names])
+    rest = np.setdiff1d(np.arange(moving.size), crept)
+    strengths, others = moving[crept], moving[rest]
     # Creep goes with the logarithm of the time: strengths a decade of it apart are alike.
     decades = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
-    prior = np.eye(len(extended.names))
-    prior[np.ix_(strengths, strengths)] = np.linalg.inv(0.9**decades)
+    prior = np.eye(moving.size)
+    prior[np.ix_(crept, crept)] = np.linalg.inv(0.9**decades)
 
     begin = places.mean(axis=0)
     mode, hessian = begin.copy(), prior
     for _ in range(ROUNDS):
-        linear = linearize(extended, mode[np.newaxis])
+        linear = target.linearize(mode[np.newaxis])
         hessian = linear.fisher_information[0] + prior
-        gradient = (linear.gradient[0] - prior @ mode)[moving]
-        mode[moving] += np.linalg.solve(hessian[np.ix_(moving, moving)], gradient)
-    across = hessian[np.ix_(others, strengths)]
-    follow = np.linalg.solve(hessian[np.ix_(others, others)], across)
-    precision = hessian[np.ix_(strengths, strengths)] - across.T @ follow
+        mode[moving] += np.linalg.solve(hessian, linear.gradient[0] - prior @ mode[moving])
+    across = hessian[np.ix_(rest, crept)]
+    follow = np.linalg.solve(hessian[np.ix_(rest, rest)], across)
+    precision = hessian[np.ix_(crept, crept)] - across.T @ follow
     covariance = np.linalg.inv((precision + precision.T) / 2)
-    crept = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))
-    places[:, others] += (mode - begin)[others] - (crept - mode[strengths]) @ follow.T
-    places[:, strengths] = crept
+    drawn = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))
+    places[:, others] += (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
+    places[:, strengths] = drawn
     return extended, extended.prior.constrain(places)[0]
 
 

@@ -14,9 +14,9 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.linearization import (
     STEP,
     gradient_and_hessian,
-    linearize,
     value_and_jacobian,
 )
+from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
 from tests.inference.linear import Linear, every_case
 from tests.inference.problems import short_posterior
@@ -75,7 +75,7 @@ def test_the_hessian_of_a_quadratic_is_exact(numbers: list[float]) -> None:
 def test_a_linear_model_is_the_closed_form(free: tuple[str, ...], noise: str) -> None:
     model = Linear(free, noise)
     z = np.array([[0.3, -0.8, 1.1][: len(free)], [-1.0, 0.2, 0.4][: len(free)]])
-    linear = linearize(model.posterior, z)
+    linear = Target(model.posterior).linearize(z)
     design = model.design[model.rows] * model.sd
     residual = (model.readings - model.level)[model.rows] - z @ design.T
     weighted = np.linalg.solve(model.noise[np.ix_(model.rows, model.rows)], design)
@@ -94,13 +94,12 @@ def test_the_gradient_is_that_of_the_density_where_nothing_is_unknown(engine: En
     posterior = short_posterior(samples=200, fixed={"initial": 0.0})
     posterior = replace(posterior.altered(from_rest=True), engine=engine)
     places = np.random.default_rng(1).normal(0, 0.5, (3, len(posterior.names)))
-    linear = linearize(posterior, places)
-    physical = [name in posterior.table.physical for name in posterior.names]
+    linear = Target(posterior).linearize(places)
 
     def log_likelihood(z: FloatArray) -> FloatArray:
         return posterior.log_likelihood(posterior.prior.theta(posterior.prior.constrain(z)[0]))
 
-    expected = np.where(physical, value_and_jacobian(log_likelihood, places)[1], 0.0)
+    _, expected = value_and_jacobian(log_likelihood, places, Target(posterior).physical)
     np.testing.assert_allclose(linear.gradient, expected, rtol=1e-5, atol=1e-4)
 
 
@@ -112,8 +111,8 @@ def test_what_two_records_say_adds_up() -> None:
     table = replace(single.table, records=("first", "second"), shared=shared)
     joint = Posterior((single.only, second), single.prior, single.engine, table)
     z = np.full((1, len(joint.names)), 0.1)
-    parts = [linearize(single, z), linearize(single.altered(**vars(second)), z)]
-    whole = linearize(joint, z)
+    parts = [Target(p).linearize(z) for p in (single, single.altered(**vars(second)))]
+    whole = Target(joint).linearize(z)
     np.testing.assert_allclose(whole.gradient, sum(p.gradient for p in parts), rtol=1e-9)
     information = sum(p.fisher_information for p in parts)
     np.testing.assert_allclose(whole.fisher_information, information, rtol=1e-9)
