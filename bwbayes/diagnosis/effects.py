@@ -123,7 +123,7 @@ def reversed_sign(scene: Scene) -> Iterator[Explanation]:
     if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) >= 0:
         return
     turned = scene.posterior.altered(displacement=-record.displacement)
-    fit = climb(turned, map_estimate.valleys(turned, scene.generator))
+    fit = climb(turned, map_estimate.local_minima(turned, scene.generator))
     text, fix = "reversed sign of the displacement", "change its sign in the file"
     yield scene.explained("sign", text, fix, fit)
 
@@ -155,7 +155,7 @@ def delay(scene: Scene) -> Iterator[Explanation]:
     unmoved = scene.posterior.altered(displacement=kept, training=whole)
     moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=whole)
     before = replace(scene, fit=climb(unmoved, scene.places), before=None, held_out=())
-    fit = climb(moved, map_estimate.valleys(moved, scene.generator))
+    fit = climb(moved, map_estimate.local_minima(moved, scene.generator))
     cost = scene.lead + float(np.log(2 * limit / scene.interval))
     yield _late(before, rows * scene.interval, fit, cost)
 

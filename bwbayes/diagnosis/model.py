@@ -107,7 +107,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         spec = scene.study.spec.with_stage(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
         # One start finds the best place for nearly all records, in half of the time of five.
-        places = map_estimate.valleys(posterior, scene.generator, 1)
+        places = map_estimate.local_minima(posterior, scene.generator, 1)
         fit = scene.extended(posterior=posterior, places=places)
         text = f"another operator, {name}"
         fix = _lines(scene.study.spec, spec)
@@ -179,7 +179,7 @@ def prior(scene: Scene) -> Iterator[Explanation]:
         posterior = replace(scene.posterior, prior=JointPrior(parameters, before.constraint))
         places = [
             posterior.prior.unconstrain(before.constrain(scene.places)[0]),
-            map_estimate.valleys(posterior, scene.generator, 1),
+            map_estimate.local_minima(posterior, scene.generator, 1),
         ]
         fit = scene.extended(posterior=posterior, places=np.concatenate(places))
         text = f"prior of {parameter.name}, {parameter.prior}, that excludes the record's value"

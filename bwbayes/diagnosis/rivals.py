@@ -61,7 +61,7 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
     Each starts at what it has in common with the model, and at its own valley.
     """
     whole = study.posterior
-    place = map_estimate.valleys(whole, rng, 1)[0]
+    place = map_estimate.local_minima(whole, rng, 1)[0]
     theta = whole.prior.theta(whole.prior.constrain(place[np.newaxis])[0])
     stride = stride_of(thinned(whole, theta, READINGS), whole)
     known = dict(zip(whole.names, place.tolist(), strict=True))
@@ -72,7 +72,7 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
             posterior = study.with_model(spec).posterior
             posterior = replace(posterior, datasets=(thin(posterior.only, stride),))
             start = np.array([[known.get(name, 0.0) for name in posterior.names]])
-            places = np.concatenate([start, map_estimate.valleys(posterior, rng, 1)])
+            places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
             fits.append(climb(posterior, places))
     return tuple(fit for fit in fits if fit.follows)
 

@@ -150,7 +150,7 @@ class Scene:
         places = optima
         try:
             rest = posterior.altered(training=later)
-            best = climb(rest, map_estimate.valleys(rest, generator))
+            best = climb(rest, map_estimate.local_minima(rest, generator))
             places = np.concatenate([optima, best.coordinates[np.newaxis]])
         except InputError:
             pass  # the rest has too few readings for these priors

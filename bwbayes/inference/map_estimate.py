@@ -91,7 +91,7 @@ def fit(posterior: Posterior, generator: np.random.Generator, watch: Watch = unw
     return PointFit(best.coordinates, best.covariance, best.log_density, optima, spread)
 
 
-def valleys(
+def local_minima(
     posterior: Posterior, generator: np.random.Generator, starts: int = STARTS
 ) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
@@ -114,7 +114,7 @@ def valleys(
     return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
 
 
-def peaks(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
+def mode_weights(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
     """Return covariances (modes, free, free) at a point fit's optima, and their shares (modes,).
 
     A mode's share of the posterior is guessed from its height and width (Laplace's approximation).
@@ -147,7 +147,9 @@ def _places(
     for steps in watched((False, True), watch):
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
-        optima += _valleys(least_squares, least_squares.optima(draws[order[:starts]], least))
+        optima += _distinct_minima(
+            least_squares, least_squares.optima(draws[order[:starts]], least)
+        )
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]
     # A place that least squares allows may still have no density: the noise is another one there.
@@ -235,7 +237,7 @@ def _with_noise(
     return winner
 
 
-def _valleys(least_squares: LeastSquares, places: FloatArray) -> list[FloatArray]:
+def _distinct_minima(least_squares: LeastSquares, places: FloatArray) -> list[FloatArray]:
     """Keep one place for each distinct optimum of least squares, the best first."""
     same = 1e-2  # optima whose sums of squares and coordinates agree to this part are one
     costs = least_squares.costs(places)

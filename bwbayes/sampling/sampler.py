@@ -36,7 +36,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.map_estimate import PointFit, peaks
+from bwbayes.inference.map_estimate import PointFit, mode_weights
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import Block, Chain, Phase, constrain_steps, thinning
@@ -95,7 +95,9 @@ def first_chain(
     seeds = generator.spawn(plan.ensembles)
     chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
     totals = TotalMap.of_noise(posterior.prior)
-    chain.freeze("pilot", StudentMixture.around(point.optima, *peaks(posterior, point), totals))
+    chain.freeze(
+        "pilot", StudentMixture.around(point.optima, *mode_weights(posterior, point), totals)
+    )
     return chain
 
 

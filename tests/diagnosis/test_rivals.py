@@ -57,7 +57,7 @@ def fitted(kind: str, folder: Path) -> tuple[Problem, FloatArray]:
         write_record(measured(kind, voltage, rng), folder / f"{name}.h5")
     problem = resolve(parse(CONFIG, "config"), folder)
     posterior = problem.posterior
-    fit = climb(posterior, map_estimate.valleys(posterior, rng, 1))
+    fit = climb(posterior, map_estimate.local_minima(posterior, rng, 1))
     drawn = rng.multivariate_normal(fit.coordinates, fit.covariance, 300, method="eigh")
     free, density = posterior.prior.constrain(drawn)
     return problem, free[np.isfinite(density)]

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.least_squares import LeastSquares
-from bwbayes.inference.map_estimate import PointFit, fit, peaks
+from bwbayes.inference.map_estimate import PointFit, fit, mode_weights
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.plants import bench
 from tests.diagnosis.test_fixes import CONFIG, put
@@ -100,7 +100,7 @@ def test_both_modes_of_a_record_of_one_amplitude_are_seen(
         point = fit(problem.posterior, np.random.default_rng(seed))
         free, _ = problem.posterior.prior.constrain(point.optima)
         np.testing.assert_allclose([0.71, 0.95], np.sort(free[:, 0]), atol=0.02)
-        assert least < min(peaks(problem.posterior, point)[1])
+        assert least < min(mode_weights(problem.posterior, point)[1])
 
 
 def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: Path) -> None:

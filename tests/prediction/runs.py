@@ -78,7 +78,7 @@ def weighted_draws(
     if point is None:
         point = pointfit.fit(posterior, source)
     random = np.random.RandomState(source.bit_generator)
-    proposal = StudentMixture.around(point.optima, *pointfit.peaks(posterior, point))
+    proposal = StudentMixture.around(point.optima, *pointfit.mode_weights(posterior, point))
     for _ in range(ROUNDS):
         places, ratio = _tried(posterior, proposal, random, PILOT)
         if not np.isfinite(ratio).any():

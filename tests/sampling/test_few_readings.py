@@ -53,7 +53,7 @@ def without_discrepancy(posterior: Posterior, coordinates: FloatArray) -> BoolAr
 
 def share_by_weights(posterior: Posterior, point: PointFit) -> tuple[float, float]:
     """Return the share of the mode without a discrepancy by importance sampling, and its error."""
-    around = StudentMixture.around(point.optima, *map_estimate.peaks(posterior, point))
+    around = StudentMixture.around(point.optima, *map_estimate.mode_weights(posterior, point))
     # Twice as wide as the modes: what is between them is reached too.
     proposal = replace(around, factors=2**0.5 * around.factors, freedom=3.0)
     places, proposed = proposal.evaluate(proposal.draw(np.random.RandomState(1), 400_000))
