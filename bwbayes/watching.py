@@ -40,3 +40,9 @@ def counted(total: int, watch: Watch) -> Callable[[int], None]:
 def part(watch: Watch, first: float, last: float) -> Watch:
     """Return the watch of a part of a step, from one share of it to another."""
     return lambda share: watch(first + (last - first) * share)
+
+
+def parts[T](items: Sequence[T], watch: Watch) -> Iterator[tuple[T, Watch]]:
+    """Yield items, each with the watch of its equal part of a step."""
+    for i, item in enumerate(items):
+        yield item, part(watch, i / len(items), (i + 1) / len(items))

@@ -19,7 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import narrower
-from bwbayes.watching import Watch, part, unwatched, watched
+from bwbayes.watching import Watch, part, parts, unwatched, watched
 
 # Draws that are asked about each of many histories.
 FEW = 50
@@ -150,14 +150,9 @@ def _by_grids(
     Those of one draw follow one another, (draws * repeats,).
     """
     single = len(likelihoods) == 1
-    count = len(likelihoods)
     grids = [
-        _grid(
-            likelihood,
-            States(likelihood, theta, single=single),
-            part(watch, number / count, (number + 1) / count),
-        )
-        for number, likelihood in enumerate(likelihoods)
+        _grid(likelihood, States(likelihood, theta, single=single), of_likelihood)
+        for likelihood, of_likelihood in parts(likelihoods, watch)
     ]
     evidence = np.stack([grid[2] for grid in grids])
     rows = np.repeat(np.arange(len(theta)), repeats)

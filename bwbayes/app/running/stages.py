@@ -18,7 +18,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import NotConvergedError
 from bwbayes.sampling.chain import PHASES, log_densities
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import Watch, WatchSteps, counted, part, unwatched, watched
+from bwbayes.watching import Watch, WatchSteps, counted, parts, unwatched, watched
 
 if TYPE_CHECKING:
     from bwbayes.app.jobs.at_work import Scratch
@@ -291,11 +291,10 @@ class Stages:
 
         best = self.problem.posterior.prior.unconstrain(self.best)
         modes = distinct([*best, *self.chain.point.optima], self.chain.point.covariance)
-        names, explanations = [*self.problem.records], {}
-        for i, name in enumerate(names):
-            of_record = part(watch, i / len(names), (i + 1) / len(names))
-            explanations[name] = explained(self.problem, name, modes, of_record)
-        return explanations
+        return {
+            name: explained(self.problem, name, modes, of_record)
+            for name, of_record in parts([*self.problem.records], watch)
+        }
 
     @always
     def verdicts(self, _: Watch) -> dict[str, Verdict]:
@@ -329,12 +328,11 @@ class Stages:
         from bwbayes.diagnosis.predictive_checks import check_predictions
 
         _ = self.information_gain  # first: it draws from the same source
-        posterior, source, checks = self.problem.posterior, self._check_source, {}
-        names = [dataset.name for dataset in posterior.datasets]
-        for i, name in enumerate(names):
-            of_record = part(watch, i / len(names), (i + 1) / len(names))
-            checks[name] = check_predictions(posterior, self.subset, source, name, of_record)
-        return checks
+        posterior, subset, source = self.problem.posterior, self.subset, self._check_source
+        return {
+            name: check_predictions(posterior, subset, source, name, of_record)
+            for name, of_record in parts([*self.problem.records], watch)
+        }
 
     @always
     def remarks(self, watch: Watch) -> tuple[str, ...]:
