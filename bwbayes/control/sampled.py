@@ -31,7 +31,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.elementwise import anywhere, select
 from bwbayes.model.linear import Taps
 from bwbayes.model.operator import Span
-from bwbayes.model.stage import Clock, Stage
+from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.step import HysteresisStep
 from bwbayes.prediction.loops import steady_loop
 from bwbayes.shown import brief
@@ -143,12 +143,12 @@ class SampledStage(NamedTuple):
 
     @classmethod
     def row(
-        cls, stages: Sequence[Stage], column: Values, clock: Clock, at_rest: FloatArray
+        cls, stages: Sequence[Stage], column: Values, timing: Timing, at_rest: FloatArray
     ) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """Return stages in a row, and what comes out behind them at rest at zero volts."""
         row = []
         for stage in stages:
-            numbers = stage.numbers(column, clock)
+            numbers = stage.numbers(column, timing)
             row.append(cls(stage, numbers.T, at_rest))
             at_rest, _ = stage.settled(numbers, at_rest)
         return tuple(row), at_rest
@@ -243,13 +243,13 @@ class SampledModel:
     def inputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """The stages before the hysteresis, and the voltage behind them at rest, (models,), V."""
         actuator, zero = self.actuator, np.zeros(self.models)
-        return SampledStage.row(actuator.inputs, self.column, actuator.clock, zero)
+        return SampledStage.row(actuator.inputs, self.column, actuator.timing, zero)
 
     @cached_property
     def outputs(self) -> tuple[tuple[SampledStage, ...], FloatArray]:
         """The stages behind the dynamics, and what comes out of them at rest, (models,), um."""
         actuator, level = self.actuator, self._settle(self.inputs[1])[2]
-        return SampledStage.row(actuator.outputs, self.column, actuator.clock, level)
+        return SampledStage.row(actuator.outputs, self.column, actuator.timing, level)
 
     def _settle(self, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Let hysteresis, dynamics and creep come to rest at a voltage (models,), V.

@@ -30,7 +30,7 @@ from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
-from bwbayes.model.stage import Advance, Clock, Side, Stage, begin_stages, pass_stages
+from bwbayes.model.stage import Advance, Side, Stage, Timing, begin_stages, pass_stages
 from bwbayes.shown import brief
 
 OFFSET = Declaration(
@@ -205,7 +205,7 @@ class Actuator:
             outputs = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
         else:
             outputs = state.outputs
-        result, outputs = pass_stages(self.outputs, column, result, outputs, self.clock)
+        result, outputs = pass_stages(self.outputs, column, result, outputs, self.timing)
         result += column["offset"][:, np.newaxis]
         return result, State(hysteresis, equilibrium, filtered, inputs, outputs)
 
@@ -246,9 +246,9 @@ class Actuator:
         return replace(self, dynamics="none", hold="first", creep=None, stages=stages)
 
     @property
-    def clock(self) -> Clock:
+    def timing(self) -> Timing:
         """How its samples follow each other."""
-        return Clock(self.interval, self.hold)
+        return Timing(self.interval, self.hold)
 
     @cached_property
     def inputs(self) -> tuple[Stage, ...]:
@@ -269,7 +269,7 @@ class Actuator:
         """Return the memories of the stages before the hysteresis at a record's first voltage."""
         models = column["offset"].size
         rest = np.zeros(models) if from_rest else None
-        return begin_stages(self.inputs, column, np.full(models, path[0]), self.clock, rest)
+        return begin_stages(self.inputs, column, np.full(models, path[0]), self.timing, rest)
 
     def begin_outputs(
         self, column: Values, first: FloatArray, *, from_rest: bool
@@ -279,7 +279,7 @@ class Actuator:
         Displacements are in um, without the offset.
         """
         rest = self.level_at_rest(column) if from_rest else None
-        return begin_stages(self.outputs, column, first, self.clock, rest)
+        return begin_stages(self.outputs, column, first, self.timing, rest)
 
     def level_at_rest(self, column: Values) -> FloatArray:
         """Return the displacement (models,), um, of demagnetized models at rest at zero volts.
@@ -290,7 +290,7 @@ class Actuator:
         if self.inputs:
             rest = np.zeros(column["offset"].size)
             for stage in self.inputs:
-                rest, _ = stage.settled(stage.numbers(column, self.clock), rest)
+                rest, _ = stage.settled(stage.numbers(column, self.timing), rest)
             driven = rest[:, np.newaxis]
         memory = self.begin(column, driven, from_rest=True, span=self.range_of(zero))
         drive, _ = self.drive(column, driven, memory)
@@ -314,7 +314,7 @@ class Actuator:
         if not self.inputs:
             return path, ()
         every = np.broadcast_to(path, (column["offset"].size, path.size))
-        return pass_stages(self.inputs, column, every, memories, self.clock, advance)
+        return pass_stages(self.inputs, column, every, memories, self.timing, advance)
 
     def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
         """Return what hysteresis and gain make of a path, V, (models, samples), um.

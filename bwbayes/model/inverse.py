@@ -128,7 +128,7 @@ class _Single:
         actuator, interval = self.actuator, self.actuator.interval
         rest = actuator.level_at_rest(self.column) if self.from_rest else None
         drive = (displacement - self.column["offset"][0])[np.newaxis]
-        drive = undo_stages(actuator.outputs, self.column, drive, actuator.clock, rest)[0]
+        drive = undo_stages(actuator.outputs, self.column, drive, actuator.timing, rest)[0]
         span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
         size = peak / self.slope if self.slope > 0 else 1.0
         # Beyond so many times what a straight line would need no voltage is looked for.
@@ -156,7 +156,7 @@ class _Single:
         """Return the command (samples,), V, that makes a voltage at the hysteresis."""
         rest = np.zeros(1) if self.from_rest else None
         actuator, path = self.actuator, voltage[np.newaxis]
-        command = undo_stages(actuator.inputs, self.column, path, actuator.clock, rest)
+        command = undo_stages(actuator.inputs, self.column, path, actuator.timing, rest)
         return np.asarray(command[0])
 
     def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:

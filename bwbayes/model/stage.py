@@ -29,7 +29,7 @@ from bwbayes.shown import brief
 Side = Literal["input", "output"]
 
 
-class Clock(NamedTuple):
+class Timing(NamedTuple):
     """How samples follow each other: every ``interval`` s, with a ``hold`` in between."""
 
     interval: float
@@ -69,7 +69,7 @@ class Stage(ABC):
         return self.name
 
     @abstractmethod
-    def numbers(self, column: Values, clock: Clock) -> FloatArray:
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return what ``move`` needs to know of models, (models, any), from columns (models,)."""
 
     @staticmethod
@@ -100,7 +100,7 @@ class Stage(ABC):
         column: Values,  # noqa: ARG002
         numbers: FloatArray,
         first: FloatArray,
-        clock: Clock,  # noqa: ARG002
+        timing: Timing,  # noqa: ARG002
     ) -> FloatArray:
         """Return the memory (models, any) before a first value (models,), not from rest.
 
@@ -165,7 +165,7 @@ def begin_stages(
     stages: Sequence[Stage],
     column: Values,
     first: FloatArray,
-    clock: Clock,
+    timing: Timing,
     rest: FloatArray | None = None,
 ) -> tuple[FloatArray, ...]:
     """Return the memories of stages in a row just before a record's first value (models,).
@@ -175,9 +175,9 @@ def begin_stages(
     """
     memories = []
     for stage in stages:
-        numbers = stage.numbers(column, clock)
+        numbers = stage.numbers(column, timing)
         if rest is None:
-            memory = stage.begin(column, numbers, first, clock)
+            memory = stage.begin(column, numbers, first, timing)
         else:
             rested, at_rest = stage.settled(numbers, rest)
             # What has no pace has come along the whole path from there.
@@ -192,7 +192,7 @@ def undo_stages(
     stages: Sequence[Stage],
     column: Values,
     values: FloatArray,
-    clock: Clock,
+    timing: Timing,
     rest: FloatArray | None = None,
 ) -> FloatArray:
     """Return the values (models, samples) with which these come out behind stages in a row.
@@ -209,15 +209,15 @@ def undo_stages(
         stage.require_inverse()
         at_rest.append(rest)
         if rest is not None:
-            rest = stage.settled(stage.numbers(column, clock), rest)[0]
+            rest = stage.settled(stage.numbers(column, timing), rest)[0]
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
-        numbers, first = stage.numbers(column, clock), values[:, 0].copy()
-        memories = begin_stages((stage,), column, first, clock, rested)
+        numbers, first = stage.numbers(column, timing), values[:, 0].copy()
+        memories = begin_stages((stage,), column, first, timing, rested)
         # What comes out first hangs on what goes in first.
         for _ in range(40):
             out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
             first = first + (values[:, 0] - out[:, 0])
-            memories = begin_stages((stage,), column, first, clock, rested)
+            memories = begin_stages((stage,), column, first, timing, rested)
         values = stage.inverse(numbers, memories[0], values)
     return values
 
@@ -227,12 +227,12 @@ def pass_stages(
     column: Values,
     values: FloatArray,
     memories: Sequence[FloatArray],
-    clock: Clock,
+    timing: Timing,
     advance: Advance = Stage.advance,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
     """Let values (models, samples) pass stages in a row; return them, and the memories."""
     after = []
     for stage, memory in zip(stages, memories, strict=True):
-        values, reached = advance(stage, stage.numbers(column, clock), memory, values)
+        values, reached = advance(stage, stage.numbers(column, timing), memory, values)
         after.append(reached)
     return values, tuple(after)

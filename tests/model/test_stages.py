@@ -36,7 +36,7 @@ from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
-from bwbayes.model.stage import Clock, Stage
+from bwbayes.model.stage import Stage, Timing
 from bwbayes.record.true_values import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -137,7 +137,7 @@ def passed(name: str, x: FloatArray, hold: Hold = "first") -> FloatArray:
     """Return what the package's stage makes of the same."""
     stage = STAGES[name]()
     column = {one: np.array([value]) for one, value in VALUES.items()}
-    numbers = stage.numbers(column, Clock(INTERVAL, hold))
+    numbers = stage.numbers(column, Timing(INTERVAL, hold))
     _, memory = stage.settled(numbers, x[:1])
     return np.asarray(stage.advance(numbers, memory, x[np.newaxis])[0][0])
 

@@ -17,7 +17,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled import kernels, lanes, whitening
 from bwbayes.inference.compiled.motion import physics, shared, simulated
-from bwbayes.inference.compiled.stages import Stage, advance_of, given, prepared
+from bwbayes.inference.compiled.stages import CompiledDrive, advance_of, given, prepared
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.declaration import Values
@@ -173,7 +173,7 @@ def _over_gaps(steps: FloatArray) -> FloatArray:
 
 def _staged(
     likelihood: Likelihood, column: Values, voltage: FloatArray
-) -> Iterator[tuple[IntArray | slice, Stage]]:
+) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
     """Yield which models go together, and the stage that makes their drive."""
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
     if actuator.stages:

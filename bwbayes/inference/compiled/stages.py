@@ -29,7 +29,7 @@ from bwbayes.model.step import HysteresisStep
 Kind = HysteresisStep | RemembersExtrema | None
 
 
-class Stage(NamedTuple):
+class CompiledDrive(NamedTuple):
     """What a compiled stage starts from.
 
     ``kind`` is what brings its formula, None where the drive is known; ``rest`` (models,) is w₀,
@@ -42,21 +42,23 @@ class Stage(NamedTuple):
     plan: FloatArray
 
 
-def prepared(operator: Operator, column: Values, voltage: FloatArray, memory: Any) -> Stage | None:
+def prepared(
+    operator: Operator, column: Values, voltage: FloatArray, memory: Any
+) -> CompiledDrive | None:
     """Return the stage of an operator's models; None if that is left to NumPy."""
     if isinstance(operator, RemembersExtrema):
         group = extrema.rows(voltage, memory)
-        return Stage(operator, memory.displacement, group, operator.numbers(column))
+        return CompiledDrive(operator, memory.displacement, group, operator.numbers(column))
     if type(operator).step is Operator.step:
         return None
     step = operator.step(column)
     state = step.remembered(memory)
     if isinstance(step, RelaxingStep):
         group, plan_rows = relaxing.rows(step, state, voltage[0]), relaxing.planned(step)
-        return Stage(step, group[:, 0], group, plan_rows)
+        return CompiledDrive(step, group[:, 0], group, plan_rows)
     equilibrium = step.go(state, np.full(len(state), voltage[0])).w
     group = np.column_stack([np.arange(equilibrium.size), equilibrium, state])
-    return Stage(step, equilibrium, group, step.parameters)
+    return CompiledDrive(step, equilibrium, group, step.parameters)
 
 
 def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
@@ -65,12 +67,12 @@ def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
     return pinned.drive if integrated else type(operator).advance
 
 
-def given(drive: FloatArray) -> Stage:
+def given(drive: FloatArray) -> CompiledDrive:
     """Take a known drive (models, samples), um."""
     equilibrium = drive[:, 0]
     group = np.stack([np.arange(equilibrium.size), equilibrium], axis=1)
     # All that follows would be compiled once more for another layout.
-    return Stage(None, equilibrium, group, np.ascontiguousarray(drive))
+    return CompiledDrive(None, equilibrium, group, np.ascontiguousarray(drive))
 
 
 def drive_of(

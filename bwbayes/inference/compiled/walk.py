@@ -57,7 +57,7 @@ def walk(
         if memories is None:
             memories = actuator.begin_outputs(column, moved[:, 0], from_rest=from_rest)
         moved, memories = pass_stages(
-            actuator.outputs, column, moved, memories, actuator.clock, advance_stage
+            actuator.outputs, column, moved, memories, actuator.timing, advance_stage
         )
         return moved + column["offset"][:, np.newaxis]
 

@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.elementwise import select
-from bwbayes.model.stage import Clock, Side, Stage
+from bwbayes.model.stage import Side, Stage, Timing
 
 
 class Backlash(Stage):
@@ -60,7 +60,7 @@ class Backlash(Stage):
         """Say how much it is from end to end."""
         return f"backlash of {2 * values['backlash']:.2g} um in the mount"
 
-    def numbers(self, column: Values, clock: Clock) -> FloatArray:  # noqa: ARG002  # no pace
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
         """Return b, (models, 1), um."""
         return column["backlash"][:, np.newaxis].copy()
 
@@ -75,7 +75,7 @@ class Backlash(Stage):
         column: Values,
         numbers: FloatArray,
         first: FloatArray,
-        clock: Clock,  # noqa: ARG002  # no pace
+        timing: Timing,  # noqa: ARG002  # no pace
     ) -> FloatArray:
         """Return y = x + s b, and x."""
         y = first + np.clip(column["backlash_start"], -1.0, 1.0) * numbers[:, 0]

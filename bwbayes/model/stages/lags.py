@@ -16,7 +16,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import ComplexArray, first_order_lag
-from bwbayes.model.stage import Clock, Side, Stage
+from bwbayes.model.stage import Side, Stage, Timing
 
 
 class _Lag(Stage):
@@ -32,23 +32,23 @@ class _Lag(Stage):
         what = self.name.partition("-")[0]
         return f"{what} with a lag of {1000 * values[self.parameters[0].name]:.2g} ms"
 
-    def numbers(self, column: Values, clock: Clock) -> FloatArray:
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return the coefficients of x, of x before and of y before, (models, 6).
 
         Three that give what comes out, and three that give y at the sample, or at the next one.
         """
         lag = column[self.parameters[0].name]
-        if not self.is_held(clock):
-            recursion = first_order_lag(lag, clock.interval, "first")
+        if not self.is_held(timing):
+            recursion = first_order_lag(lag, timing.interval, "first")
             row = np.column_stack([recursion.numerator, -recursion.denominator[:, 1]])
             return np.concatenate([row, row], axis=1)
         with np.errstate(divide="ignore"):
-            z = clock.interval / lag
+            z = timing.interval / lag
         mean = -np.expm1(-z) / z
         none = np.zeros_like(z)
         return np.column_stack([1 - mean, none, mean, -np.expm1(-z), none, np.exp(-z)])
 
-    def is_held(self, clock: Clock) -> bool:  # noqa: ARG002  # a displacement has no steps
+    def is_held(self, timing: Timing) -> bool:  # noqa: ARG002  # a displacement has no steps
         """Tell whether x stays the same until the next sample."""
         return False
 
@@ -63,10 +63,10 @@ class _Lag(Stage):
         return value
 
     def begin(
-        self, column: Values, numbers: FloatArray, first: FloatArray, clock: Clock
+        self, column: Values, numbers: FloatArray, first: FloatArray, timing: Timing
     ) -> FloatArray:
         """Return y as far behind x as it is where x has long moved at the stated speed."""
-        slope = column[self.parameters[1].name] * clock.interval
+        slope = column[self.parameters[1].name] * timing.interval
         before, keep = numbers.T[4:]
         # y = x − g s solves the recursion with x before and y before a slope s less.
         behind = (before + keep) / np.maximum(1.0 - keep, 1e-300)
@@ -130,9 +130,9 @@ class AmplifierLag(_Lag):
     side: ClassVar[Side] = "input"
     parameters = _declared("amplifier_lag", "\\tau_{a}", "amplifier", "V", "voltage")
 
-    def is_held(self, clock: Clock) -> bool:
+    def is_held(self, timing: Timing) -> bool:
         """Tell whether the command is."""
-        return clock.hold == "zero"
+        return timing.hold == "zero"
 
 
 class SensorLag(_Lag):

@@ -9,7 +9,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal, normal
-from bwbayes.model.stage import Clock, Side, Stage
+from bwbayes.model.stage import Side, Stage, Timing
 
 
 class Saturation(Stage):
@@ -45,7 +45,7 @@ class Saturation(Stage):
         ends = f"{middle - reach:.3g} and {middle + reach:.3g} V"
         return f"amplifier that saturates towards {ends}"
 
-    def numbers(self, column: Values, clock: Clock) -> FloatArray:  # noqa: ARG002  # no pace
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:  # noqa: ARG002  # no pace
         """Return c and r, (models, 2), V."""
         return np.stack([column["saturation_middle"], column["saturation_reach"]], axis=1)
 

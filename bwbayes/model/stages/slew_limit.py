@@ -12,7 +12,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
-from bwbayes.model.stage import Clock, Side, Stage
+from bwbayes.model.stage import Side, Stage, Timing
 
 
 class SlewLimit(Stage):
@@ -40,9 +40,9 @@ class SlewLimit(Stage):
         """Say what the amplifier does."""
         return f"amplifier that follows no faster than {values['slew_limit']:.3g} V/s"
 
-    def numbers(self, column: Values, clock: Clock) -> FloatArray:
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return the largest change between two samples, (models, 1), V."""
-        return column["slew_limit"][:, np.newaxis] * clock.interval
+        return column["slew_limit"][:, np.newaxis] * timing.interval
 
     @staticmethod
     def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # any rate
