@@ -4,7 +4,9 @@ A disturbance of the sensor or of the room does not know the voltage; what a wro
 comes back wherever the drive does the same again. Each residual, less its mean over a period of the
 drive, is held against the mean of those where the drive was most alike, at other times. The
 correlation of both is compared with that of residuals drawn from the fitted noise, which has the
-residual's size and memory and knows nothing of the drive.
+residual's size and memory and knows nothing of the drive. Where a drive hardly comes back, one part
+of the record tells as much of another: what plays, powers and lags of the voltage explain of the
+whitened residual in all parts but one is held against that one.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.reversals import time_between_turns, turning_points
+from bwbayes.inference.state_space import root
+from bwbayes.model.reversals import monotone_stretches, time_between_turns, turning_points
 
-# Probability of a false alarm, of a residual that does not follow the drive; and the correlation
-# from which on it matters: a twentieth of the residual's variance follows the drive then.
+# Probability of a false alarm, of a residual that does not follow the drive; and the correlation,
+# or the part of its variance beyond the sensor's noise, from which on it matters.
 ALARM, MATTERS = 0.02, 0.1
 
 # Nearest states of the drive that a residual is compared with, and readings that are looked at.
@@ -33,21 +36,28 @@ AVERAGES = (0.2, 0.6)
 # Residuals that are drawn; draws whose mean is what the model does.
 DRAWN, MEAN_OF = 200, 40
 
+# Thresholds of plays in parts of half the range, times of lags in those between reversals, and
+# parts of a record of which each is predicted from the others.
+PLAYS, LAGS, PARTS = (0.05, 0.1, 0.2, 0.4, 0.7), (0.1, 0.3, 1.0, 3.0, 10.0, 30.0), 8
+
 
 @dataclass(frozen=True)
 class DriveLock:
     """How the residual goes with that at like states of the drive: correlation, and p value.
 
-    ``p_value`` is the probability that noise which knows nothing of the drive has it as large.
+    ``p_value`` is the probability that noise which knows nothing of the drive has it as large, or
+    lets as much of one part be told from the others; ``share`` the part of the residual's variance
+    that is not the sensor's noise.
     """
 
     correlation: float
     p_value: float
+    share: float = 1.0
 
     @property
     def locked(self) -> bool:
         """Whether the residual follows the drive."""
-        return self.p_value < ALARM and self.correlation > MATTERS
+        return self.p_value < ALARM and max(self.share, self.correlation) > MATTERS
 
     @property
     def numbers(self) -> dict[str, object]:
@@ -90,17 +100,23 @@ def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator
     if readings.rows.size <= 10 * NEIGHBORS:
         return DriveLock(0.0, 1.0)  # they tell nothing
     theta = posterior.prior.theta(draws[rng.integers(len(draws), size=DRAWN)])
-    rows = readings.rows[:: -(-readings.rows.size // READINGS)]
-    missed = record.displacement[rows]
-    missed = missed - np.mean(posterior.simulate(theta[:MEAN_OF], rows), axis=0)
+    missed = readings.values - np.mean(posterior.simulate(theta[:MEAN_OF], readings.rows), axis=0)
     if float(np.std(missed)) < rounding_sd(readings.values):
         return DriveLock(0.0, 1.0)  # it rounds, which follows the drive as well
+    every = -(-missed.size // READINGS)
+    rows, parameters = readings.rows[::every], record.table.noise(theta)
     # On a grid as coarse as the readings.
     step = int(np.gcd.reduce(np.diff(rows)))
     places = (rows - rows[0]) // step
     noise = record.noise.at(step * record.actuator.interval)
-    discrepancy, sensor = noise.draw_all(record.table.noise(theta), int(places[-1]) + 1, rng)
-    return compare(missed, (discrepancy + sensor)[:, places], record.voltage, rows)
+    discrepancy, sensor = noise.draw_all(parameters, int(places[-1]) + 1, rng)
+    like = compare(missed[::every], (discrepancy + sensor)[:, places], record.voltage, rows)
+    typical = np.median(parameters, axis=0, keepdims=True)
+    series = np.concatenate([[missed], drive_features(record.voltage)[:, readings.rows]])
+    white = posterior.likelihood.whiten(typical, series[np.newaxis])[0][0]
+    white_sd = float(record.noise.marginal_sd(typical)[1][0]) if record.noise.states else 0.0
+    p_value = min(1.0, 2 * min(like.p_value, predictability(white[0], white[1:], rng)))
+    return DriveLock(like.correlation, p_value, 1 - white_sd**2 / float(np.var(missed)))
 
 
 def compare(
@@ -154,3 +170,45 @@ def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArr
     distance[np.abs(np.subtract.outer(rows, rows)) < turn_time] = np.inf
     like: IntArray = np.argpartition(distance, NEIGHBORS, axis=1)[:, :NEIGHBORS]
     return like
+
+
+def drive_features(voltage: FloatArray) -> FloatArray:
+    """Return what a misfit may follow: 1, powers, plays and lags (features, samples) of a drive."""
+    turn_time, middle = time_between_turns(voltage, 1.0), (voltage.max() + voltage.min()) / 2
+    level = (voltage - middle) / max(float(np.ptp(voltage)) / 2, 1e-300)
+    thresholds = np.array(PLAYS)[:, np.newaxis]
+    plays = np.empty((thresholds.size, level.size))
+    reached = np.full((thresholds.size, 1), level[0])
+    for first, last, direction in monotone_stretches(level):
+        along = level[first : last + 1] - direction * thresholds
+        plays[:, first : last + 1] = (np.maximum if direction > 0 else np.minimum)(reached, along)
+        reached = plays[:, last : last + 1]
+    kept = np.exp(-1 / (np.array(LAGS) * turn_time))
+    lags = [
+        scipy.signal.lfilter([1 - a], [1.0, -a], level, zi=[a * level[0]])[0] for a in kept.tolist()
+    ]
+    return np.stack([np.ones(level.size), level, level**2, level**3, *plays, *lags])
+
+
+def predictability(white: FloatArray, features: FloatArray, rng: np.random.Generator) -> float:
+    """Return the p value of what features predict of parts of a residual from all the others.
+
+    By ridge regression of the whitened residual (readings,) on whitened ``features`` (features,
+    readings); chance is that of independent normal numbers.
+    """
+    basis, sizes, _ = np.linalg.svd(features.T, full_matrices=False)
+    basis = basis[:, sizes > 1e-6 * sizes[0]]
+    parts = np.array_split(basis, PARTS)
+    inside = np.stack([part.T @ part for part in parts])
+    scaled = np.array_split(white / np.std(white), PARTS)
+    found = np.stack([part.T @ values for part, values in zip(parts, scaled, strict=True)])
+    scores = rng.standard_normal((DRAWN, *found.shape))
+    drawn = np.einsum("pji,dpj->dpi", root(inside), scores)
+    each = np.concatenate([found[np.newaxis], drawn])
+    others = each.sum(axis=1, keepdims=True) - each
+    # The ridge is worth a part of the record.
+    ridge = (1 + 1 / PARTS) * np.eye(basis.shape[1])
+    weights = np.einsum("pij,dpj->dpi", np.linalg.inv(ridge - inside), others)
+    spread = np.sqrt(np.einsum("dpi,pij,dpj->d", weights, inside, weights))
+    z, *chance = np.sum(weights * each, axis=(1, 2)) / spread
+    return float(scipy.stats.norm.sf((z - np.mean(chance)) / np.std(chance)))

@@ -1,8 +1,9 @@
 """A residual that follows the drive is told from one that does not.
 
-False alarms: at most 3% of residuals of white, rough and smooth noise (2% by the test's level; fits
-of 100 good actuators had none). Power: 95% of misfits as large as that noise, where the drive comes
-back to where it was; of a multisine, which hardly does in 12 s, of those twice as large.
+False alarms: at most 3% of residuals of white, rough and smooth noise (2% by the test's level; one
+of 120 fits of good actuators). Power: 95% of misfits as large as that noise, where the drive comes
+back to where it was; of a multisine, which hardly does in 12 s, of those twice as large by like
+states alone, and of those half as large as white noise by its other parts.
 """
 
 from __future__ import annotations
@@ -13,7 +14,13 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.drive_lock import DriveLock, compare, drive_lock
+from bwbayes.diagnosis.drive_lock import (
+    DriveLock,
+    compare,
+    drive_features,
+    drive_lock,
+    predictability,
+)
 from bwbayes.inference.noise import noise_model
 from tests.inference.problems import short_posterior, truth
 from tests.stand import play
@@ -86,6 +93,18 @@ def test_misfit_of_another_drive_is_not_one_of_this() -> None:
     """The twin: as large, but along a drive that the actuator did not have, it is hardly seen."""
     found = [locked("smooth", "triangle", number, 1.0, own=False) for number in range(20)]
     assert sum(lock.locked for lock in found) <= 0.3 * len(found)
+
+
+@pytest.mark.parametrize(("size", "seen"), [(0.0, (0.0, 0.03)), (0.5, (0.95, 1.0))])
+def test_parts_of_a_record_tell_of_each_other(size: float, seen: tuple[float, float]) -> None:
+    """What follows a multisine, half as large as white noise, is seen; the noise alone is not."""
+    found = []
+    for number in range(100):
+        rng = np.random.default_rng((55, number))
+        voltage = drive("multisine", rng)
+        white = rng.standard_normal(voltage.size) + size * misfit(voltage)
+        found.append(predictability(white, drive_features(voltage), rng) < 0.01)
+    assert seen[0] <= np.mean(found) <= seen[1]
 
 
 @pytest.mark.parametrize("planted", [False, True])
