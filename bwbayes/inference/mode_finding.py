@@ -64,7 +64,7 @@ class Linearization:
 
 
 @dataclass(frozen=True)
-class State:
+class Iterate:
     """Where a climb is: coordinates (size,), log density, displacement (readings,), um."""
 
     coordinates: FloatArray
@@ -140,7 +140,7 @@ class Target:
                 density[possible] += score.log_density
         return np.where(np.isfinite(density), density, -np.inf)
 
-    def at(self, coordinates: FloatArray) -> list[State]:
+    def at(self, coordinates: FloatArray) -> list[Iterate]:
         """Return the states at coordinates (states, size)."""
         theta, density = self.prior(coordinates)
         possible, moved = np.isfinite(density), self.simulate(theta, density, coordinates)
@@ -148,9 +148,9 @@ class Target:
             score = self.posterior.score(theta[possible], moved[:0], moved[possible])
             density[possible] += score.log_density
         density = np.where(np.isfinite(density), density, -np.inf)
-        return [State(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
+        return [Iterate(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
 
-    def round(self, states: Sequence[State], noise_steps: int) -> list[State]:
+    def round(self, states: Sequence[Iterate], noise_steps: int) -> list[Iterate]:
         """Climb a round from states side by side: in the noise's coordinates, then in the others.
 
         So many steps at most in the noise's, one of Fisher scoring in the others.
@@ -197,7 +197,7 @@ class Target:
         score = self.posterior.score(theta, slopes, read if expected else here)
         return Linearization(slopes, read - here, score.gradient, score.fisher_information)
 
-    def covariance(self, state: State) -> tuple[FloatArray, float]:
+    def covariance(self, state: Iterate) -> tuple[FloatArray, float]:
         """Covariance (size, size) at a mode, and its log determinant.
 
         Noise and physical parameters are uncorrelated. What the record does not tell keeps its
@@ -220,7 +220,7 @@ class Target:
             log_determinant -= float(np.sum(np.log(values)))
         return covariance, log_determinant
 
-    def step_noise(self, state: State, count: int = NOISE_STEPS) -> State:
+    def step_noise(self, state: Iterate, count: int = NOISE_STEPS) -> Iterate:
         """Step in the noise's coordinates, by Newton's method where the density bends down."""
         for _ in range(count if self.noise.size else 0):
             gradient, hessian = self._noise_hessian(state)
@@ -235,17 +235,17 @@ class Target:
                 break
             coordinates = state.coordinates.copy()
             coordinates[self.noise] += steps[best]
-            state = State(coordinates, state.density + float(gains[best]), state.displacement)
+            state = Iterate(coordinates, state.density + float(gains[best]), state.displacement)
         return state
 
-    def _noise_gains(self, state: State, steps: FloatArray) -> FloatArray:
+    def _noise_gains(self, state: Iterate, steps: FloatArray) -> FloatArray:
         """By how much steps (steps, noise) in the noise's coordinates raise the log density."""
         coordinates = np.tile(state.coordinates, (len(steps), 1))
         coordinates[:, self.noise] += steps
         density = self.noise_density(coordinates, state.displacement)
         return np.maximum(density, WALL) - state.density
 
-    def _noise_hessian(self, state: State) -> tuple[FloatArray, FloatArray]:
+    def _noise_hessian(self, state: Iterate) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the log density in the noise's coordinates."""
         return gradient_and_hessian(
             lambda steps: self._noise_gains(state, steps), self.noise.size, NOISE_STEP, 0.0
@@ -254,7 +254,7 @@ class Target:
 
 def climb(
     target: Target, starts: FloatArray, least: float = -np.inf, many_steps: int = NOISE_STEPS
-) -> State:
+) -> Iterate:
     """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
 
     The one that leads after :data:`FIRST_ROUNDS` goes on alone, until it gains so little that it

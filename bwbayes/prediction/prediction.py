@@ -47,7 +47,7 @@ PIECE = 400
 STATES_SHARE = 0.4
 
 
-class Tails(NamedTuple):
+class TailScales(NamedTuple):
     """How much larger than s² the variance of a sensor's noise with heavy tails may be.
 
     ``scales`` (scores, draws) is that of each score of a draw; ``values`` (draws, values) and their
@@ -228,7 +228,7 @@ def _bands(
     if noise.tailed:
         inverse_df = noise.inverse_df(parameters)
         scales = mixture.stratified_scales(scores, inverse_df)
-        tails = Tails(scales, *scale_mixture(inverse_df))
+        tails = TailScales(scales, *scale_mixture(inverse_df))
     variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
     variances.append(np.full((1, 1), model_error_sd**2))
     samples = window.stop - window.start
@@ -286,7 +286,7 @@ def _summarized(
     start: InitialStates,
     variances: Sequence[FloatArray],
     scores: FloatArray,
-    tails: Tails | None,
+    tails: TailScales | None,
     record: Record,
     first: int,
     simulated: FloatArray,
