@@ -73,8 +73,11 @@ def test_errors_are_ten_times_smaller_on_the_stand_with_the_right_model() -> Non
 
 
 def running(voltage: float, source: np.random.Generator, interval: float) -> FloatArray:
-    """Return a sine of any amplitude within the limits that is stopped at a voltage, and waits."""
-    amplitude = source.uniform(abs(voltage) + 1.0, 100.0)
+    """Return a sine that is stopped at a voltage, and waits.
+
+    Its amplitude is that of the limits as often as any within them.
+    """
+    amplitude = source.choice([100.0, source.uniform(abs(voltage) + 1.0, 100.0)])
     time = interval * np.arange(round(4.0 / interval))
     swung = amplitude * np.sin(2 * np.pi * (time + source.uniform())) * np.minimum(time, 1.0)
     passes = np.flatnonzero(np.diff(np.sign(swung[time > 2.0] - voltage))) + np.sum(time <= 2.0)
