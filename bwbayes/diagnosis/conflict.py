@@ -133,14 +133,17 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
     values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
     for parameter in prior.free:
         name, (low, high) = parameter.name, parameter.support
+        # A bound that the stage itself declares is no choice of the prior.
+        limits = parameter.declared.limits(prior.seen(values, parameter.record))
+        given_low, given_high = low > np.max(limits[0]), high < np.min(limits[1])
         if parameter.declared.reaches_floor and low == parameter.floor:
             if _near(values[name] - low):
                 yield Finding(
                     name, f"lies on its bound {low:g}", f"give {name} = {{ fixed = {low:.1f} }}"
                 )
-        elif np.isfinite(low) and low != 0 and _near(values[name] - low):
+        elif given_low and low != 0 and np.isfinite(low) and _near(values[name] - low):
             yield _given_bound(parameter, "lower", low)
-        if np.isfinite(high) and _near(high - values[name]):
+        if given_high and np.isfinite(high) and _near(high - values[name]):
             yield _given_bound(parameter, "upper", high)
     for parameter in prior.parameters:
         declared = parameter.declared
