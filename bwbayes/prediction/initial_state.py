@@ -29,6 +29,9 @@ from bwbayes.record.record import Record
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched
 
+# Turns in which the unknowns of a start are chosen.
+SWEEPS = 4
+
 
 @dataclass(frozen=True)
 class Start:
@@ -206,7 +209,10 @@ def estimate_initial_states(
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
     histories, start_theta = choose_histories(likelihoods, theta, generator, part(watch, 0.0, 0.5))
-    start_theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
+    # What stages do not know and what the hysteresis has been through is chosen in turns.
+    for _ in range(SWEEPS if redrawn else 0):
+        theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
+        histories, start_theta = choose_histories(likelihoods, theta, generator)
     informed = _informed(histories, start_theta, record, window, generator)
     if not start.after:
         return informed

@@ -17,7 +17,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, STAGES, made
 from bwbayes.prediction.bands import KINDS, Bands, Kind
 from bwbayes.prediction.initial_state import Start
 from bwbayes.prediction.prediction import predict_record
@@ -57,17 +57,19 @@ class Case:
     cut: Cut = "any"
     from_rest: bool = False
     hysteresis: str = "bouc-wen"
+    stages: tuple[str, ...] = ()
 
     @property
     def actuator(self) -> Actuator:
         """The model."""
         operator = made("hysteresis", self.hysteresis, HYSTERESIS, {})
-        return Actuator(self.dynamics, "first", 1 / RATE, operator)
+        stages = tuple(STAGES[name]() for name in self.stages)
+        return Actuator(self.dynamics, "first", 1 / RATE, operator, stages=stages)
 
     @property
     def true(self) -> dict[str, float]:
         """All true values by name."""
-        own = {"lag": self.lag, "discrepancy_sd": self.discrepancy}
+        own = {"lag": self.lag, "discrepancy_sd": self.discrepancy, "backlash": 2.0}
         return TRUE | true_values(self.actuator, TRUE) | own
 
 
@@ -76,7 +78,8 @@ def posterior_of_case(case: Case) -> Posterior:
     actuator, true = case.actuator, case.true
     voltage = 100 * np.sin(2 * np.pi * np.arange(400) / RATE)
     names = (*actuator.parameters, "sensor_sd", "discrepancy_sd", "discrepancy_time")
-    fixed = {name: true[name] for name in names}
+    # Where in its play a record begins, nobody knows.
+    fixed = {name: true[name] for name in names if name != "backlash_start"}
     posterior = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", fixed)
     return replace(posterior, engine="numba")
 
@@ -108,7 +111,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
 def predicted(case: Case, posterior: Posterior, record: Record, seed: int) -> Bands:
     """Predict a record with draws that are all the truth."""
     start = Start(case.from_rest, lead_in=case.lead_in)
-    draws = np.empty((DRAWS, 0))
+    draws = np.zeros((DRAWS, posterior.prior.dimensions))
     return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
 
 

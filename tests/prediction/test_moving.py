@@ -33,6 +33,7 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.initial_state import Start, estimate_initial_states
 from tests.measured import keep
@@ -47,6 +48,7 @@ from tests.prediction.moving import (
     record_of,
     studied,
     widening,
+    width,
 )
 
 QUICK = 40
@@ -96,6 +98,18 @@ def test_bands_cover_records_cut_from_a_running_drive(case: Case, hysteresis: st
     assert {} == {level: t for level, t in off(every).items() if abs(t) > QUICK_LIMIT}
     assert np.mean(covered(every, 95)) > LEAST
     assert alarms(every) <= stats.binom.isf(1e-3, records, LEAD_IN_ALARM)
+
+
+def test_bands_cover_records_behind_a_play_that_begins_anywhere() -> None:
+    """The twin, which does not ask the lead-in where the play begins, has wider bands."""
+    case = Case(stages=("backlash",), discrepancy=0.05)
+    every = studied(case, QUICK // 2, seed=1)
+    assert {} == {level: t for level, t in off(every).items() if abs(t) > QUICK_LIMIT}
+    assert np.mean(covered(every, 95)) > 0.9
+    with patch.object(initial_state, "SWEEPS", 0):
+        unasked = studied(case, QUICK // 2, seed=1)
+    wide, narrow = (np.mean([width(b, "sensor") for b in bands]) for bands in (unasked, every))
+    assert narrow < 0.97 * wide
 
 
 @pytest.mark.slow
