@@ -48,8 +48,6 @@ class Stage(ABC):
     side: ClassVar[Side]
     rate_independent: ClassVar[bool] = False
     """Whether only the path of its values counts, not their pace: then it shapes loops."""
-    has_inverse: ClassVar[bool] = True
-    """Whether :meth:`undo` is there."""
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
     starts: ClassVar[Sequence[Mapping[str, float]]] = ({},)
@@ -152,9 +150,9 @@ class Stage(ABC):
         return 1.0
 
     def require_inverse(self) -> None:
-        """Raise an InputError if no command can undo the stage."""
-        if not self.has_inverse:
-            raise InputError(f"inverse: no command undoes the stage {self.name}")
+        """Raise an InputError if the stage has no ``undo``."""
+        if type(self).undo is Stage.undo:
+            raise InputError(f"inverse: no command undoes the stage {self.name}; leave it out")
 
 
 Advance = Callable[[Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]

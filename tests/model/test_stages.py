@@ -37,6 +37,7 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stages.saturation import Saturation
 from bwbayes.record.true_values import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -306,3 +307,14 @@ def test_a_stage_declares_priors_that_follow_the_record(name: str) -> None:
 def _extent() -> Extent:
 
     return Extent(SPAN, 1e-3, 10.0)
+
+
+def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_for() -> None:
+    class OneWay(Saturation):
+        undo = Stage.undo
+
+    made = Actuator("lag", "first", INTERVAL, BoucWen(), span=SPAN, stages=(OneWay(),))
+    models = theta(made, 1)
+    with pytest.raises(InputError, match="inverse: no command undoes the stage saturation; leave"):
+        inverse(made, models, made.displacement(models, drive(50)))
+    assert "no command undoes" in str(exported("one way", made, models[0], SPAN).without_inverse)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from bwbayes.sampling.diagnostics import Outcome
 
 
-class Stage[T](cached_property[T]):
+class RunStage[T](cached_property[T]):
     """A stage of a run, from the function that computes it, of the run and a watch.
 
     What an earlier process has kept is not computed again. Unless a stage is there ``always``, to
@@ -62,9 +62,9 @@ class Stage[T](cached_property[T]):
         super().__init__(stage)
 
 
-def always[T](compute: Callable[[Any, Watch], T]) -> Stage[T]:
+def always[T](compute: Callable[[Any, Watch], T]) -> RunStage[T]:
     """Make a stage that is there without convergence, too."""
-    return Stage(compute, always=True)
+    return RunStage(compute, always=True)
 
 
 @dataclass(eq=False, repr=False)
@@ -220,7 +220,7 @@ class Stages:
 
         return Background.of(self.problem.posterior, self.flat_draws)
 
-    @Stage
+    @RunStage
     def step_responses(self, _: Watch) -> dict[str, StepResponse]:
         """Return the responses to the steps among what was predicted, by name."""
         from bwbayes.prediction.steps import measure_steps
@@ -230,14 +230,14 @@ class Stages:
             records = {**self.problem.records, **records}
         return measure_steps(self.problem.posterior, self.subset, records)
 
-    @Stage
+    @RunStage
     def predictions(self, watch: Watch) -> tuple[Bands, ...]:
         """Return the bands of all that was held out, and of the training windows."""
         from bwbayes.app.running.predictions import predictions
 
         return predictions(self.problem, self.flat_draws, watch)
 
-    @Stage
+    @RunStage
     def scores(self, watch: Watch) -> dict[str, Scores]:
         """Return the scores of all bands with a measurement, by name."""
         from bwbayes.prediction.scores import score
@@ -248,7 +248,7 @@ class Stages:
             if bands.scored(bands.measured).any()
         }
 
-    @Stage
+    @RunStage
     def innovations(self, watch: Watch) -> dict[str, Innovations]:
         """Return the innovation of each reading at the most probable draw, by record."""
         from bwbayes.diagnosis.innovations import innovations
@@ -259,7 +259,7 @@ class Stages:
             for name, single, theta in watched([*self.problem.posterior.each(self.best)], watch)
         }
 
-    @Stage
+    @RunStage
     def consistency(self, watch: Watch) -> dict[str, Agreement]:
         """Return how each of several records agrees with the others, by record."""
         from bwbayes.diagnosis.consistency import agreements
@@ -267,14 +267,14 @@ class Stages:
         starts = {name: record.start for name, record in self.problem.records.items()}
         return agreements(self.problem.posterior, self.chain.point, starts, watch)
 
-    @Stage
+    @RunStage
     def loops(self, watch: Watch) -> Loops:
         """Return the major and a minor loop and the initial curve."""
         from bwbayes.prediction.loops import measure_loops
 
         return measure_loops(self.problem.posterior, self.subset, watch)
 
-    @Stage
+    @RunStage
     def drive_locks(self, _: Watch) -> dict[str, DriveLock]:
         """Return whether what the model misses follows the drive, by record."""
         from bwbayes.app.problem.records import generator
@@ -283,7 +283,7 @@ class Stages:
         source = generator(self.problem.config.seed, "drive lock")
         return drive_locks(self.problem.posterior, self.subset, source)
 
-    @Stage
+    @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
         """Return what may explain each record's readings better than the model, the best first."""
         from bwbayes.app.running.explaining import explained
@@ -313,7 +313,7 @@ class Stages:
 
         return generator(self.problem.config.seed, "checks")
 
-    @Stage
+    @RunStage
     def information_gain(self, watch: Watch) -> InformationGain:
         """Return information gained from the data: prior against posterior."""
         from bwbayes.diagnosis.identifiability import information_gain
@@ -322,7 +322,7 @@ class Stages:
         source = self._check_source
         return information_gain(prior, sampled.draws, sampled.log_density, source, watch)
 
-    @Stage
+    @RunStage
     def posterior_checks(self, watch: Watch) -> dict[str, PredictiveChecks]:
         """Return where each record lies among replicated ones."""
         from bwbayes.diagnosis.predictive_checks import check_predictions
@@ -402,4 +402,4 @@ class Stages:
 
 
 # In their order.
-STAGES = {name: stage for name, stage in vars(Stages).items() if isinstance(stage, Stage)}
+STAGES = {name: stage for name, stage in vars(Stages).items() if isinstance(stage, RunStage)}
