@@ -267,7 +267,7 @@ def assess(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
         )
     elif better is not None:
-        parts = all(each.spec is not None for each in better_models(explanations))
+        parts = any(each.spec is not None for each in better_models(explanations))
         way = "; --improve adds it" if parts else ", which no key of [model] adds"
         doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){way}")
     if standard.idle and not bands.training:

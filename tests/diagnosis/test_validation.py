@@ -387,6 +387,21 @@ def test_no_fit_passes_while_a_better_model_is_known(
     assert said is None or (verdict.cause is not None and verdict.cause.fix == explanation.fix)
 
 
+def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
+    record = made(np.random.default_rng(1), length=30)
+    late = Explanation("delay", "late by 4 ms", "move the column", nats=21.0)
+    slow = Explanation("sensor lag", "a slow sensor", "set it", nats=22.0, spec=ModelSpec())
+    verdict = assess(
+        bands_of(record, training=True),
+        Background(record.memory, 0.0, FITTED),
+        explanations=[slow, late],
+    )
+    assert verdict is not None
+    assert verdict.reasons == (
+        "a better model is known (sensor lag or delay, 22 nats); --improve adds it",
+    )
+
+
 def test_no_fix_is_a_command_line_which_python_has_not() -> None:
     assert not [fix for _, fix in WORDS.values() if "bwbayes " in fix]
 
