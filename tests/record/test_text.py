@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
 
 HEADER = "time_s,voltage_V,displacement_um"
@@ -308,6 +308,55 @@ def test_units_may_stand_above_names_below_settings(
             tmp_path_factory.getbasetemp(), lines(*(f"{line}{comma}" for line in head), *ROWS)
         )
     assert record.sha256 == read(tmp_path_factory.getbasetemp(), GOOD).sha256
+
+
+UNIT_ROWS = {"time": ["s", "ms"], "voltage": ["V", "mV"], "displacement": ["um", "\u00b5m", "nm"]}
+
+
+@given(
+    rows=st.lists(
+        st.tuples(*map(st.sampled_from, UNIT_ROWS.values())).map(list), min_size=2, max_size=3
+    ),
+    place=st.integers(0, 3),
+    left_out=st.sets(st.integers(0, 2), max_size=1),
+    said=st.sampled_from([{}, {"time": "s", "voltage": "V", "displacement": "um"}]),
+)
+def test_rows_of_units_that_contradict_are_asked_for(
+    tmp_path_factory: pytest.TempPathFactory,
+    rows: list[list[str]],
+    place: int,
+    left_out: set[int],
+    said: dict[str, str],
+) -> None:
+    """Wherever the names are among them: nothing but what differs, unless the user has said it.
+
+    A cell that is left out of one row, or the same unit otherwise spelled, contradicts nothing.
+    """
+    for column in left_out:
+        rows[0][column] = ""
+    head = [",".join(row) for row in rows]
+    head.insert(min(place, len(rows)), "time,voltage,displacement")
+    path = tmp_path_factory.getbasetemp() / "rows.csv"
+    path.write_text(lines(*head, *ROWS), encoding="utf-8")
+    alike = [{cell.replace("\u00b5", "u") for cell in c} - {""} for c in zip(*rows, strict=True)]
+    asked = [q for q, units in zip(UNIT_ROWS, alike, strict=True) if len(units) > 1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        if asked and not said:
+            with pytest.raises(ColumnsError) as caught:
+                read_record(path)
+            assert asked == list(caught.value.guess["units"])
+            return
+        record = read_record(path, units=said)
+    taken = said or {q: units.pop() for q, units in zip(UNIT_ROWS, alike, strict=True)}
+    expected = read_record(_good(tmp_path_factory), units=taken)
+    assert record.sha256 == expected.sha256
+
+
+def _good(factory: pytest.TempPathFactory) -> Path:
+    path = factory.getbasetemp() / "good.csv"
+    path.write_text(lines("time,voltage,displacement", *ROWS), encoding="utf-8")
+    return path
 
 
 @pytest.mark.parametrize(

@@ -131,6 +131,7 @@ def find_header(
     """Return the columns' names and units, and the index of the header's first line."""
     rows: list[tuple[int, list[str]]] = []
     unit_row: int | None = None
+    units: list[str] = []
     values = cells_of(lines[layout.first], layout.separator)
     above = [(i, line) for i, line in enumerate(lines[: layout.first]) if line.strip()]
     for index, line in reversed(above[-6:]):
@@ -150,23 +151,34 @@ def find_header(
             is_time_form(cell) or any(scale_of(cell, q) for q in QUANTITIES) for cell in stated
         ]
         others = [cell for cell, known in zip(stated, is_unit, strict=True) if not known]
-        if unit_row is None and any(is_unit) and all(map(is_other_unit, others)):
-            unit_row = len(rows)
-            cells = bare
-        rows.append((index, cells))
+        if not any(is_unit) or not all(map(is_other_unit, others)):
+            rows.append((index, cells))
+        elif unit_row is None:
+            unit_row, units = len(rows), bare
+            rows.append((index, bare))
+        else:
+            # Another row of units; where they differ, it is open which is right.
+            units = [_either(*pair) for pair in zip_longest(bare, units, fillvalue="")]
     # From the numbers upwards: comments, units and names, or names alone.
     used = rows[:1]
     if unit_row is not None:
         # Names stand above units as a file's first such line; below settings, beneath the units.
         is_below = unit_row > 0 and len(rows) != unit_row + 2
         used = rows[: unit_row + 1][-2:] if is_below else rows[unit_row : unit_row + 2]
-    units = rows[unit_row][1] if unit_row is not None else []
-    names = next((cells for _, cells in used[::-1] if cells is not units), [])
+    named = [row for row in used if unit_row is None or row is not rows[unit_row]]
+    names = named[-1][1] if named else []
     first = used[-1][0] if used else None
-    fields = max(layout.fields, len(names))
+    fields = max(layout.fields, len(names), len(units))
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
     return [name or f"column {i}" for i, name in enumerate(names, start=1)], units, first
+
+
+def _either(unit: str, other: str) -> str:
+    """Return the unit that two texts state, or both of them, which is none, if they differ."""
+    scales = [[scale_of(text, q) for q in QUANTITIES] for text in (unit, other)]
+    is_same = unit == other or (scales[0] == scales[1] and any(scales[0]))
+    return f"{unit} or {other}" if unit and other and not is_same else other or unit
 
 
 def split_header(line: str, layout: Layout) -> list[str]:
