@@ -183,6 +183,8 @@ def test_a_slow_clock_is_named_and_samples_may_be_missing_beside_it() -> None:
     st.lists(st.sampled_from(["copied", "late", "early", "added"]), min_size=19, max_size=19),
     st.sampled_from([0.0, -3.0, 1.7e9]),
 )
+# One more row than times, and steps of no, one and two ticks of what might be a clock.
+@example(400, {1, 2, 5, 13, 15, 16}, [*["late"], *["copied"] * 3, *["early"] * 15], 0.0)
 def test_repeated_times_leave_a_record_as_it_was(
     samples: int, places: set[int], kinds: list[str], start: float
 ) -> None:

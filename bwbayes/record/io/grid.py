@@ -284,8 +284,9 @@ def _slopes_between(
 def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
     """Return the interval, s, of a uniform grid whose times a coarse clock rounded to its ticks.
 
-    Times of whole ticks, about as long as the interval or longer, are within a tick along a line.
-    Missing samples make such times too, if they are evenly spread: ten at random, once in 3000.
+    Times of whole ticks, about as long as the interval or longer, are within a tick along a line,
+    and their steps differ by one tick at most. Missing samples make such times too, if they are
+    evenly spread: ten at random, once in 3000.
     """
     steps = np.diff(elapsed)
     shortest = float(steps[steps > 0].min())
@@ -305,7 +306,7 @@ def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
     is_rounded = width <= 1.001 * tick
     is_whole = np.abs(counts - np.rint(counts)).max() < 1e-3
     others = np.count_nonzero(np.rint(counts) != np.rint(np.median(counts)))
-    if not is_rounded or not is_whole or others < 10:
+    if not is_rounded or not is_whole or np.ptp(np.rint(counts)) > 1 or others < 10:
         return None
     unsure = 1.5 * tick / math.sqrt(elapsed.size)
     interval = _exact_interval(table, float(interval), tick, unsure, steps.size)
