@@ -12,17 +12,17 @@ from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain
-from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.diagnostics import SamplingResult
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 
 
-def sampled(problem: Problem, workers: int = 1) -> tuple[Outcome, Chain]:
+def sampled(problem: Problem, workers: int = 1) -> tuple[SamplingResult, Chain]:
     """Return how the sampling of a problem ended, and the chain."""
     posterior, seed = problem.posterior, problem.config.seed
     with one_thread(), open_executor(workers, posterior.engine) as pool:
         point = pointfit.fit(posterior, generator(seed, "point fit"))
-        chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
+        chain = init_chain(posterior, point, problem.plan, generator(seed, "sampling"))
         return sample(posterior, problem.plan, chain, pool), chain
 
 
@@ -30,7 +30,7 @@ def converged(posterior: Posterior, plan: SamplingPlan, seed: int = 1) -> Chain:
     """Return the chain of a posterior that must converge."""
     source = np.random.default_rng(seed)
     with ThreadPoolExecutor(1) as pool, one_thread():
-        chain = first_chain(posterior, pointfit.fit(posterior, source), plan, source)
+        chain = init_chain(posterior, pointfit.fit(posterior, source), plan, source)
         outcome = sample(posterior, plan, chain, pool)
     assert outcome.converged, outcome.stop_reason
     return chain

@@ -30,7 +30,7 @@ from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.calibration.evaluation import LIMIT, Calibration, judge
-from bwbayes.calibration.replicates import Experiment, Replicate
+from bwbayes.calibration.replicates import CalibrationSetup, Replicate
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
@@ -80,12 +80,12 @@ def test_five_hundred_replicates_pass_and_find_small_defects() -> None:
             "replicates": outcome.replicates,
             "unconverged": len(outcome.unconverged),
             "tests": len(outcome.statistics),
-            "shortcomings": len(outcome.shortcomings),
+            "shortcomings": len(outcome.failures),
             "power": round(outcome.power["20% too small"], 3),
             "bands": {name: round(band.mean, 4) for name, band in outcome.bands.items()},
         },
     )
-    assert () == outcome.shortcomings
+    assert () == outcome.failures
     assert () == outcome.unconverged
     assert outcome.power["20% too small"] > 0.98
     assert {} == {name: errors for name, errors in off.items() if not abs(errors) < LIMIT}
@@ -139,21 +139,21 @@ class Swapped(Posterior):
         return swapped
 
 
-def wrong_correlation() -> Experiment:
+def wrong_correlation() -> CalibrationSetup:
     common = experiment(problem(fixed=("alpha", "beta", "gamma", "lag")))
     right = common.posterior
     wrong = right.altered(noise=WrongCorrelation(right.only.actuator.interval, 3.0))
     return replace(common, posterior=wrong, source=right)
 
 
-def swapped_sign() -> Experiment:
+def swapped_sign() -> CalibrationSetup:
     common = experiment(problem(fixed=("d", "lag", "offset")))
     right = common.posterior
     parts = {name: getattr(right, name) for name in right.__dataclass_fields__}
     return replace(common, posterior=Swapped(**parts), source=right)
 
 
-def forgotten_prior() -> Experiment:
+def forgotten_prior() -> CalibrationSetup:
     """Simulate with the config's correlation time, and fit with a prior of ten times that."""
     fixed = ("alpha", "beta", "gamma", "lag")
     wide = '{ distribution = "lognormal", median = 3.0, sigma = 1.0 }'
@@ -163,7 +163,7 @@ def forgotten_prior() -> Experiment:
 
 
 @pytest.mark.parametrize("defect", [wrong_correlation, swapped_sign, forgotten_prior])
-def test_defect_of_likelihood_or_prior_is_found(defect: Callable[[], Experiment]) -> None:
+def test_defect_of_likelihood_or_prior_is_found(defect: Callable[[], CalibrationSetup]) -> None:
     outcome = judged(made(replace(defect(), held_out={}), FEW))
     assert not outcome.passed
-    assert any("ranks" in text for text in outcome.shortcomings), outcome.shortcomings
+    assert any("ranks" in text for text in outcome.failures), outcome.failures

@@ -33,7 +33,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
 from bwbayes.app.problem.problem import resolve
 from bwbayes.calibration.evaluation import Calibration, judge
-from bwbayes.calibration.replicates import Experiment, Replicate
+from bwbayes.calibration.replicates import CalibrationSetup, Replicate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS
@@ -152,7 +152,7 @@ def typical(
     return Record(voltage[cut:], reading[cut:], interval)
 
 
-def typical_experiment(variant: Variant, folder: Path) -> Experiment:
+def typical_experiment(variant: Variant, folder: Path) -> CalibrationSetup:
     """Resolve the default priors once, from typical records."""
     generator = np.random.default_rng(SEED)
     write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
@@ -161,7 +161,7 @@ def typical_experiment(variant: Variant, folder: Path) -> Experiment:
     return experiment(resolve(parse(text, "typical"), folder))
 
 
-Sound = tuple[Experiment, list[Replicate]]
+Sound = tuple[CalibrationSetup, list[Replicate]]
 
 
 def band_limit(bands: int, count: int) -> float:
@@ -177,10 +177,10 @@ def calibrated(variant: Variant, folder: Path, count: int) -> Sound:
 
 def remarks(outcome: Calibration) -> list[str]:
     """Return a calibration's shortcomings but for replicates that have not converged."""
-    return [text for text in outcome.shortcomings if "did not converge" not in text]
+    return [text for text in outcome.failures if "did not converge" not in text]
 
 
-def figures(common: Experiment, every: list[Replicate]) -> dict[str, Any]:
+def figures(common: CalibrationSetup, every: list[Replicate]) -> dict[str, Any]:
     """Return what is kept of a calibration."""
     outcome = judge([one.entry for one in every], np.random.default_rng(SEED))
     ranked = [one for one in every if len(one.draws)]

@@ -124,7 +124,7 @@ from functools import partial
 from typing import ClassVar
 import numpy as np
 from bwbayes import InputError, Run
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus
 from bwbayes.report.report import Product, Report, Text, standing_banner
 from bwbayes.watching import WatchSteps, unwatched, watched

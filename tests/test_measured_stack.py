@@ -20,7 +20,7 @@ from bwbayes.errors import ExitStatus
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, thinned
 from bwbayes.record import Record, read_record
 from tests.app import small
@@ -237,7 +237,9 @@ def on_cuts(posterior: Posterior, drawn: FloatArray) -> tuple[Judged, Judged]:
     results = []
     for transient in (0.0, 20.0):
         ten = ((cut(record, n, transient), np.random.default_rng(n)) for n in range(10))
-        results.append(judged([predict_record(posterior, drawn, r, Start(), g) for r, g in ten]))
+        results.append(
+            judged([predict_record(posterior, drawn, r, InitialConditions(), g) for r, g in ten])
+        )
     usual, knocked = results
     return usual, knocked
 

@@ -184,7 +184,7 @@ FIGURES: dict[str, list[str]] = {
     "-m slow tests/population": [
         f"100 populations/{key}" for key in ("mean", "spread", "new", "shrunk", "width")
     ],
-    "-m slow tests/inference/test_untried.py": [
+    "-m slow tests/inference/test_prior_creep.py": [
         *(f"100 untried/coverage/{name}" for name in ("sine", "staircase", "hold", "hour")),
         "untried/wider",
     ],
@@ -240,9 +240,9 @@ def test_twin_another_figure_is_found() -> None:
 
 
 def test_no_calibration_has_a_shortcoming_and_every_part_has_one() -> None:
-    shortcomings = [value for path, value in LEAVES.items() if path.endswith("/shortcomings")]
-    assert len(shortcomings) > len(PARTS)
-    assert not any(shortcomings)
+    failures = [value for path, value in LEAVES.items() if path.endswith("/shortcomings")]
+    assert len(failures) > len(PARTS)
+    assert not any(failures)
     assert all(f"calibrated part, {name}" in STUDIES for name in PARTS)
 
 

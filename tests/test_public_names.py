@@ -59,7 +59,7 @@ def test_type_checkers_see_the_methods_that_come_from_verbs() -> None:
     """The package says that it is typed, and a line in ``Run`` stands for a verb in the table."""
     assert Path(bwbayes.__file__).with_name("py.typed").exists()
     source = Path(inspect.getfile(bw.Run)).read_text(encoding="utf-8")
-    typed = set(re.findall(r"^        (\w+) = at_work\(\w+\)$", source, re.MULTILINE))
+    typed = set(re.findall(r"^        (\w+) = fit_method\(\w+\)$", source, re.MULTILINE))
     assert typed
     assert typed <= {verb.name for verb in VERBS}
     for verb in VERBS:

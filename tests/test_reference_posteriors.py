@@ -27,7 +27,7 @@ from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
-from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.diagnostics import SamplingResult
 from tests.reference.make import digest, from_cube
 from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
 from tests.sampled import sampled
@@ -84,7 +84,7 @@ def drawn_by_a_run(reference: Reference) -> FloatArray:
     return result
 
 
-def run(problem: Problem) -> tuple[Outcome, FloatArray]:
+def run(problem: Problem) -> tuple[SamplingResult, FloatArray]:
     """Sample a problem as a run does; draws (draws, free)."""
     outcome, chain = sampled(problem)
     return outcome, draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))

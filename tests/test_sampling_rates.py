@@ -23,7 +23,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import LEVELS
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.measured import keep
@@ -98,7 +98,7 @@ def answer(fitted: Record, other: Record, every: int, noise: str, folder: Path) 
     source = np.random.default_rng([82, every])
     draws, weights = weighted_draws(problem.posterior, source)
     chosen = draws[source.choice(len(draws), KEPT, p=weights)]
-    start = Start(from_rest=True, own_offset=False)
+    start = InitialConditions(from_rest=True, own_offset=False)
     bands = predict_record(problem.posterior, chosen, other, start, source)
     assert bands.measured is not None
     columns = [problem.posterior.names.index(name) for name in SHAPE]

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.voltage_noise import path_covariance, widened
 from bwbayes.model.actuator import Actuator
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.measured import keep
@@ -88,7 +88,7 @@ def answer(fitted: Record, other: Record, folder: Path) -> Answer:
     shape = draws[:, [posterior.names.index(name) for name in SHAPE]]
     truth = np.array([TRUTH[name] for name in SHAPE])
     off = np.mean(shape, axis=0) - truth
-    start = Start(from_rest=True, hold="first")
+    start = InitialConditions(from_rest=True, hold="first")
     bands = predict_record(posterior, draws[::8], other, start, source)
     width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
     return Answer(off / truth, off / np.std(shape, axis=0), covered(bands), width)

@@ -98,7 +98,7 @@ class Calibration:
     provenance: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def shortcomings(self) -> tuple[str, ...]:
+    def failures(self) -> tuple[str, ...]:
         """Why the calibration has failed; empty if it has passed."""
         reasons = []
         if len(self.unconverged) > 0.01 * self.replicates:
@@ -125,7 +125,7 @@ class Calibration:
     @property
     def passed(self) -> bool:
         """Whether nothing speaks against the posteriors."""
-        return not self.shortcomings
+        return not self.failures
 
     @property
     def predicted(self) -> tuple[str, ...]:
@@ -143,7 +143,7 @@ class Calibration:
         return dict(self.provenance) | {
             "passed": self.passed,
             "telling": self.telling,
-            "shortcomings": list(self.shortcomings),
+            "failures": list(self.failures),
             "replicates": self.replicates,
             "unconverged": list(self.unconverged),
             "draws_ranked_among": RANKED,

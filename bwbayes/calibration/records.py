@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import Start, estimate_initial_states
+from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record, Window
 
@@ -76,7 +76,7 @@ class OtherRecord:
     """
 
     record: Record
-    start: Start = field(default_factory=Start)
+    start: InitialConditions = field(default_factory=InitialConditions)
     window: Window | None = None
     like: str = ""
 

@@ -29,7 +29,7 @@ from bwbayes.prediction.prediction import predict_windows, thinned
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.shown import brief
 
 # Draws that a truth is ranked among.
@@ -56,7 +56,7 @@ class Entry(TypedDict):
 
 
 @dataclass(frozen=True)
-class Experiment:
+class CalibrationSetup:
     """What all replicates have in common.
 
     Parameters
@@ -133,7 +133,11 @@ class Replicate:
 
 
 def replicates(
-    experiment: Experiment, seed: int, numbers: Iterable[int], executor: Executor, together: int = 1
+    experiment: CalibrationSetup,
+    seed: int,
+    numbers: Iterable[int],
+    executor: Executor,
+    together: int = 1,
 ) -> Iterator[Replicate]:
     """Make the replicates of those numbers, and yield each as soon as it is done.
 
@@ -163,7 +167,7 @@ def as_done[T](
         yield from (future.result() for future in done)
 
 
-def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
+def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate:
     """Draw a truth, simulate its record, fit that, and compare.
 
     Raises
@@ -194,7 +198,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
     )
     # InputError, and what linear algebra raises: one record must not end the whole calibration.
     try:
-        chain = first_chain(posterior, pointfit.fit(posterior, fitting), experiment.plan, sampling)
+        chain = init_chain(posterior, pointfit.fit(posterior, fitting), experiment.plan, sampling)
         with ThreadPoolExecutor(1) as executor:
             outcome = sample(posterior, experiment.plan, chain, executor)
     except ValueError as error:
@@ -225,7 +229,7 @@ def replicate(experiment: Experiment, seed: int, number: int) -> Replicate:
 
 
 def _simulated(
-    experiment: Experiment, generator: np.random.Generator
+    experiment: CalibrationSetup, generator: np.random.Generator
 ) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
     """Draw a truth; return it by parameter, (1,) each, and its records by name."""
     source = experiment.truth
@@ -240,7 +244,7 @@ def _simulated(
         model = likelihood.actuator.advance(
             dataset.table.actuator(record_theta),
             dataset.voltage,
-            unrest=sd * generator.standard_normal(sd.shape),
+            initial_transient=sd * generator.standard_normal(sd.shape),
             from_rest=dataset.from_rest,
         )[0][0]
         record = Record(dataset.voltage, fitted.displacement, dataset.actuator.interval)
@@ -250,7 +254,7 @@ def _simulated(
 
 
 def _predictions(
-    experiment: Experiment,
+    experiment: CalibrationSetup,
     posterior: Posterior,
     draws: FloatArray,
     theta: Mapping[str, FloatArray],

@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import Part
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.shown import brief
@@ -63,7 +63,7 @@ class Candidate:
     hysteresis: bool = True
     held_out: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
-    standing: Standing | None = None
+    standing: ValidationSummary | None = None
     parts: Mapping[str, Part] = field(default_factory=dict)
     evidence: Evidence | None = None
     screened: bool = False

@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from bwbayes.comparison.candidates import Candidate
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus
 from bwbayes.report.report import (
     UNKNOWN,
@@ -107,10 +107,10 @@ class Comparison(Product):
         return "log score" if self.voting else "log evidence"
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> ValidationSummary:
         """Whether the bands of the recommended model hold."""
         recommended = None if self.recommended is None else self[self.recommended].standing
-        return recommended or Standing()
+        return recommended or ValidationSummary()
 
     @property
     def shortfall(self) -> str:

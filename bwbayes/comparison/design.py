@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.comparison.designed import Promise
+from bwbayes.comparison.designed import DesignScore
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.linearization import value_and_jacobian
@@ -38,7 +38,7 @@ def promises(
     amplifier: Limits,
     generator: np.random.Generator,
     watch: Watch = unwatched,
-) -> list[Promise]:
+) -> list[DesignScore]:
     """Rank candidates by what they would teach, the best first.
 
     With Σ the covariance of the actuator's parameters among the draws, in the coordinates of the
@@ -113,7 +113,7 @@ def promises(
     for number, (name, voltage) in enumerate(candidates.items()):
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
         if refused:
-            scores.append(Promise(name, np.nan, np.nan, refused))
+            scores.append(DesignScore(name, np.nan, np.nan, refused))
             continue
         planned, remaining = Target(_planned(posterior, voltage)), []
         this = part(watch, number / count, (number + 1) / count)
@@ -129,7 +129,7 @@ def promises(
                 remaining.append(_mean_sd(gradient, after))
         shares = np.array(remaining) / before
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
-        scores.append(Promise(name, float(np.mean(shares)), error))
+        scores.append(DesignScore(name, float(np.mean(shares)), error))
     return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar, overload
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.model.limits import Limits
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
@@ -33,7 +33,7 @@ from bwbayes.shown import brief
 
 
 @dataclass(frozen=True)
-class Promise:
+class DesignScore:
     """What a candidate promises.
 
     Attributes
@@ -58,7 +58,7 @@ class Promise:
 
 
 @dataclass(frozen=True)
-class Design(Product, Sequence[Promise]):
+class Design(Product, Sequence[DesignScore]):
     """What to measure next, from a run: a sequence of its promises.
 
     Attributes
@@ -88,21 +88,21 @@ class Design(Product, Sequence[Promise]):
     amplifier: Limits
     signals: Mapping[str, FloatArray]
     interval: float
-    standing: Standing
-    promises: Sequence[Promise]
+    standing: ValidationSummary
+    promises: Sequence[DesignScore]
 
     @overload
-    def __getitem__(self, index: int) -> Promise: ...
+    def __getitem__(self, index: int) -> DesignScore: ...
     @overload
-    def __getitem__(self, index: slice) -> Sequence[Promise]: ...
-    def __getitem__(self, index: int | slice) -> Promise | Sequence[Promise]:
+    def __getitem__(self, index: slice) -> Sequence[DesignScore]: ...
+    def __getitem__(self, index: int | slice) -> DesignScore | Sequence[DesignScore]:
         return self.promises[index]
 
     def __len__(self) -> int:
         return len(self.promises)
 
     @property
-    def best(self) -> Promise:
+    def best(self) -> DesignScore:
         """The best candidate."""
         return self.promises[0]
 

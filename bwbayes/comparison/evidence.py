@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.diagnostics import effective_draws
@@ -96,15 +96,15 @@ def evidence(
     coordinates = coordinates.reshape(draws.shape)
     half = draws.shape[1] // 2
     fitted = coordinates[:, :half].reshape(-1, free)
-    most_draws = 20_000  # that the mixture is fitted to, and at the other end
-    fitted = fitted[:: max(len(fitted) // most_draws, 1)]
+    max_draws = 20_000  # that the mixture is fitted to, and at the other end
+    fitted = fitted[:: max(len(fitted) // max_draws, 1)]
     mass, mass_error = log_prior_mass(posterior.prior, generator)
     try:
         proposal = StudentMixture.fitted(fitted)
     except np.linalg.LinAlgError:  # too few draws
         highest = float(np.max(log_likelihood))
         return Evidence(np.nan, np.inf, mass, 0.0, max_log_likelihood=highest)
-    thin = max(log_density[:, half:].size // most_draws, 1)
+    thin = max(log_density[:, half:].size // max_draws, 1)
     sampled = coordinates[::thin, half:]
     at_draws = log_density[::thin, half:] - proposal.log_density(sampled)
     random = np.random.RandomState(generator.integers(2**32))
@@ -126,7 +126,7 @@ def evidence(
 
 
 def screening_evidence(
-    posterior: Posterior, point: PointFit, generator: np.random.Generator
+    posterior: Posterior, point: MAPEstimate, generator: np.random.Generator
 ) -> Evidence:
     """Return Laplace's approximation at a point fit, whose error nobody knows.
 

@@ -19,14 +19,14 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import thinned
 from bwbayes.sampling.chain import Phase, draws
-from bwbayes.sampling.diagnostics import Check, autocorrelation_time
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
 
 # What the later half of the training readings is called.
@@ -252,12 +252,12 @@ def _fitted(
     wide = np.atleast_2d(np.cov(prior.unconstrain(prior.draw(rng, DRAWS)), rowvar=False))
     # With less readings a posterior is wider.
     covariance = 2 * np.atleast_2d(np.cov(coordinates, rowvar=False))
-    point = PointFit(best, covariance, float(np.max(density)), best[np.newaxis], wide)
-    short = replace(plan, ess=min(400.0, plan.ess), most_steps=min(4000, plan.most_steps))
-    chain = first_chain(posterior, point, short, rng)
+    point = MAPEstimate(best, covariance, float(np.max(density)), best[np.newaxis], wide)
+    short = replace(plan, ess=min(400.0, plan.ess), max_steps=min(4000, plan.max_steps))
+    chain = init_chain(posterior, point, short, rng)
     share = 0.0
 
-    def checked(_: Phase, check: Check | None) -> None:
+    def checked(_: Phase, check: ConvergenceDiagnostics | None) -> None:
         nonlocal share
         if check is not None:
             share = max(share, min(float(np.nan_to_num(check.lowest_ess)) / short.ess, 1.0))

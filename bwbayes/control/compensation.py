@@ -28,7 +28,7 @@ from typing import get_args
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.predicted import Choice, Compensation, Errors, Played, planned
+from bwbayes.control.predicted import Choice, Compensation, Errors, PredictedResponse, planned
 from bwbayes.control.references import Reference
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.posterior import Posterior
@@ -36,7 +36,11 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inverse import inverse
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
-from bwbayes.prediction.initial_state import InitialStates, Start, estimate_initial_states
+from bwbayes.prediction.initial_state import (
+    InitialConditions,
+    InitialStates,
+    estimate_initial_states,
+)
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from bwbayes.watching import Watch, part, unwatched
@@ -49,7 +53,7 @@ class _Plan:
     posterior: Posterior
     draws: FloatArray
     reference: Reference
-    start: Start
+    start: InitialConditions
     hold: Hold
     seed: int
 
@@ -81,7 +85,8 @@ class _Plan:
             rows = slice(start, start + size)
             histories = replace(states.histories, which=states.histories.which[rows])
             fields = {
-                name: getattr(states, name)[rows] for name in ("model", "unrest", "offset_sd")
+                name: getattr(states, name)[rows]
+                for name in ("model", "initial_transient", "offset_sd")
             }
             subset = replace(states, histories=histories, **fields)
             yield rows, subset.displacement(voltage)
@@ -94,7 +99,7 @@ class _Plan:
             square += float(np.sum(np.mean((displacement - self.references[1]) ** 2, axis=1)))
         return math.sqrt(square / len(self.draws)), mean
 
-    def played(self, voltage: FloatArray, watch: Watch) -> Played:
+    def played(self, voltage: FloatArray, watch: Watch) -> PredictedResponse:
         """Predict a command; ``watch`` is called with the share that is done."""
         bands = predict_record(
             self.posterior, self.draws, self.record(voltage), self.start, self.rng()
@@ -112,7 +117,7 @@ class _Plan:
             watch(min(rows.stop / len(theta), 1.0))
         expected = np.sqrt(np.mean(squares, axis=0)).tolist()
         smoothed = Errors(rms[:, 1], largest[:, 1], expected[1])
-        return Played(rms[:, 0], largest[:, 0], expected[0], voltage, bands, smoothed)
+        return PredictedResponse(rms[:, 0], largest[:, 0], expected[0], voltage, bands, smoothed)
 
 
 def compensate(
@@ -175,7 +180,9 @@ def compensate(
         )
     reference = reference.from_zero()
     seed = int(generator.integers(2**62))
-    plan = _Plan(posterior, draws, reference, Start(from_rest, False, settled=True), hold, seed)
+    plan = _Plan(
+        posterior, draws, reference, InitialConditions(from_rest, False, settled=True), hold, seed
+    )
     requested, target = plan.references
     record = posterior.only
     slope, _ = np.polyfit(record.voltage[record.readings.rows], record.readings.values, 1)

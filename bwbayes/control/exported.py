@@ -32,7 +32,7 @@ from bwbayes.control.sampled import (
     search,
     settle,
 )
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
@@ -73,7 +73,7 @@ class Exported(Product):
     limits: Span
     sds: Mapping[str, float]
     without_inverse: str | None
-    standing: Standing = field(default_factory=Standing)
+    standing: ValidationSummary = field(default_factory=ValidationSummary)
 
     @property
     def shortfall(self) -> str:

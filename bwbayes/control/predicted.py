@@ -16,7 +16,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
@@ -78,7 +78,7 @@ class Errors:
 
 
 @dataclass(frozen=True, eq=False)
-class Played(Errors):
+class PredictedResponse(Errors):
     """A command, the displacement that it gives, and its errors to the reference as requested.
 
     ``voltage`` (samples,), V; ``bands`` of the displacement; ``smoothed`` the errors to the
@@ -116,14 +116,14 @@ class Compensation(Product):
 
     reference: Reference
     command: Choice
-    compensated: Played
-    linear: Played
+    compensated: PredictedResponse
+    linear: PredictedResponse
     hold: Hold
     between: float
     from_rest: bool
     limit: float | None = None
     remarks: tuple[str, ...] = ()
-    standing: Standing = field(default_factory=Standing)
+    standing: ValidationSummary = field(default_factory=ValidationSummary)
 
     @property
     def asked(self) -> FloatArray:
@@ -283,7 +283,7 @@ class Compensation(Product):
         )
 
     @property
-    def _commands(self) -> dict[str, Played]:
+    def _commands(self) -> dict[str, PredictedResponse]:
         """The commands as their figures take them."""
         return {"uncompensated": self.linear, "compensated": self.compensated}
 

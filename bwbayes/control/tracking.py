@@ -22,7 +22,7 @@ from bwbayes.control.gains import Gains, Margins, Robustness, design
 from bwbayes.control.loop import CONTROLLERS, LoopNoise, Stand, follow, plan_loops
 from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel, require_inverse
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.report.report import (
@@ -69,7 +69,7 @@ class Tracking(Product):
     rms: FloatArray
     largest: FloatArray
     limited: FloatArray
-    standing: Standing = field(default_factory=Standing)
+    standing: ValidationSummary = field(default_factory=ValidationSummary)
     name: str = ""
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.distributions import Distribution
 
@@ -33,7 +33,7 @@ def effective(prior: JointPrior, generator: np.random.Generator) -> FloatArray:
     return quantiles
 
 
-def around(prior: JointPrior, point: PointFit, generator: np.random.Generator) -> FloatArray:
+def around(prior: JointPrior, point: MAPEstimate, generator: np.random.Generator) -> FloatArray:
     """Return draws (draws, free) of the Gaussian approximation around a point fit."""
     spread = np.linalg.cholesky(point.covariance)
     moves = generator.standard_normal((DRAWS, point.mode.size)) @ spread.T

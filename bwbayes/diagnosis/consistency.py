@@ -32,7 +32,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import LocalFit, climb
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.watching import Watch, unwatched, watched
@@ -42,12 +42,12 @@ ALARM = 1e-3
 
 
 @dataclass(frozen=True)
-class Agreement:
+class Consistency:
     """How a record of a joint fit agrees with the others.
 
     Parameters
     ----------
-    joint_um, own_um
+    joint_rms_um, single_rms_um
         Root mean square of its residuals at the joint mode and at that of a fit of it alone, um.
     distance, degrees
         D in units in which it is a χ² variable, and its degrees of freedom; both zero if nothing
@@ -61,8 +61,8 @@ class Agreement:
         (readings,) in s and um: the residuals, thinned.
     """
 
-    joint_um: float
-    own_um: float
+    joint_rms_um: float
+    single_rms_um: float
     distance: float
     degrees: float
     moved: tuple[str, float]
@@ -80,7 +80,7 @@ class Agreement:
     @property
     def disagrees(self) -> bool:
         """Whether the record does not go with the others, beyond chance and so that it matters."""
-        return self.p_value < ALARM and self.joint_um > 1.02 * self.own_um
+        return self.p_value < ALARM and self.joint_rms_um > 1.02 * self.single_rms_um
 
     @property
     def noisier(self) -> bool:
@@ -95,8 +95,8 @@ class Agreement:
     def numbers(self) -> dict[str, object]:
         """What ``summary.json`` has of it."""
         return {
-            "residual_joint_um": self.joint_um,
-            "residual_own_um": self.own_um,
+            "residual_joint_um": self.joint_rms_um,
+            "residual_own_um": self.single_rms_um,
             "chi_square": self.distance,
             "degrees_of_freedom": self.degrees,
             "p_value": self.p_value,
@@ -109,10 +109,10 @@ class Agreement:
 
 def agreements(
     posterior: Posterior,
-    point: PointFit,
+    point: MAPEstimate,
     begin: Mapping[str, float] | None = None,
     watch: Watch = unwatched,
-) -> dict[str, Agreement]:
+) -> dict[str, Consistency]:
     """Compare each record of a joint posterior with all of them; nothing, if there is one alone.
 
     Parameters
@@ -143,14 +143,14 @@ def agreements(
         own = climb(with_noise, point.mode[columns])
         series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
         own_residual = innovations(with_noise, own.free).residual
-        joint_um, own_um, size = (
+        joint_rms_um, single_rms_um, size = (
             float(np.sqrt(np.mean(x**2))) for x in (series.residual, own_residual, series.white)
         )
         # Residuals are for pictures, some 2,000 of them.
         step = slice(None, None, -(-series.time.size // 2000))
-        compared[name] = Agreement(
-            joint_um,
-            own_um,
+        compared[name] = Consistency(
+            joint_rms_um,
+            single_rms_um,
             *_distance(posterior, point, columns, own),
             size,
             series.time.size,
@@ -162,7 +162,7 @@ def agreements(
 
 
 def _distance(
-    posterior: Posterior, point: PointFit, columns: Sequence[int], own: LocalFit
+    posterior: Posterior, point: MAPEstimate, columns: Sequence[int], own: LocalFit
 ) -> tuple[float, float, tuple[str, float]]:
     """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off.
 
@@ -201,15 +201,16 @@ def _distance(
     return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
 
 
-def disagreements(compared: Mapping[str, Agreement]) -> Iterator[Finding]:
+def disagreements(compared: Mapping[str, Consistency]) -> Iterator[Finding]:
     """Yield the records that do not go with the others."""
     for name, record in compared.items():
         parameter, away = record.moved
         if record.disagrees:
             yield Finding(
                 name,
-                f"is inconsistent with the other records: its residual is {record.joint_um:.3g} um "
-                f"rms in the joint fit and {record.own_um:.3g} um in a fit of its own, where "
+                "is inconsistent with the other records: its residual is "
+                f"{record.joint_rms_um:.3g} um rms in the joint fit and "
+                f"{record.single_rms_um:.3g} um in a fit of its own, where "
                 f"{parameter} is {abs(away):.1f} SD {'higher' if away > 0 else 'lower'} "
                 f"(chi-square {record.distance:.4g} with {record.degrees:.3g} degrees of freedom, "
                 f"p = {record.p_value:.1g})",

@@ -29,7 +29,7 @@ ODDS = 1.5
 
 
 @dataclass(frozen=True)
-class Standardized:
+class StandardizedResiduals:
     """Scored readings against their bands, and how many independent ones they are worth.
 
     ``z`` (readings,) are residuals over the sensor band's sd; ``mean_size`` and ``square_size`` are
@@ -50,7 +50,7 @@ class Standardized:
     noise_log_sd: float
 
     @classmethod
-    def of(cls, bands: Bands, memory: float, noise_log_sd: float) -> Standardized:
+    def of(cls, bands: Bands, memory: float, noise_log_sd: float) -> StandardizedResiduals:
         """Take the residuals over their sd, and work out how many independent ones they are worth.
 
         With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in

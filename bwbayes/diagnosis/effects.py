@@ -16,7 +16,7 @@ from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import Effect, LocalFit, climb
 from bwbayes.diagnosis.loopfit import find_delay
 from bwbayes.diagnosis.record_checks import late_fix, settle_fix
-from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate
 from bwbayes.record.record import Record
@@ -35,7 +35,7 @@ def add_shapes(shapes: FloatArray, size: float) -> Effect:
     return _add(lambda sizes: size * (sizes @ shapes), np.zeros((1, len(shapes))))
 
 
-def drift(scene: Scene) -> Iterator[Explanation]:
+def drift(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A₁ t/T + A₂ (t/T)²."""
     along = scene.time / scene.duration
     fit = scene.extended(add_shapes(np.stack([along, along**2]), SIZE * scene.extent))
@@ -44,7 +44,7 @@ def drift(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("drift", text, "measure again after a longer warm-up", fit, foreign=True)
 
 
-def transient(scene: Scene) -> Iterator[Explanation]:
+def transient(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A exp(−t/τ); τ is a thirtieth of the record, within a factor of three."""
 
     def decay(size: float) -> float:
@@ -65,7 +65,7 @@ def transient(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("transient", text, fix, fit, removes=True, foreign=True)
 
 
-def step(scene: Scene) -> Iterator[Explanation]:
+def step(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A from a time on: that of the largest innovation, whose choice is paid for.
 
     Where readings before it were not fitted, the largest of theirs says when it was.
@@ -88,7 +88,7 @@ def step(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("step", text, fix, fit, cost, foreign=True)
 
 
-def oscillation(scene: Scene) -> Iterator[Explanation]:
+def oscillation(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not."""
     rows = scene.posterior.only.readings.rows
     line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
@@ -104,7 +104,7 @@ def oscillation(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("oscillation", text, fix, fit, cost, noise=True)
 
 
-def moving_gain(scene: Scene) -> Iterator[Explanation]:
+def moving_gain(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try x (1 + a t/T)."""
     along = scene.time / scene.duration
 
@@ -116,7 +116,7 @@ def moving_gain(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("moving gain", text, "measure at a constant temperature", fit)
 
 
-def reversed_sign(scene: Scene) -> Iterator[Explanation]:
+def reversed_sign(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try −x, if the readings fall where the voltage rises."""
     record = scene.posterior.only
     readings, drive = record.readings, record.voltage[record.readings.rows]
@@ -128,7 +128,7 @@ def reversed_sign(scene: Scene) -> Iterator[Explanation]:
     yield scene.explained("sign", text, fix, fit)
 
 
-def delay(scene: Scene) -> Iterator[Explanation]:
+def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try u(t − δ), of either sign; δ is a fiftieth of the time between reversals, give or take.
 
     Up to a quarter of a period it is told by loops: the model is fitted anew to readings that are
@@ -160,7 +160,7 @@ def delay(scene: Scene) -> Iterator[Explanation]:
     yield _late(before, rows * scene.interval, fit, cost)
 
 
-def _late(scene: Scene, late: float, fit: LocalFit, cost: float = 0.0) -> Explanation:
+def _late(scene: ResidualAnalysis, late: float, fit: LocalFit, cost: float = 0.0) -> Explanation:
     text = f"{'displacement' if late > 0 else 'voltage'} that is late by {1000 * abs(late):.3g} ms"
     fix = late_fix(late, scene.interval / scene.stride)
     if late > 0:

@@ -15,13 +15,13 @@ import numpy as np
 
 from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.model.registry import STAGES
 from bwbayes.watching import Watch, unwatched
 
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
 # good fit refuses at once; the others explain what the discrepancy takes up.
-ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
+ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     effects.transient,
     effects.drift,
     effects.step,
@@ -33,7 +33,7 @@ ADDITIONS: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
     model.heavy_tails,
     model.growing_noise,
 )
-CHANGES: tuple[Callable[[Scene], Iterator[Explanation]], ...] = (
+CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.stages,
     model.nonlinearity,
     model.creep,
@@ -51,7 +51,7 @@ LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *STAGES))))
 TIED = float(np.log(20))
 
 
-def explain(scene: Scene, watch: Watch = unwatched) -> tuple[Explanation, ...]:
+def explain(scene: ResidualAnalysis, watch: Watch = unwatched) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
     Only the first of them where the discrepancy takes up too little for any other to be worth more

@@ -2,8 +2,8 @@
 
 In voltage, speed, reversals, slowness or duration. There the bands know how sure the parameters
 are, and of what else the actuator does only the creep after slower drives, by its prior
-(:mod:`bwbayes.inference.untried`): it saturates at higher voltages, lags behind faster ones, and
-drifts.
+(:mod:`bwbayes.inference.prior_creep`): it saturates at higher voltages, lags behind faster ones,
+and drifts.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.linearization import value_and_jacobian
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
@@ -39,7 +39,7 @@ from bwbayes.watching import Watch, part, unwatched, watched
 LEFT_OPEN = 1 / 3
 
 
-def undetermined(posterior: Posterior, point: PointFit) -> Iterator[Finding]:
+def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     """Yield the combinations of loop parameters that the record determines least, two at most.
 
     Each leaves more of the prior's sd at a point fit than a third, and says how much and what to
@@ -85,7 +85,7 @@ def remaining(share: float) -> str:
     return f"{percent(share)} of the effective prior's SD remains"
 
 
-def spectrum(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
+def spectrum(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:
     """Return the part of the prior sd that is left along each principal direction of the loop.
 
     The parts (loop parameters,), the largest first, and the directions as columns, in units of

@@ -17,7 +17,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import conflict_fix
-from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.outliers import LIMIT, MOST
@@ -28,7 +28,7 @@ from bwbayes.model.registry import HYSTERESIS, STAGES
 from bwbayes.model.spec import ModelSpec
 
 
-def nonlinearity(scene: Scene) -> Iterator[Explanation]:
+def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
     gain = scene.posterior.only.actuator.gain
     present = set(gain.terms) if gain else set()
@@ -37,13 +37,13 @@ def nonlinearity(scene: Scene) -> Iterator[Explanation]:
             yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", terms)
 
 
-def creep(scene: Scene) -> Iterator[Explanation]:
+def creep(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try slow lags."""
     if scene.posterior.only.actuator.creep is None:
         yield from _changed(scene, "creep", ("creep",))
 
 
-def dynamics(scene: Scene) -> Iterator[Explanation]:
+def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a mass on a spring; readings show the ratios of its parameters alone."""
     if scene.posterior.only.actuator.dynamics == "second-order":
         return
@@ -62,7 +62,7 @@ def dynamics(scene: Scene) -> Iterator[Explanation]:
     )
 
 
-def stages(scene: Scene) -> Iterator[Explanation]:
+def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try each stage before or behind the hysteresis that the model has not."""
     present = scene.study.spec.stages if scene.study is not None else ()
     for name, make in STAGES.items():
@@ -72,7 +72,7 @@ def stages(scene: Scene) -> Iterator[Explanation]:
         yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
 
 
-def without(scene: Scene, names: Sequence[str]) -> Iterator[Explanation]:
+def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
     """Try the model without each of these stages: a gain says that it is not needed."""
     for name in names:
         # Another operator, hold or noise has taken the place of one.
@@ -86,7 +86,7 @@ def without(scene: Scene, names: Sequence[str]) -> Iterator[Explanation]:
         yield scene.explained(name, f"no {name}", fix, fit, spec=spec)
 
 
-def hold(scene: Scene) -> Iterator[Explanation]:
+def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the other thing that the voltage may do between samples."""
     other = "first" if scene.whole.only.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
@@ -95,7 +95,7 @@ def hold(scene: Scene) -> Iterator[Explanation]:
     yield from _changed(scene, text, (), "hold", hold=other)
 
 
-def operator(scene: Scene) -> Iterator[Explanation]:
+def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try other hysteresis operators."""
     present = type(scene.posterior.only.actuator.hysteresis)
     # Compiled ones, each of another family, and plays of any weights, which follow loops that no
@@ -114,7 +114,7 @@ def operator(scene: Scene) -> Iterator[Explanation]:
         yield scene.explained(kind, text, fix, fit, spec=spec, coordinates=fit.coordinates)
 
 
-def smooth(scene: Scene) -> Iterator[Explanation]:
+def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
     if isinstance(scene.posterior.only.noise, DiscrepancyNoise) and scene.before is None:
         facts = {"noise": True}
@@ -122,7 +122,7 @@ def smooth(scene: Scene) -> Iterator[Explanation]:
 
 
 def _changed(
-    scene: Scene,
+    scene: ResidualAnalysis,
     text: str | Callable[[Mapping[str, float]], str],
     stages: Sequence[str],
     kind: str = "",
@@ -165,7 +165,7 @@ def _changed(
     )
 
 
-def prior(scene: Scene) -> Iterator[Explanation]:
+def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the default prior of each parameter that has another one.
 
     Whether the fit has left the prior, or what else it has has made up for it.
@@ -193,7 +193,7 @@ def _lines(before: ModelSpec, after: ModelSpec) -> str:
     return f"set {', '.join(f'{key} = {json.dumps(value)}' for key, value in changes)} in [model]"
 
 
-def heavy_tails(scene: Scene) -> Iterator[Explanation]:
+def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try innovations of a Student t distribution, of whatever scale, if any is an outlier."""
     white = scene.innovations
     far = np.abs(white) > 5
@@ -256,7 +256,7 @@ def isolated_nats(white: FloatArray) -> float:
     return density - cost
 
 
-def growing_noise(scene: Scene) -> Iterator[Explanation]:
+def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try innovations of sd exp(a + b g), g the drive's speed or distance from its center."""
     rows, white = scene.posterior.only.readings.rows, scene.innovations
     center = (scene.voltage.max() + scene.voltage.min()) / 2

@@ -15,7 +15,7 @@ from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.loopfit import LONG_DECAY, LoopFit, find_delay, fit_loop
 from bwbayes.diagnosis.series_patterns import (
-    Stuck,
+    FrozenRun,
     clipped,
     copies,
     held,
@@ -193,13 +193,13 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     fix = "look for what slips or is zeroed"
     samples = np.zeros(record.samples, dtype=np.bool_)
     if first.size <= 5:
-        fix = _exclude(record, rows, Stuck(first, last))
+        fix = _exclude(record, rows, FrozenRun(first, last))
         samples[rows[np.repeat(shifted, np.diff(edges))]] = True
     start, stop = record.time[rows[at[0]]], record.time[rows[at[-1]]] + record.interval
     return Finding("jump", text, fix, float(start), float(stop)), samples
 
 
-def _exclude(record: Record, rows: IntArray, stuck: Stuck) -> str:
+def _exclude(record: Record, rows: IntArray, stuck: FrozenRun) -> str:
     """Return the line of config that leaves out runs of the readings at ``rows``."""
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval
@@ -360,7 +360,7 @@ def _coarse(record: Record) -> Iterator[Finding]:
             yield _whole(record, "coarse resolution", text, fix)
 
 
-def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: Stuck) -> Finding:
+def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: FrozenRun) -> Finding:
     """Return a finding about stuck samples, with the windows to leave out if these are few."""
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval

@@ -16,14 +16,14 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.laplace import LocalFit, climb
-from bwbayes.diagnosis.scene import READINGS
+from bwbayes.diagnosis.residual_analysis import READINGS
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study
 from bwbayes.inference.thinning import stride_of, thin, thinned
 from bwbayes.model.spec import ModelSpec
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record
 
@@ -82,7 +82,7 @@ def disagreement(
     draws: FloatArray,
     rivals: Sequence[LocalFit],
     record: Record,
-    start: Start,
+    start: InitialConditions,
     rng: np.random.Generator,
 ) -> float:
     """Return by how much more rivals differ from a model on another record than in training, um.

@@ -118,7 +118,7 @@ def strongest_line(
     return Line(best, "") if best else None
 
 
-class Stuck(NamedTuple):
+class FrozenRun(NamedTuple):
     """Runs of samples that are stuck: the first and the last sample of each, (runs,)."""
 
     first: IntArray
@@ -135,7 +135,7 @@ class Stuck(NamedTuple):
         return int(np.median(self.last - self.first + 1))
 
 
-def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
+def clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
     """Return where values (samples,) stay at their largest while the other column moves on.
 
     A sensor whose steps are finer than its noise hardly ever repeats itself, in 2% of its
@@ -162,7 +162,7 @@ def clipped(values: FloatArray, other: FloatArray) -> Stuck | None:
     return enough
 
 
-def held(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
+def held(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
     """Return where readings (samples,) are held while the voltage moves, and then jump.
 
     A coarse sensor repeats itself where it moves slowly, and goes on by a step or two; one that is
@@ -204,7 +204,7 @@ def _jumps(before: FloatArray, after: FloatArray, step: float) -> BoolArray:
     return result
 
 
-def repeated(voltage: FloatArray, displacement: FloatArray) -> Stuck | None:
+def repeated(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
     """Return where whole samples are repeated and what follows has gone on without them.
 
     The voltage (samples,) then jumps by as many of its steps as samples were repeated; that of a
@@ -263,7 +263,7 @@ def moves_between(voltage: FloatArray, displacement: FloatArray) -> bool:
     return bool(before * samples > 0.65 * motion * (last - middles[:-1]).sum() > 0)
 
 
-def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> Stuck | None:
+def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> FrozenRun | None:
     """Return the runs that are stuck if these are ten samples in all, enough to say so."""
-    runs_stuck = Stuck(first[stuck], last[stuck])
+    runs_stuck = FrozenRun(first[stuck], last[stuck])
     return runs_stuck if runs_stuck.samples >= 10 else None

@@ -15,8 +15,8 @@ outliers: parameters that have followed it are others. Nor has it where a better
 held-out readings have the drive of those that were fitted, and a discrepancy takes up there what
 the model misses; along another drive its size is another one.
 
-What everything carries along that builds on a run is its :class:`Standing`: it goes first on every
-page, into every file of numbers, and decides the exit status of every command.
+What everything carries along that builds on a run is its :class:`ValidationSummary`: it goes first
+on every page, into every file of numbers, and decides the exit status of every command.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
-from bwbayes.diagnosis.departures import Standardized
+from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
-from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import ExitStatus
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, titled
@@ -41,7 +41,7 @@ from bwbayes.shown import brief
 
 
 @dataclass(frozen=True)
-class Background:
+class ValidationContext:
     """What a verdict needs to know of the fit, besides the bands.
 
     Parameters
@@ -65,7 +65,7 @@ class Background:
     extent: float = 0.0
 
     @classmethod
-    def of(cls, posterior: Posterior, draws: FloatArray) -> Background:
+    def of(cls, posterior: Posterior, draws: FloatArray) -> ValidationContext:
         """Return what a posterior and its draws (draws, free) say."""
         memory, noise_log_sd = [], []
         for _, single, record_draws in posterior.each(draws):
@@ -91,7 +91,7 @@ STATUSES = {True: "passed", False: "failed", None: "inconclusive"}
 
 
 @dataclass(frozen=True)
-class Verdict:
+class BandValidation:
     """Whether bands hold on one record or window.
 
     Attributes
@@ -150,7 +150,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Standing:
+class ValidationSummary:
     """Whether the bands of a run hold on all that they were validated on.
 
     Attributes
@@ -165,7 +165,7 @@ class Standing:
     lines: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, verdicts: Iterable[Verdict]) -> Self:
+    def of(cls, verdicts: Iterable[BandValidation]) -> Self:
         """Return what the verdicts of a run come to."""
         return cls._of((verdict.holds, verdict.line) for verdict in verdicts)
 
@@ -214,11 +214,11 @@ class Standing:
 
 def assess(
     bands: Bands,
-    background: Background,
+    background: ValidationContext,
     *,
     explanations: Sequence[Explanation] = (),
     beyond: Sequence[Finding] = (),
-) -> Verdict | None:
+) -> BandValidation | None:
     """Judge bands by the readings after ``scored_from``; None if there are none.
 
     A good record, one that the fitted model describes, fails with a probability below 1%.
@@ -236,10 +236,10 @@ def assess(
     """
     if not bands.scored(bands.measured).any():
         return None
-    standard = Standardized.of(bands, background.memory, background.noise_log_sd)
+    standard = StandardizedResiduals.of(bands, background.memory, background.noise_log_sd)
     reasons = standard.reasons(background.fitted, background.extent)
     width = (standard.excess_width,) if bands.training and standard.excess_width else ()
-    verdict = Verdict(bands.name, bands.training, True, notes=width, separate=bands.separate)
+    verdict = BandValidation(bands.name, bands.training, True, notes=width, separate=bands.separate)
     # What bands hold after, as far as these readings tell, has done no harm.
     lead, doubted = bands.lead_in, verdict
     off = bool(reasons or standard.chances())

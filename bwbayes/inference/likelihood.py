@@ -237,17 +237,17 @@ class Likelihood:
         return int(self.offset_sd > 0) + (0 if self.from_rest else self.actuator.unknowns)
 
     def simulate(
-        self, model: FloatArray, voltage: FloatArray, unrest: FloatArray | None = None
+        self, model: FloatArray, voltage: FloatArray, initial_transient: FloatArray | None = None
     ) -> FloatArray:
         """Displacement (models, samples), um, along a voltage (samples,), V.
 
-        ``model`` is (models, parameters of the actuator); ``unrest`` (models, unknowns), um, is how
-        far dynamics and creep are from rest at the first sample.
+        ``model`` is (models, parameters of the actuator); ``initial_transient`` (models, unknowns),
+        um, is how far dynamics and creep are from rest at the first sample.
         """
-        return self.walk(model, voltage, unrest)(voltage.size)
+        return self.walk(model, voltage, initial_transient)(voltage.size)
 
     def walk(
-        self, model: FloatArray, voltage: FloatArray, unrest: FloatArray | None = None
+        self, model: FloatArray, voltage: FloatArray, initial_transient: FloatArray | None = None
     ) -> Callable[[int], FloatArray]:
         """Put models to a voltage's first sample; what is returned walks them on to a sample.
 
@@ -258,14 +258,14 @@ class Likelihood:
             # Here, because it is slow to load.
             from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
 
-            return walk(self.actuator, model, voltage, unrest, from_rest=self.from_rest)
+            return walk(self.actuator, model, voltage, initial_transient, from_rest=self.from_rest)
         state, now = None, 0
 
         def onwards(last: int) -> FloatArray:
             nonlocal state, now
             piece, now = voltage[now:last], last
             moved, state = self.actuator.advance(
-                model, piece, state, unrest, from_rest=self.from_rest
+                model, piece, state, initial_transient, from_rest=self.from_rest
             )
             return moved
 

@@ -42,7 +42,7 @@ SAMPLES, PROBES = 20_000, 8
 
 
 @dataclass(frozen=True)
-class PointFit:
+class MAPEstimate:
     """The posterior's mode and its Gaussian approximation, in unconstrained coordinates.
 
     ``mode`` (free,), ``covariance`` (free, free), ``log_density`` at the mode; ``optima``
@@ -59,7 +59,9 @@ class PointFit:
     prior_covariance: FloatArray
 
 
-def fit(posterior: Posterior, generator: np.random.Generator, watch: Watch = unwatched) -> PointFit:
+def fit(
+    posterior: Posterior, generator: np.random.Generator, watch: Watch = unwatched
+) -> MAPEstimate:
     """Find the mode of a posterior and the Gaussian approximation there.
 
     ``watch`` is called with the share that is done.
@@ -88,7 +90,7 @@ def fit(posterior: Posterior, generator: np.random.Generator, watch: Watch = unw
     best = modes[0]
     worth = [m.coordinates for m in modes if m.log_density > best.log_density - NEGLIGIBLE]
     optima = distinct(worth, best.covariance)
-    return PointFit(best.coordinates, best.covariance, best.log_density, optima, spread)
+    return MAPEstimate(best.coordinates, best.covariance, best.log_density, optima, spread)
 
 
 def local_minima(
@@ -114,7 +116,7 @@ def local_minima(
     return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
 
 
-def mode_weights(posterior: Posterior, point: PointFit) -> tuple[FloatArray, FloatArray]:
+def mode_weights(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:
     """Return covariances (modes, free, free) at a point fit's optima, and their shares (modes,).
 
     A mode's share of the posterior is guessed from its height and width (Laplace's approximation).

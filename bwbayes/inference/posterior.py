@@ -234,11 +234,11 @@ class Posterior:
         dataset = self.only if record is None else self.datasets[number]
         likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
         model = dataset.table.actuator(theta)
-        unrest = likelihood.start(theta).mean if likelihood.unknowns else None
+        initial_transient = likelihood.start(theta).mean if likelihood.unknowns else None
         voltage = dataset.voltage[: dataset.training[-1].stop]
 
         for batch in batches(len(theta), voltage.size):
-            moving = None if unrest is None else unrest[batch]
+            moving = None if initial_transient is None else initial_transient[batch]
             yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
 
     @cached_property

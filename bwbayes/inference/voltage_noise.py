@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.linearization import value_and_jacobian
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.record.voltage_path import VoltagePath
 from bwbayes.watching import Watch, unwatched, watched
@@ -26,7 +26,7 @@ COPIES = 16
 def path_covariance(
     posterior: Posterior,
     paths: Mapping[str, VoltagePath],
-    point: PointFit,
+    point: MAPEstimate,
     generator: np.random.Generator,
     watch: Watch = unwatched,
 ) -> FloatArray:

@@ -167,7 +167,7 @@ class Actuator:
         theta: ArrayLike,
         voltage: ArrayLike,
         state: State | None = None,
-        unrest: FloatArray | None = None,
+        initial_transient: FloatArray | None = None,
         *,
         from_rest: bool = False,
     ) -> tuple[FloatArray, State]:
@@ -175,8 +175,9 @@ class Actuator:
 
         Shapes and units as in :meth:`displacement`. Without a ``state`` the record starts here: the
         hysteresis is in the state that θ's initial one says; dynamics and creep are at rest at the
-        first drive, or ``unrest`` (models, unknowns) away from there, um: the dynamics (also how
-        fast they move, where there is a mass), then each lag of the creep; (models, 0) is rest.
+        first drive, or ``initial_transient`` (models, unknowns) away from there, um: the dynamics
+        (also how fast they move, where there is a mass), then each lag of the creep; (models, 0) is
+        rest.
         """
         models = np.atleast_2d(np.asarray(theta, dtype=np.float64))
         if models.ndim != 2 or models.shape[1] != len(self.parameters):
@@ -200,7 +201,7 @@ class Actuator:
         else:
             memory = state.hysteresis
         drive, hysteresis = self.drive(column, driven, memory)
-        result, equilibrium, filtered = self._follow(column, drive, path, state, unrest)
+        result, equilibrium, filtered = self._follow(column, drive, path, state, initial_transient)
         if state is None:
             outputs = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
         else:
@@ -215,19 +216,22 @@ class Actuator:
         drive: FloatArray,
         path: FloatArray,
         state: State | None,
-        unrest: FloatArray | None,
+        initial_transient: FloatArray | None,
     ) -> tuple[FloatArray, tuple[FloatArray, ...], tuple[FloatArray, ...]]:
         """Let dynamics and creep follow a drive (models, samples), um, along a path (samples,), V.
 
         Returns the displacement without the offset, the drives at which they were at rest, and the
-        states of their recursions; ``state`` and ``unrest`` as in :meth:`advance`.
+        states of their recursions; ``state`` and ``initial_transient`` as in :meth:`advance`.
         """
         sections, drives = self.sections(column), [drive]
         if self.creep is not None:
             crept = self.creep.drive(column, drive, path)
             drives += [crept.copy() for _ in self.creep.times]
         if state is None:
-            equilibrium, filtered = tuple(w[:, 0].copy() for w in drives), sections.begin(unrest)
+            equilibrium, filtered = (
+                tuple(w[:, 0].copy() for w in drives),
+                sections.begin(initial_transient),
+            )
         else:
             equilibrium, filtered = state.rest, tuple(carried.copy() for carried in state.filter)
         # The recursions see the drives' distance from rest, so that they start at zero exactly.

@@ -149,12 +149,12 @@ class Sections:
             zeros.append(np.roots(total))
         return np.concatenate(zeros).astype(np.complex128)
 
-    def begin(self, unrest: FloatArray | None) -> tuple[FloatArray, ...]:
-        """Return the states of sections that are ``unrest`` (models, unknowns) away from rest."""
-        if unrest is None or not unrest.size:
+    def begin(self, initial_transient: FloatArray | None) -> tuple[FloatArray, ...]:
+        """Return the states of sections with an ``initial_transient`` (models, unknowns)."""
+        if initial_transient is None or not initial_transient.size:
             return tuple(recursion.at_rest() for recursion in self.recursions)
         ends = np.cumsum([recursion.unknowns for recursion in self.recursions])[:-1]
-        parts = np.split(unrest, ends, axis=1)
+        parts = np.split(initial_transient, ends, axis=1)
         return tuple(
             np.einsum("mu,mut->mt", state, recursion.free)
             for state, recursion in zip(parts, self.recursions, strict=True)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from bwbayes.model.operator import Span
 
 
-class Gone(NamedTuple):
+class StepResult(NamedTuple):
     """What is once a voltage has gone there: w (models,), um, dw/du (models,), and the memory."""
 
     w: FloatArray
@@ -83,10 +83,10 @@ class HysteresisStep(ABC):
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return what the equation of the first model has: numbers by name, and their units."""
 
-    def go(self, memory: FloatArray, voltage: FloatArray) -> Gone:
+    def go(self, memory: FloatArray, voltage: FloatArray) -> StepResult:
         """Return what is once the voltage has gone there; the memory that is given stays."""
         after = np.empty_like(memory)
-        return Gone(*self.move(self.parameters.T, memory.T, voltage, after.T), after)
+        return StepResult(*self.move(self.parameters.T, memory.T, voltage, after.T), after)
 
 
 class OneStateStep(HysteresisStep):

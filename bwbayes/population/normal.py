@@ -141,7 +141,8 @@ def spreads(likelihoods: NormalLikelihoods, prior: Hyperprior) -> Spreads:
 
     With wᵢ = 1/(sᵢ² + τ²), and the prior of the mean counted as one more specimen:
 
-        V = 1/Σ wᵢ,   μ̂ = V Σ wᵢ mᵢ,   log p(τ) = log p₀(τ) + ½ (log V + Σ (log wᵢ − wᵢ (mᵢ − μ̂)²))
+        V = 1/Σ wᵢ,   μ̂ = V Σ wᵢ mᵢ,   log p(τ) = log p₀(τ) + ½ (log V + Σ (log wᵢ − wᵢ (mᵢ −
+        μ̂)²))
 
     up to a constant.
     """

@@ -38,7 +38,7 @@ from bwbayes.population.normal import (
     spreads,
 )
 from bwbayes.population.specimen import Specimen, likelihoods, shared
-from bwbayes.sampling.diagnostics import LARGEST_PARETO_K, smoothed_weights
+from bwbayes.sampling.diagnostics import MAX_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched
 
@@ -308,7 +308,7 @@ def _populations(
         z = (y - np.median(mean)) / np.median(spread)
         weights, shapes[i] = smoothed_weights(np.log(population_density(z)) - log_prior)
         effective[i] = 1 / np.sum(weights**2)
-    is_normal = ~((shapes <= LARGEST_PARETO_K) & (effective >= 50))
+    is_normal = ~((shapes <= MAX_PARETO_K) & (effective >= 50))
     proposed = prior.log_density(mean, spread) + np.sum(sound.marginal(mean, spread), axis=0)
     k = 0.0
     for _ in range(4):
@@ -319,7 +319,7 @@ def _populations(
             logs[i] = largest + np.log(np.sum(by_draw, axis=0))
         target = prior.log_density(mean, spread) + np.sum(logs, axis=0)
         weights, k = smoothed_weights(target - proposed)
-        if k <= LARGEST_PARETO_K:
+        if k <= MAX_PARETO_K:
             break
         # Around these: a Student distribution of μ and log τ with the weighted moments.
         places = np.stack([mean, np.log(spread)], axis=1)

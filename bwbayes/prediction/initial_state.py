@@ -34,7 +34,7 @@ SWEEPS = 4
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialConditions:
     """What is known of the start of another record.
 
     Parameters
@@ -116,17 +116,17 @@ class InitialStates:
     """What every draw takes for a record's start.
 
     ``histories`` with the record's interval and hold, and which of them each draw has; ``model``
-    (draws, parameters of the actuator) with initial state and offset; ``unrest`` (draws, unknowns)
-    of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of the offset still; ``lead_in``
-    says how that went, if there is one, and ``scored_from`` is the first sample after it;
-    ``discrepancy`` is what its readings leave of the discrepancy, for a forecast.
+    (draws, parameters of the actuator) with initial state and offset; ``initial_transient`` (draws,
+    unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of the offset still;
+    ``lead_in`` says how that went, if there is one, and ``scored_from`` is the first sample after
+    it; ``discrepancy`` is what its readings leave of the discrepancy, for a forecast.
     """
 
     __repr__ = brief
 
     histories: Histories
     model: FloatArray
-    unrest: FloatArray
+    initial_transient: FloatArray
     offset_sd: FloatArray
     lead_in: LeadIn | None = None
     scored_from: int = 0
@@ -139,7 +139,7 @@ class InitialStates:
     def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
         """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
         walks = [
-            (rows, likelihood.walk(self.model[rows], voltage, self.unrest[rows]))
+            (rows, likelihood.walk(self.model[rows], voltage, self.initial_transient[rows]))
             for likelihood, rows in self.histories.groups
         ]
         for first in range(0, voltage.size, size):
@@ -158,7 +158,7 @@ def estimate_initial_states(
     posterior: Posterior,
     theta: FloatArray,
     record: Record,
-    start: Start,
+    start: InitialConditions,
     generator: np.random.Generator,
     watch: Watch = unwatched,
 ) -> InitialStates:
@@ -220,7 +220,10 @@ def estimate_initial_states(
 
 
 def _of_new_record(
-    posterior: Posterior, theta: FloatArray, start: Start, generator: np.random.Generator
+    posterior: Posterior,
+    theta: FloatArray,
+    start: InitialConditions,
+    generator: np.random.Generator,
 ) -> tuple[FloatArray, list[str]]:
     """Give draws θ what stages do not know of a record that was not fitted, from its prior.
 
@@ -308,12 +311,14 @@ def training_initial_states(
 ) -> InitialStates:
     """Give every draw θ (draws, parameters) the start that the training record tells."""
     likelihood = posterior.likelihood
-    unrest = np.empty((len(theta), 0))
+    initial_transient = np.empty((len(theta), 0))
     if likelihood.unknowns:
         start = likelihood.start(theta)
-        unrest = _normal(start.mean, start.covariance, generator)
+        initial_transient = _normal(start.mean, start.covariance, generator)
     histories = Histories((likelihood,), np.zeros(len(theta), dtype=np.int64))
-    return InitialStates(histories, likelihood.table.actuator(theta), unrest, np.zeros(len(theta)))
+    return InitialStates(
+        histories, likelihood.table.actuator(theta), initial_transient, np.zeros(len(theta))
+    )
 
 
 def _unseen(
@@ -332,10 +337,12 @@ def _unseen(
     (sd,) = histories.each(theta, lambda likelihood, rows: (likelihood.start_sd(rows),))
     if settled:
         sd[:, : first.actuator.filter.unknowns(first.actuator.hold)] = 0.0
-    unrest = _normal(np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator)
+    initial_transient = _normal(
+        np.zeros_like(sd), sd[:, :, np.newaxis] ** 2 * np.eye(sd.shape[1]), generator
+    )
     start_theta = histories.with_states(theta, uniform(generator, draws))
     model = first.table.actuator(start_theta)
-    start = InitialStates(histories, model, unrest, np.zeros(draws))
+    start = InitialStates(histories, model, initial_transient, np.zeros(draws))
     if settled:
         offset = first.actuator.parameters.index("offset")
         model[:, offset] -= start.displacement(first.voltage[:1])[:, 0]
@@ -349,17 +356,17 @@ def _informed(
     window: slice,
     generator: np.random.Generator,
 ) -> InitialStates:
-    """Let the lead-in tell offset and unrest of draws θ whose initial state is chosen."""
+    """Let the lead-in tell offset and initial transient of draws θ whose initial state is chosen."""
     likelihood = histories.likelihoods[0]
     posterior = LinearStart(*histories.each(theta, Likelihood.start))
     offsets = int(likelihood.offset_sd > 0)
     mean, covariance = posterior.mean, posterior.covariance
-    unrest = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
+    initial_transient = _normal(mean[:, offsets:], covariance[:, offsets:, offsets:], generator)
     start_theta, sd = theta, np.zeros(len(theta))
     if offsets:
-        # Given the unrest the offset is normal still.
+        # Given the initial transient the offset is normal still.
         pull = np.linalg.pinv(covariance[:, 1:, 1:], hermitian=True) @ covariance[:, 1:, :1]
-        shift = np.einsum("mij,mi->mj", pull, unrest - mean[:, 1:])[:, 0]
+        shift = np.einsum("mij,mi->mj", pull, initial_transient - mean[:, 1:])[:, 0]
         variance = covariance[:, 0, 0] - np.sum(covariance[:, 1:, 0] * pull[..., 0], axis=1)
         level = likelihood.table.columns(theta)["offset"] + mean[:, 0] + shift
         start_theta = likelihood.table.replaced(theta, "offset", level)
@@ -371,7 +378,7 @@ def _informed(
         _p_value(histories, theta, posterior.squares),
     )
     model = likelihood.table.actuator(start_theta)
-    return InitialStates(histories, model, unrest, sd, lead_in, window.stop)
+    return InitialStates(histories, model, initial_transient, sd, lead_in, window.stop)
 
 
 def _p_value(histories: Histories, theta: FloatArray, squares: FloatArray) -> float:

@@ -75,7 +75,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Traced:
+class TracedLoop:
     """A steady loop of some models: displacements ``rising`` and ``falling`` (models, points), um.
 
     ``voltage`` (points,) rises, V; ``closed`` says whether the last cycle was as the one before.
@@ -104,7 +104,7 @@ class Loop:
     closed: bool
 
     @classmethod
-    def of(cls, traced: Traced) -> Loop:
+    def of(cls, traced: TracedLoop) -> Loop:
         """Measure the loops of all draws."""
         estimates = {n: None if v is None else Estimate.of(v) for n, v in measures(traced).items()}
         branches = Curve.of(traced.rising), Curve.of(traced.falling)
@@ -183,7 +183,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, watch: Watch = unwatc
 
 def steady_loop(
     actuator: Actuator, column: Values, low: float, high: float, points: int = POINTS
-) -> Traced:
+) -> TracedLoop:
     """Drive models from the demagnetized state up and down until the loop closes.
 
     Of the ``actuator`` all counts that has no pace, but no offset; ``column`` has columns (models,)
@@ -208,7 +208,7 @@ def steady_loop(
         cycles *= 2
     rising, state = actuator.advance(theta, voltage, state)
     falling, _ = actuator.advance(theta, voltage[::-1], state)
-    return Traced(voltage, rising, falling[:, ::-1], closed)
+    return TracedLoop(voltage, rising, falling[:, ::-1], closed)
 
 
 def initial_curve(
@@ -229,7 +229,7 @@ def initial_curve(
     return voltage, np.concatenate([curves[0][:, ::-1], curves[1]], axis=1)
 
 
-def measures(traced: Traced) -> dict[str, FloatArray | None]:
+def measures(traced: TracedLoop) -> dict[str, FloatArray | None]:
     """Measure a loop of models: each number (models,), None where the loop does not have it.
 
     With x↑ and x↓ the displacement on the way up and on the way down, x₊ and x₋ that at the highest

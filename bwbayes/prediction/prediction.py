@@ -27,8 +27,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import (
+    InitialConditions,
     InitialStates,
-    Start,
     continue_discrepancy,
     estimate_initial_states,
     training_initial_states,
@@ -151,7 +151,7 @@ def predict_record(
     posterior: Posterior,
     draws: FloatArray,
     record: Record,
-    start: Start,
+    start: InitialConditions,
     generator: np.random.Generator,
     name: str = "prediction",
     window: Window | None = None,

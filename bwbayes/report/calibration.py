@@ -26,7 +26,7 @@ def calibration_report(calibration: Calibration) -> Report:
     bands, unconverged = _bands(calibration), calibration.unconverged
     counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
     if not calibration.passed:
-        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.shortcomings)
+        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.failures)
     elif calibration.telling:
         verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
     else:

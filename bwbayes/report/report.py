@@ -27,7 +27,7 @@ from bwbayes.watching import Watch, unwatched
 if TYPE_CHECKING:
     from matplotlib import figure
 
-    from bwbayes.diagnosis.validation import Standing
+    from bwbayes.diagnosis.validation import ValidationSummary
     from bwbayes.record.record import Record
 
 # A figure of matplotlib, which is loaded when something is drawn.
@@ -234,7 +234,7 @@ def _flat(blocks: Sequence[Block]) -> Iterator[Block]:
             yield block
 
 
-def kind_of(standing: Standing, *, good: bool = True) -> Kind:
+def kind_of(standing: ValidationSummary, *, good: bool = True) -> Kind:
     """Return the kind of a banner: good only if the run's validation passed, too."""
     return "good" if good and standing.holds else "note"
 
@@ -244,7 +244,7 @@ def remarks_banner(remarks: Sequence[str], headline: str = "Remarks") -> list[Ba
     return [Banner("note", headline, items=remarks, label="note", name="remarks")] * bool(remarks)
 
 
-def standing_banner(standing: Standing, on: Target = "both") -> list[Banner]:
+def standing_banner(standing: ValidationSummary, on: Target = "both") -> list[Banner]:
     """Return a banner with what does not hold of the run that a product builds on, if anything."""
     if not standing.lines:
         return []

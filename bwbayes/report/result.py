@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.consistency import Agreement
+from bwbayes.diagnosis.consistency import Consistency
 from bwbayes.diagnosis.drive_lock import DriveLock
 from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.diagnosis.predictive_checks import PredictiveChecks
-from bwbayes.diagnosis.scene import Explanation
-from bwbayes.diagnosis.validation import Standing, Verdict
+from bwbayes.diagnosis.residual_analysis import Explanation
+from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.loops import Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import StepResponse
-from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.diagnostics import SamplingResult
 from bwbayes.shown import brief
 
 RENAMED = {
@@ -77,19 +77,19 @@ class Result:
     __repr__ = brief
 
     name: str
-    outcome: Outcome
+    outcome: SamplingResult
     parameters: tuple[Parameter, ...]
     draws: FloatArray
     log_density: FloatArray
     moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     predictions: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
-    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    verdicts: Mapping[str, BandValidation] = field(default_factory=dict)
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
     loops: Loops | None = None
     step_responses: Mapping[str, StepResponse] = field(default_factory=dict)
-    consistency: Mapping[str, Agreement] = field(default_factory=dict)
+    consistency: Mapping[str, Consistency] = field(default_factory=dict)
     explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
     information_gain: InformationGain | None = None
     posterior_checks: Mapping[str, PredictiveChecks] = field(default_factory=dict)
@@ -120,9 +120,9 @@ class Result:
         return [bands for bands in self.predictions if bands.name not in self.step_responses]
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> ValidationSummary:
         """Whether all bands hold."""
-        return Standing.of(self.verdicts.values())
+        return ValidationSummary.of(self.verdicts.values())
 
     @property
     def validation(self) -> dict[str, dict[str, Any]]:

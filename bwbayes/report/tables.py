@@ -12,7 +12,7 @@ from markupsafe import Markup
 from bwbayes.diagnosis.conflict import effective
 from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.predictive_checks import STATISTICS
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
@@ -137,7 +137,7 @@ def replicated_tables(result: Result) -> list[Table]:
 
 def scores_table(
     scores: Mapping[str, Scores],
-    verdicts: Mapping[str, Verdict],
+    verdicts: Mapping[str, BandValidation],
     titles: Mapping[str, str],
     records: Sequence[Mapping[str, object]] = (),
 ) -> Table:

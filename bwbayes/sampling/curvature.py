@@ -5,9 +5,9 @@ in a straight line: the ridge is a hundred times as long as wide, and bent by ma
 Tails are longer on one side, and an offset is the less known the larger the discrepancy. No few
 ellipsoids cover that, least of all where there are few draws. Three maps take it out, one after the
 other. Of two sds a record may tell hardly more than what they are together: the ridge is then two
-legs at a right angle, which a :class:`TotalMap` puts in line. A :class:`SkewMap` makes both tails
-of each coordinate alike. A :class:`QuadraticMap` takes of each coordinate what those before it
-leave open, longest first, and lets it bend quadratically with them, and widen. Each tells how
+legs at a right angle, which a :class:`TotalRatioMap` puts in line. A :class:`SkewMap` makes both
+tails of each coordinate alike. A :class:`QuadraticMap` takes of each coordinate what those before
+it leave open, longest first, and lets it bend quadratically with them, and widen. Each tells how
 much it stretches, so that a distribution of the straight coordinates is one of the bent ones,
 density and all.
 """
@@ -221,7 +221,7 @@ class SkewMap:
 
 
 @dataclass(frozen=True)
-class TotalMap:
+class TotalRatioMap:
     """The map from straight coordinates y to those x of pairs of sds a and b that add up.
 
     With ln a = c₁ + s₁ x₁ and ln b = c₂ + s₂ x₂,
@@ -245,7 +245,7 @@ class TotalMap:
     scale: FloatArray
 
     @classmethod
-    def of_noise(cls, prior: JointPrior) -> TotalMap | None:
+    def of_noise(cls, prior: JointPrior) -> TotalRatioMap | None:
         """Take the sds of each record's sensor and discrepancy, where both are free and lognormal.
 
         None if there are no such pairs.
@@ -293,7 +293,7 @@ class TotalMap:
         return slopes
 
 
-type Map = TotalMap | SkewMap | QuadraticMap
+type Map = TotalRatioMap | SkewMap | QuadraticMap
 
 
 def fit_maps(draws: FloatArray) -> list[Map]:

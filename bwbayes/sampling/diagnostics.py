@@ -26,13 +26,13 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.shown import brief
 
-LARGEST_RHAT = 1.01
+MAX_RHAT = 1.01
 
 # Of walkers that mix it is 1.01 after 50 autocorrelation times: √(1 + 1/50).
-LARGEST_WALKER_RHAT = 1.05
+MAX_WALKER_RHAT = 1.05
 
 # Above this a proposal does not cover the draws.
-LARGEST_PARETO_K = 0.7
+MAX_PARETO_K = 0.7
 
 # Log weights that differ by less than this, nats, are equal: the proposal is the posterior itself.
 EQUAL = 1e-6
@@ -42,7 +42,7 @@ LENGTH = 50
 
 
 @dataclass(frozen=True)
-class Check:
+class ConvergenceDiagnostics:
     """The state of a sampling; arrays are (free,).
 
     ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk``, of the ranks, and
@@ -69,7 +69,7 @@ class Check:
     @property
     def covered(self) -> bool:
         """Whether the proposal, if there is one, covers the draws."""
-        return self.pareto_k is None or self.pareto_k < LARGEST_PARETO_K
+        return self.pareto_k is None or self.pareto_k < MAX_PARETO_K
 
     @property
     def lowest_ess(self) -> float:
@@ -79,10 +79,10 @@ class Check:
     @property
     def steps_needed(self) -> float:
         """Steps, to two digits, for walkers to agree, as they differ now: R² − 1 ∝ 1/steps."""
-        steps = self.steps * (self.walker_rhat**2 - 1) / (LARGEST_WALKER_RHAT**2 - 1)
+        steps = self.steps * (self.walker_rhat**2 - 1) / (MAX_WALKER_RHAT**2 - 1)
         return float(f"{steps:.1e}")
 
-    def shortcomings(self, ess: float, fraction: float = 1.0) -> list[str]:
+    def failures(self, ess: float, fraction: float = 1.0) -> list[str]:
         """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
 
         First what more draws need not cure. Of effective draws, and of autocorrelation times, a
@@ -103,29 +103,29 @@ class Check:
         Numbers are rounded away from the limit that they miss.
         """
         reasons = []
-        if not (self.rhat < LARGEST_RHAT).all():
+        if not (self.rhat < MAX_RHAT).all():
             rhat = np.ceil(1e3 * np.max(self.rhat)) / 1e3
-            reasons.append(f"R-hat {rhat:.3f} is not below {LARGEST_RHAT}")
-        if not self.walker_rhat < LARGEST_WALKER_RHAT:
+            reasons.append(f"R-hat {rhat:.3f} is not below {MAX_RHAT}")
+        if not self.walker_rhat < MAX_WALKER_RHAT:
             rhat = np.ceil(1e3 * self.walker_rhat) / 1e3
-            reasons.append(f"R-hat {rhat:.3f} of walkers is not below {LARGEST_WALKER_RHAT}")
+            reasons.append(f"R-hat {rhat:.3f} of walkers is not below {MAX_WALKER_RHAT}")
         if self.stuck:
             reasons.append(f"{self.stuck} walkers are stuck")
         if self.pareto_k is not None and not self.covered:
             shape = np.ceil(100 * self.pareto_k) / 100
-            reasons.append(f"Pareto k {shape:.2f} is not below {LARGEST_PARETO_K}")
+            reasons.append(f"Pareto k {shape:.2f} is not below {MAX_PARETO_K}")
         return reasons
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SamplingResult:
     """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
 
     __repr__ = brief
 
     converged: bool
     stop_reason: str
-    check: Check
+    check: ConvergenceDiagnostics
     remarks: tuple[str, ...] = ()
 
 
@@ -136,7 +136,7 @@ def check(
     thin: int = 1,
     autocorrelation: FloatArray | None = None,
     pareto_k: float | None = None,
-) -> Check:
+) -> ConvergenceDiagnostics:
     """Judge the draws of a sampling.
 
     Parameters
@@ -162,7 +162,7 @@ def check(
     with warnings.catch_warnings(), ThreadPoolExecutor(2) as executor:
         statistics = executor.map(_one_parameter, columns)
         rhat, bulk, tail, mean, walker_rhat = np.array([*statistics]).T
-    return Check(
+    return ConvergenceDiagnostics(
         steps=len(accepted) * block,
         rhat=rhat,
         ess_bulk=bulk,
@@ -230,8 +230,8 @@ def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     """Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
 
     The largest weights are replaced by the order statistics of the generalized Pareto distribution
-    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted, or a
-    weight is not a number.
+    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted, or
+    a weight is not a number.
 
     Notes
     -----

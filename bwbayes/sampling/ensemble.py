@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import (
     Block,
@@ -28,7 +28,7 @@ from bwbayes.sampling.moves import Counted, WeightedMoves
 
 def start(
     posterior: Posterior,
-    point: PointFit,
+    point: MAPEstimate,
     number: int,
     walkers: int,
     generator: np.random.Generator,

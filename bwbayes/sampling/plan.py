@@ -25,9 +25,9 @@ class SamplingPlan:
         Walkers of one ensemble, even, at least twice the free parameters.
     block
         Steps that are made and stored at a time; checks come after whole blocks.
-    most_steps, most_pilot_steps
+    max_steps, max_pilot_steps
         The budget: steps of each ensemble that count, and before.
-    least_pilot_steps
+    min_pilot_steps
         Steps of the pilot in any case.
     ensembles_per_task
         Ensembles that one task advances.
@@ -41,9 +41,9 @@ class SamplingPlan:
     ensembles: int = 4
     walkers: int = 24
     block: int = 50
-    most_steps: int = 20_000
-    least_pilot_steps: int = 25
-    most_pilot_steps: int = 3_000
+    max_steps: int = 20_000
+    min_pilot_steps: int = 25
+    max_pilot_steps: int = 3_000
     ensembles_per_task: int = 1
     tries: int = 1
     ahead: int = 1

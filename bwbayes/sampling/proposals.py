@@ -21,7 +21,7 @@ from bwbayes.sampling.curvature import (
     Map,
     QuadraticMap,
     SkewMap,
-    TotalMap,
+    TotalRatioMap,
     fit_maps,
     subsample,
     to_curved,
@@ -30,7 +30,7 @@ from bwbayes.sampling.curvature import (
 from bwbayes.shown import brief
 
 # By the name in a file, in the order in which they make coordinates straight.
-_MAPS: dict[str, type[Map]] = {"totals": TotalMap, "skew": SkewMap, "bend": QuadraticMap}
+_MAPS: dict[str, type[Map]] = {"totals": TotalRatioMap, "skew": SkewMap, "bend": QuadraticMap}
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class StudentMixture:
         optima: FloatArray,
         covariances: FloatArray,
         shares: FloatArray,
-        totals: TotalMap | None = None,
+        totals: TotalRatioMap | None = None,
     ) -> StudentMixture:
         """Take modes' places (modes, free), covariances (modes, free, free) and shares (modes,).
 

@@ -36,16 +36,16 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.inference.map_estimate import PointFit, mode_weights
+from bwbayes.inference.map_estimate import MAPEstimate, mode_weights
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling import chain as chains
 from bwbayes.sampling.chain import Block, Chain, Phase, constrain_steps, thinning
-from bwbayes.sampling.curvature import TotalMap
+from bwbayes.sampling.curvature import TotalRatioMap
 from bwbayes.sampling.diagnostics import (
-    LARGEST_PARETO_K,
     LENGTH,
-    Check,
-    Outcome,
+    MAX_PARETO_K,
+    ConvergenceDiagnostics,
+    SamplingResult,
     check,
     nested_rhat,
     pareto_k,
@@ -59,26 +59,26 @@ from bwbayes.sampling.proposals import StudentMixture
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing. A proposal is fitted again to so many more at least.
 FIRST_CHECK = 2
-LARGEST_STRETCH = 3.0
+MAX_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
 # Another proposal is worth the draws where what is left takes this much longer, as effective draws
 # grow now, than all of it at the best rate so far; or where more draws show that this much more of
 # them are needed than fewer did.
-LARGEST_SLOWDOWN = 1.2
+MAX_SLOWDOWN = 1.2
 
 # Of the two checks that a chain must pass: for the first, this part of the draws that are to be
 # reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
 # would be one.
 FIRST_PART = 0.5
-APART = 1.2
+MIN_CHECK_GROWTH = 1.2
 
 # Called after each block of one ensemble (phase, None) and after each check (phase, check).
-Watcher = Callable[[Phase, Check | None], None]
+ProgressCallback = Callable[[Phase, ConvergenceDiagnostics | None], None]
 
 
-def first_chain(
-    posterior: Posterior, point: PointFit, plan: SamplingPlan, generator: np.random.Generator
+def init_chain(
+    posterior: Posterior, point: MAPEstimate, plan: SamplingPlan, generator: np.random.Generator
 ) -> Chain:
     """Return a chain without blocks, its ensembles at their starts.
 
@@ -94,7 +94,7 @@ def first_chain(
         )
     seeds = generator.spawn(plan.ensembles)
     chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
-    totals = TotalMap.of_noise(posterior.prior)
+    totals = TotalRatioMap.of_noise(posterior.prior)
     chain.freeze(
         "pilot", StudentMixture.around(point.optima, *mode_weights(posterior, point), totals)
     )
@@ -106,8 +106,8 @@ def sample(
     plan: SamplingPlan,
     chain: Chain,
     executor: Executor,
-    watcher: Watcher = lambda *_: None,
-) -> Outcome:
+    watcher: ProgressCallback = lambda *_: None,
+) -> SamplingResult:
     """Extend ``chain`` until it has converged or the budget is used up.
 
     The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of
@@ -124,9 +124,9 @@ class _Sampling:
     plan: SamplingPlan
     chain: Chain
     executor: Executor
-    watcher: Watcher
+    watcher: ProgressCallback
 
-    def run(self) -> Outcome:
+    def run(self) -> SamplingResult:
         chain = self.chain
         while not chain.blocks("tuning") and not self._pilot_is_done():
             self._extend("pilot")
@@ -148,7 +148,7 @@ class _Sampling:
     @property
     def _is_early(self) -> bool:
         """Whether there is budget enough for one more proposal."""
-        return len(self.chain.history("sampling")) * self.plan.block <= self.plan.most_steps / 2
+        return len(self.chain.history("sampling")) * self.plan.block <= self.plan.max_steps / 2
 
     def _extend(self, phase: Phase) -> None:
         """Advance every ensemble by a block, wherever the executor likes."""
@@ -181,8 +181,8 @@ class _Sampling:
         evolution would keep them for ever, and a proposal fitted to all of them will not.
         """
         plan, steps = self.plan, self.chain.steps("pilot")
-        if steps < plan.least_pilot_steps or steps >= plan.most_pilot_steps:
-            return steps >= plan.most_pilot_steps
+        if steps < plan.min_pilot_steps or steps >= plan.max_pilot_steps:
+            return steps >= plan.max_pilot_steps
         half = constrain_steps(self.posterior, self.chain.coordinates("pilot")[steps // 2 :])
         if _agree(half):
             return True
@@ -219,14 +219,14 @@ class _Sampling:
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
 
-    def _sampled(self) -> Outcome | None:
+    def _sampled(self) -> SamplingResult | None:
         """Sample to the end, or until the proposal turns out not to cover the draws: then None.
 
         A chain that has blocks already is judged where it was, or would have been, on its way.
         """
         plan, chain = self.plan, self.chain
         # A chain may be longer than its budget, if that was made smaller.
-        budget = max(-(-plan.most_steps // plan.block), chain.blocks("sampling"))
+        budget = max(-(-plan.max_steps // plan.block), chain.blocks("sampling"))
         fitted_to = chain.set_aside if chain.refit else 0
         blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
         needed, best = math.inf, 0.0  # blocks, and most effective draws of a block, as told so far
@@ -243,35 +243,37 @@ class _Sampling:
             # A tenth of the budget has had several proposals, and tells whether all of it may do.
             is_early = drawn < budget / 10
             if required > blocks and is_early:
-                if may_refit and not passed and required > LARGEST_SLOWDOWN * needed:
+                if may_refit and not passed and required > MAX_SLOWDOWN * needed:
                     return None
                 needed = required
-                blocks = math.ceil(min(required, LARGEST_STRETCH * blocks))
+                blocks = math.ceil(min(required, MAX_STRETCH * blocks))
                 continue
             latest = judgment.check()
             if at_end:
                 chain.publish()
             self.watcher("sampling", latest)
-            missing = latest.shortcomings(plan.ess)
+            missing = latest.failures(plan.ess)
             # One whose target was made smaller has converged before its end.
-            done = not missing and 0 < APART * passed <= blocks
+            done = not missing and 0 < MIN_CHECK_GROWTH * passed <= blocks
             if done and at_end:
-                return Outcome(True, "converged (two consecutive checks)", latest)
+                return SamplingResult(True, "converged (two consecutive checks)", latest)
             if blocks == budget:
                 why = "; ".join(missing) or "only the last check passed"
-                return Outcome(False, f"step limit {plan.most_steps} reached: {why}", latest)
+                return SamplingResult(False, f"step limit {plan.max_steps} reached: {why}", latest)
             if not latest.covered and at_end and drawn >= LEAST_STRETCH * fitted_to:
                 return None
             is_hopeless = latest.covered and latest.steps_needed > 4 * budget * plan.block
             if is_hopeless and at_end and not is_early:
-                most, steps = 100 * plan.most_steps, latest.steps_needed
+                most, steps = 100 * plan.max_steps, latest.steps_needed
                 about = f"about {steps:.0f}" if steps < most else f"more than {most}"
                 why = f"{about} steps are needed: {'; '.join(missing)}"
-                return Outcome(False, f"step limit {plan.most_steps} out of reach: {why}", latest)
-            first = not latest.shortcomings(plan.ess, FIRST_PART)
+                return SamplingResult(
+                    False, f"step limit {plan.max_steps} out of reach: {why}", latest
+                )
+            first = not latest.failures(plan.ess, FIRST_PART)
             ess = latest.lowest_ess
             growth, best = (ess - judged[1]) / (blocks - judged[0]), max(best, ess / blocks)
-            lags = (plan.ess - ess) * best > LARGEST_SLOWDOWN * plan.ess * growth
+            lags = (plan.ess - ess) * best > MAX_SLOWDOWN * plan.ess * growth
             if may_refit and judged[0] and lags:
                 return None
             judged = blocks, ess
@@ -305,16 +307,18 @@ class _Judgment:
         Mostly the last thing that is missing, and cheap to see. None if the proposal does not cover
         the draws, because more would not help.
         """
-        if self.pareto_k is not None and not self.pareto_k < LARGEST_PARETO_K:
+        if self.pareto_k is not None and not self.pareto_k < MAX_PARETO_K:
             return 0.0
         return fraction * LENGTH * float(np.max(self.times)) / self.block
 
-    def check(self) -> Check:
+    def check(self) -> ConvergenceDiagnostics:
         """Judge everything, which costs as much as many steps."""
         return check(self.draws, self.accepted, self.block, self.thin, self.times, self.pareto_k)
 
 
-def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> int:
+def _next_check(
+    plan: SamplingPlan, blocks: int, passed: int, latest: ConvergenceDiagnostics
+) -> int:
     """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
 
     Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
@@ -324,10 +328,10 @@ def _next_check(plan: SamplingPlan, blocks: int, passed: int, latest: Check) -> 
     with np.errstate(divide="ignore"):
         draws = np.divide(latest.steps * plan.ess, latest.lowest_ess)  # of none, where none moves
         steps = np.maximum(draws, LENGTH * np.max(latest.autocorrelation))
-    following = max(fraction * steps / plan.block, APART * passed)
+    following = max(fraction * steps / plan.block, MIN_CHECK_GROWTH * passed)
     if not following > blocks:  # nan too
         following = LEAST_STRETCH * blocks
-    return int(max(np.ceil(min(following, LARGEST_STRETCH * blocks)), blocks + 1))
+    return int(max(np.ceil(min(following, MAX_STRETCH * blocks)), blocks + 1))
 
 
 def _agree(draws: FloatArray) -> bool:

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, one_line
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.sampling.chain import (
     PHASES,
     Block,
@@ -58,7 +58,7 @@ class ChainFile(Chain):
     def __init__(
         self,
         path: Path,
-        point: PointFit,
+        point: MAPEstimate,
         starts: Sequence[EnsembleState],
         block: int,
         attributes: Mapping[str, str | int],
@@ -72,7 +72,7 @@ class ChainFile(Chain):
         cls,
         path: Path,
         chain: Chain,
-        point: PointFit,
+        point: MAPEstimate,
         block: int,
         attributes: Mapping[str, str | int],
     ) -> ChainFile:
@@ -239,11 +239,11 @@ class ChainFile(Chain):
         text = json.loads(str(arrays["text"]))
         if text["format"] != FORMAT:
             raise ValueError(f"its format is {text['format']}, this version reads {FORMAT}")
-        point = {field.name: arrays[f"point_{field.name}"] for field in fields(PointFit)}
+        point = {field.name: arrays[f"point_{field.name}"] for field in fields(MAPEstimate)}
         point["log_density"] = float(point["log_density"])
         states = zip(*(arrays[field.name] for field in fields(EnsembleState)), strict=True)
         starts = [EnsembleState(*state) for state in states]
-        chain = cls(path, PointFit(**point), starts, text["block"], text["attributes"])
+        chain = cls(path, MAPEstimate(**point), starts, text["block"], text["attributes"])
         chain.proposals["pilot"] = StudentMixture.of_arrays(arrays)
         return chain
 

@@ -19,7 +19,7 @@ from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import render
 from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
-from bwbayes.sampling.diagnostics import Check, Outcome
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from tests.declared import declared
 from tests.prediction.records import normal_bands
 
@@ -86,10 +86,10 @@ def draws(steps: int = 120, walkers: int = 10) -> FloatArray:
     return MEANS + SDS * np.random.default_rng(1).standard_normal((steps, 4, walkers, 4))
 
 
-def check(steps: int) -> Check:
+def check(steps: int) -> ConvergenceDiagnostics:
     """Return a check that is content, its numbers told apart by parameter."""
     each = np.arange(4.0)
-    return Check(
+    return ConvergenceDiagnostics(
         steps=steps,
         rhat=1.001 + 0.001 * each,
         ess_bulk=2100 + each,
@@ -115,7 +115,7 @@ def run(
     every = every if converged else ()
     return Result(
         name="bender",
-        outcome=Outcome(
+        outcome=SamplingResult(
             converged,
             "two good checks" if converged else "step limit 120 reached: R-hat 1.2",
             check(values.shape[0]),

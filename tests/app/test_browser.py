@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.campaign import STATUSES, Campaign, Row
 from bwbayes.app.running.folder import CampaignFolder
-from bwbayes.comparison.designed import Design, Promise
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.comparison.designed import Design, DesignScore
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.model.limits import Limits
 from bwbayes.report.page import render
 from tests.app import example, small
@@ -88,10 +88,10 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         paths[name].write_text(page, encoding="utf-8")
     check(small.config(), folder, folder)
     wave = 100 * np.sin(np.arange(300) / 10)
-    promises = [Promise("sine", 0.6, 0.01), Promise("far", np.nan, np.nan, "goes too far")]
+    promises = [DesignScore("sine", 0.6, 0.01), DesignScore("far", np.nan, np.nan, "goes too far")]
     signals = {"sine": wave, "far": 9 * wave}
     limits = Limits(-100, 100)
-    design = Design("a run", "beta", None, limits, signals, 0.01, Standing(), promises)
+    design = Design("a run", "beta", None, limits, signals, 0.01, ValidationSummary(), promises)
     reports = {"design": design.report(), "campaign": campaign().report()}
     drawn = dict.fromkeys(("promises", "best", "parameters"), picture)
     for name, report in reports.items():

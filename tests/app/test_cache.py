@@ -53,14 +53,14 @@ def test_an_opened_run_computes_nothing(run: Path) -> None:
 def test_a_stage_is_the_same_computed_alone_read_or_after_the_others(
     run: Path, tmp_path: Path, name: str
 ) -> None:
-    alone = getattr(bw.open_run(run).knowing(kept={}), name)
+    alone = getattr(bw.open_run(run).with_cache(kept={}), name)
     kept = bw.open_run(run).kept[name]
     assert content(alone, tmp_path / "alone.npz") == content(kept, tmp_path / "kept.npz")
 
 
 @pytest.mark.parametrize("name", STAGES)
 def test_a_stage_is_computed_once(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    fit, computed = bw.open_run(run).knowing(kept={}), []
+    fit, computed = bw.open_run(run).with_cache(kept={}), []
     for other, stage in STAGES.items():
         monkeypatch.setattr(stage, "compute", lambda *_, other=other: computed.append(other))
     assert getattr(fit, name) is getattr(fit, name)
@@ -72,9 +72,9 @@ def test_a_stage_is_computed_once(run: Path, monkeypatch: pytest.MonkeyPatch, na
 @pytest.mark.parametrize("name", STAGES)
 def test_no_stage_speaks_of_an_interval_without_convergence(run: Path, name: str) -> None:
     fit = bw.open_run(run)
-    fit = fit.knowing(outcome=replace(fit.outcome, converged=False))
+    fit = fit.with_cache(outcome=replace(fit.outcome, converged=False))
     if STAGES[name].always:
-        assert not getattr(fit.knowing(kept={}), name)
+        assert not getattr(fit.with_cache(kept={}), name)
     else:
         with pytest.raises(bw.NotConvergedError, match="intervals are withheld"):
             getattr(fit, name)

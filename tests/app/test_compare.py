@@ -144,7 +144,7 @@ def test_other_readings_are_refused(
 ) -> None:
     """Before anything is worked out, so that it does not matter what the draws are of."""
     config, records = config_of(record, KEYS | keys)
-    other = fits[1].knowing(problem=resolve(config, Path(), records))
+    other = fits[1].with_cache(problem=resolve(config, Path(), records))
     with pytest.raises(InputError, match=line):
         fits[0].compare(other)
 

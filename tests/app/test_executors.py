@@ -31,7 +31,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.engine import Engine
 from bwbayes.sampling.chain import Chain, draws
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from tests.app import small
 from tests.app.conftest import Type
 from tests.inference.problems import short_posterior, truth
@@ -45,7 +45,7 @@ pytestmark = [
 ]
 
 PLAN = SamplingPlan(
-    ess=50, walkers=24, block=10, least_pilot_steps=20, most_pilot_steps=20, most_steps=40
+    ess=50, walkers=24, block=10, min_pilot_steps=20, max_pilot_steps=20, max_steps=40
 )
 PATIENCE = 120.0
 
@@ -58,7 +58,7 @@ def chain() -> Chain:
     """Return a chain before its first step."""
     one = posterior()
     point = pointfit.fit(one, np.random.default_rng(1))
-    return first_chain(one, point, PLAN, np.random.default_rng(2))
+    return init_chain(one, point, PLAN, np.random.default_rng(2))
 
 
 def sampled(pool: Executor, watcher: Callable[..., None] = lambda *_: None) -> Any:

@@ -22,7 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from bwbayes.app.running.figure_worker import Artist, artist_of
+from bwbayes.app.running.figure_worker import FigureWorker, artist_of
 from bwbayes.report.figures import interactive, picture_of, plots_of, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.pictures import pictures
@@ -269,7 +269,7 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died."""
-    artist, run = Artist(Broken()), example.run(converged=False)
+    artist, run = FigureWorker(Broken()), example.run(converged=False)
     artist.draw(run)
     drawn, plots = artist.drawn(run, tmp_path)
     assert plots == NO_PLOTS

@@ -17,7 +17,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import run
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.record import Record, read_record
 from bwbayes.report.outputs import write_bands
 from bwbayes.report.words import digits
@@ -74,7 +74,7 @@ def stopped(folder: Path, steps: int = 25) -> Run:
     """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
     outcome = replace(made.outcome, converged=False, stop_reason=f"step limit {steps} reached")
-    return made.knowing(outcome=outcome, kept={})
+    return made.with_cache(outcome=outcome, kept={})
 
 
 # Arrays to bands
@@ -121,7 +121,7 @@ def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Run) -> None:
 def test_the_heading_says_for_which_drives_validation_passed(
     opened: Run, holds: bool | None
 ) -> None:
-    heading = opened.knowing(standing=Standing(holds)).heading
+    heading = opened.with_cache(standing=ValidationSummary(holds)).heading
     drives = f" for drives like the training record's ({opened.problem.facts['drive']})"
     assert heading.endswith(f"validation passed{drives}") == bool(holds)
     assert (drives in heading) == bool(holds)
@@ -129,7 +129,7 @@ def test_the_heading_says_for_which_drives_validation_passed(
 
 def test_the_notebooks_html_shows_names_as_they_are(opened: Run) -> None:
     config = opened.problem.config.model_copy(update={"name": "<b>x</b>"})
-    shown = opened.knowing(problem=replace(opened.problem, config=config), result=opened.result)
+    shown = opened.with_cache(problem=replace(opened.problem, config=config), result=opened.result)
     assert "&lt;b&gt;x" in shown._repr_html_()
 
 

@@ -76,7 +76,9 @@ def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app_check, "save", lambda *_, **__: [])
 
 
-def best_draw(posterior: Posterior, generator: np.random.Generator, _: Watch) -> pointfit.PointFit:
+def best_draw(
+    posterior: Posterior, generator: np.random.Generator, _: Watch
+) -> pointfit.MAPEstimate:
     """Stand in for the point fit, with its error for priors that the record contradicts."""
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(generator, 64))
@@ -84,7 +86,7 @@ def best_draw(posterior: Posterior, generator: np.random.Generator, _: Watch) ->
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
     best, spread = draws[np.argmax(density)], np.atleast_2d(np.cov(draws, rowvar=False))
-    return pointfit.PointFit(best, spread, float(density.max()), best[np.newaxis], spread)
+    return pointfit.MAPEstimate(best, spread, float(density.max()), best[np.newaxis], spread)
 
 
 def check(one: Case, place: Path, seconds: int = SECONDS) -> Said:

@@ -25,7 +25,7 @@ from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.diagnosis.laplace import climb
-from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record

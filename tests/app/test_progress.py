@@ -19,7 +19,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import redraw
 from bwbayes.inference import map_estimate
-from bwbayes.sampling.diagnostics import Check
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics
 from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
@@ -45,7 +45,9 @@ class Watched:
         """Show a check; return the seconds that are left then."""
         enough = np.full(2, ess)
         rhats, autocorrelation = np.full(2, rhat), np.full(2, 4.0)
-        check = Check(steps, rhats, enough, enough, enough, autocorrelation, 0.4, stuck)
+        check = ConvergenceDiagnostics(
+            steps, rhats, enough, enough, enough, autocorrelation, 0.4, stuck
+        )
         self.show("sampling", check)
         return self.eta
 

@@ -203,7 +203,7 @@ def test_units_that_are_stated_are_doubted_and_not_refused(
     assert re.match(
         r"voltages of up to \S+ V move the displacement by \S+ um, \S+ um per volt$", finding.text
     )
-    assert proposal.pointless is None
+    assert proposal.blocking_issue is None
 
 
 def test_a_reversed_sign_is_turned_by_its_unit(

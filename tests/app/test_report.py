@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.figures import interactive
@@ -86,8 +86,8 @@ def test_scores_are_shown_for_each_of_the_bands() -> None:
 
 def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     cause = Finding("noise", "the noise is not like that", "try another noise")
-    failed = Verdict("held-out", False, False, ("covers 60%",), cause)
-    held = Verdict("training", True, True)
+    failed = BandValidation("held-out", False, False, ("covers 60%",), cause)
+    held = BandValidation("training", True, True)
     run = dataclasses.replace(example.run(), verdicts={"training": held, "held-out": failed})
     text = page(run)
     places = [text.index(said) for said in ("VALIDATION FAILED", "try another noise", "94.3 ± 1.3")]
@@ -102,9 +102,9 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
 @pytest.mark.parametrize("held_out", [True, False])
 def test_a_run_that_holds_nothing_out_says_so_on_page_and_screen(held_out: bool) -> None:
     """With what to write; a run that holds readings out says nothing of it."""
-    verdicts = {"training": Verdict("training", True, True)}
+    verdicts = {"training": BandValidation("training", True, True)}
     if held_out:
-        verdicts["held-out"] = Verdict("held-out", False, True)
+        verdicts["held-out"] = BandValidation("held-out", False, True)
     run = dataclasses.replace(example.run(), verdicts=verdicts)
     for text in (page(run), as_text(run_report(run, {}), 400)):
         assert held_out == ("no readings are held out: the bands are validated on" not in text)

@@ -111,11 +111,11 @@ def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
     folder = RunFolder(run)
     fit = finished(folder)
     outcome = replace(fit.outcome, converged=False)  # no bands are needed
-    fit = fit.knowing(outcome=outcome, kept={})
+    fit = fit.with_cache(outcome=outcome, kept={})
     assert () == fit.remarks
     nanometres = Distribution("lognormal", {"median": 1e-3, "sigma": 0.6})
     odd = replace(fit.problem, defaults={**fit.problem.defaults, "d": nanometres})
-    (remark,) = finished(folder).knowing(problem=odd, outcome=outcome, kept={}).remarks
+    (remark,) = finished(folder).with_cache(problem=odd, outcome=outcome, kept={}).remarks
     assert "Fix: check its unit" in remark
 
 

@@ -16,7 +16,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume
 from bwbayes.errors import InputError
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
@@ -58,7 +58,7 @@ def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder
     (bands,) = predict_windows(problem.posterior, draws, record, {"all": slice(0, 5000)}, rng)
     np.testing.assert_array_equal(bands.voltage, record.path.voltage)
     other = noisy_record(2)
-    bands = predict_record(problem.posterior, draws, other, Start(from_rest=True), rng)
+    bands = predict_record(problem.posterior, draws, other, InitialConditions(from_rest=True), rng)
     np.testing.assert_array_equal(bands.voltage, other.path.voltage)
 
 

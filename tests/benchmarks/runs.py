@@ -34,10 +34,10 @@ from bwbayes.calibration.replicates import replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.diagnostics import Check, Outcome, as_chains
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult, as_chains
 from bwbayes.sampling.ensemble import advance
 from bwbayes.sampling.moves import sampling_moves
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from tests.benchmarks.measuring import ROOT, Call, Cell, Table, interleaved, timed
 from tests.benchmarks.models import MODELS, by_engine, paper_record, speed_up
 
@@ -49,7 +49,7 @@ class Run:
     """A run of ours: its chain and outcome, and the seconds that each part of it took."""
 
     chain: Chain
-    outcome: Outcome
+    outcome: SamplingResult
     seconds: dict[str, float]
 
     @property
@@ -70,11 +70,11 @@ def our_run(problem: Problem) -> Run:
         seconds[part] += now - last
         last = now
 
-    def watcher(phase: Phase, check: Check | None) -> None:
+    def watcher(phase: Phase, check: ConvergenceDiagnostics | None) -> None:
         passed(phase if check is None else "checks")
 
     point = map_estimate.fit(posterior, generator(seed, "point fit"))
-    chain = first_chain(posterior, point, problem.plan, generator(seed, "sampling"))
+    chain = init_chain(posterior, point, problem.plan, generator(seed, "sampling"))
     passed("point fit")
     with open_executor(2, posterior.engine) as pool:
         outcome = sample(posterior, problem.plan, chain, pool, watcher)

@@ -100,14 +100,14 @@ def test_twin_defects_are_found(defect: str) -> None:
         assert result.telling
         assert result.power["20% too small"] > 0.98
         if defect == "two peaks":
-            assert any("leaves its band" in text for text in result.shortcomings)
+            assert any("leaves its band" in text for text in result.failures)
 
 
 def test_defect_of_one_statistic_is_told_by_its_name() -> None:
     z = scores(500)
     z[:, 4] /= 0.6
     result = judged(entries(z))
-    assert all(text.startswith("e: ") for text in result.shortcomings), result.shortcomings
+    assert all(text.startswith("e: ") for text in result.failures), result.failures
     assert result.statistics["e"].adjusted < FAMILY_LEVEL / 2
     assert result.statistics["e"].outside
 

@@ -13,7 +13,7 @@ from bwbayes.calibration import replicates as module
 from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import (
     RANKED,
-    Experiment,
+    CalibrationSetup,
     Replicate,
     replicate,
     replicates,
@@ -21,7 +21,7 @@ from bwbayes.calibration.replicates import (
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record.record import Record
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.problems import posterior_of, short_posterior
@@ -33,13 +33,13 @@ PRIORS = {
     "alpha": Distribution("normal", {"mean": 0.3, "sd": 0.05}),
     "sensor_sd": Distribution("lognormal", {"median": 0.5, "sigma": 0.3}),
 }
-PLAN = SamplingPlan(ess=100, walkers=12, block=10, most_pilot_steps=30, most_steps=2_000)
+PLAN = SamplingPlan(ess=100, walkers=12, block=10, max_pilot_steps=30, max_steps=2_000)
 
 
-def small(**changes: object) -> Experiment:
+def small(**changes: object) -> CalibrationSetup:
     """Return an experiment of 80 samples, of which 20 are held out."""
     posterior = short_posterior("white", 80, fixed=FIXED, priors=PRIORS, training=(slice(0, 60),))
-    return replace(Experiment(posterior, PLAN, {"record": [slice(60, 80)]}), **changes)  # type: ignore[arg-type]
+    return replace(CalibrationSetup(posterior, PLAN, {"record": [slice(60, 80)]}), **changes)  # type: ignore[arg-type]
 
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:
@@ -83,7 +83,7 @@ def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch
 
 def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     """Among fewer than others it would have other ranks."""
-    plan = replace(PLAN, walkers=6, block=5, most_steps=5)
+    plan = replace(PLAN, walkers=6, block=5, max_steps=5)
     entry = replicate(small(plan=plan), 1, 0).entry
     assert (5, False) == (entry["steps"], entry["converged"])
     assert {} == entry["ranks"] == entry["covered"]
@@ -96,7 +96,7 @@ def another(**changes: object) -> OtherRecord:
     """Return a sine of another rate; the last reading is missing, and a tenth is the lead-in."""
     voltage = 60 * np.sin(2 * np.pi * np.arange(200) / 100 + 1)
     reading = np.where(np.arange(200) < 199, 0.0, np.nan)
-    other = OtherRecord(Record(voltage, reading, 0.005), Start(lead_in=0.1))
+    other = OtherRecord(Record(voltage, reading, 0.005), InitialConditions(lead_in=0.1))
     return replace(other, **changes)  # type: ignore[arg-type]
 
 
@@ -119,7 +119,7 @@ def test_one_discrepancy_goes_through_all_training_windows() -> None:
     windows = (slice(0, 30), slice(30, 60))
     fixed = FIXED | {"discrepancy_time": 0.2}
     posterior = short_posterior("discrepancy", 80, fixed=fixed, training=windows)
-    experiment = Experiment(posterior, PLAN)
+    experiment = CalibrationSetup(posterior, PLAN)
     away = []
     for seed in range(200):
         theta, records = module._simulated(experiment, np.random.default_rng(seed))
@@ -145,7 +145,7 @@ def test_loop_of_a_lag_is_known_in_closed_form() -> None:
     # From the crest, where it is at rest: the sine has settled by the first passage.
     voltage = 100 * np.cos(2 * np.pi * time)
     posterior = posterior_of(voltage, voltage, Actuator("lag", "first", interval), "white")
-    experiment = Experiment(posterior, PLAN)
+    experiment = CalibrationSetup(posterior, PLAN)
     known = {"d": d, "alpha": 1e-9, "beta": 0.02, "exponent": 1.0, "lag": lag, "sensor_sd": 1.0}
     theta = np.array([[known.get(name, 0.0) for name in posterior.prior.names]])
     *_, area, extent = experiment.measures(posterior, theta)[0]

@@ -15,7 +15,7 @@ from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.design import promises
-from bwbayes.comparison.designed import Promise
+from bwbayes.comparison.designed import DesignScore
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
@@ -51,7 +51,7 @@ def promised(
     candidates: dict[str, FloatArray],
     target: str | FloatArray = "beta",
     amplifier: Limits = WIDE,
-) -> list[Promise]:
+) -> list[DesignScore]:
     return promises(*known, candidates, target, amplifier, np.random.default_rng(2))
 
 

@@ -13,7 +13,7 @@ from bwbayes.comparison.candidates import Candidate
 from bwbayes.comparison.evidence import Evidence
 from bwbayes.comparison.leave_future_out import FUTURE, Part
 from bwbayes.comparison.recommendation import difference, recommend
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.report.report import Table, as_text
 
 
@@ -180,8 +180,8 @@ def test_tables_fit_eighty_columns_whatever_folders_are_called(length: int) -> N
 def test_what_does_not_hold_is_said_before_what_is_recommended(
     holds: bool | None, status: str
 ) -> None:
-    standing = Standing(holds, ("next: the bands cover 55%",))
-    wide = replace(model("wide", COMMON - 700 + 60 * noise(2)), standing=Standing())
+    standing = ValidationSummary(holds, ("next: the bands cover 55%",))
+    wide = replace(model("wide", COMMON - 700 + 60 * noise(2)), standing=ValidationSummary())
     comparison = recommend([replace(model("good", COMMON), standing=standing), wide])
     first, second, *_ = as_text(comparison.report()).splitlines()
     assert re.match(rf"{status}.*: next: the bands cover 55%", first)

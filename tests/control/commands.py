@@ -21,7 +21,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import compensate
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import Reference
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.limits import Limits
 from bwbayes.prediction.bands import LEVELS
@@ -43,7 +43,7 @@ SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
 def fit_of(problem: Problem, flat: FloatArray) -> Run:
     """Return a fit with draws (draws, free) that come from no chain."""
     fit = Run(cast(Any, None), RunFolder(Path()))
-    return fit.knowing(problem=problem, flat_draws=flat, standing=Standing())
+    return fit.with_cache(problem=problem, flat_draws=flat, standing=ValidationSummary())
 
 
 @cache

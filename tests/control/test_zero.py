@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.jobs.at_work import limits_of
 from bwbayes.app.jobs.control import export
+from bwbayes.app.jobs.fit_methods import limits_of
 from bwbayes.app.problem.problem import Problem, resolve
 from bwbayes.control.compensation import compensate
 from bwbayes.control.references import Reference, shaped

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bwbayes.diagnosis.consistency import Agreement, agreements, disagreements
+from bwbayes.diagnosis.consistency import Consistency, agreements, disagreements
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
@@ -32,7 +32,7 @@ def pair(seed: int, gain: float = 1.0, noise: float = 0.0) -> Posterior:
     return joint(*datasets)
 
 
-def compared(posterior: Posterior) -> dict[str, Agreement]:
+def compared(posterior: Posterior) -> dict[str, Consistency]:
     return agreements(posterior, pointfit.fit(posterior, np.random.default_rng(1)))
 
 
@@ -49,7 +49,7 @@ def test_a_record_with_another_gain_is_named() -> None:
     every = compared(pair(1, gain=1.1))
     lines = [*map(str, disagreements(every))]
     assert any(line.startswith("r1: is inconsistent with the other records: ") for line in lines)
-    assert every["r1"].joint_um > every["r1"].own_um
+    assert every["r1"].joint_rms_um > every["r1"].single_rms_um
     assert any("model.per_record" in line for line in lines)
 
 

@@ -12,10 +12,10 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import effects, explanations, model
-from bwbayes.diagnosis import scene as scenes
+from bwbayes.diagnosis import residual_analysis as scenes
 from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.laplace import NONE, climb
-from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.model.stages.slew_limit import SlewLimit
 from bwbayes.record import Record, write_record
@@ -24,7 +24,9 @@ from tests.prediction.runs import problem_of
 from tests.stand import Stand
 
 
-def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters: str = "") -> Scene:
+def scene(
+    kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters: str = ""
+) -> ResidualAnalysis:
     """Fit the good model to a plant, with some priors stated."""
     (folder / "record.h5").unlink(missing_ok=True)
     write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
@@ -32,7 +34,7 @@ def scene(kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters:
     problem = problem_of(text, folder)
     rng = np.random.default_rng(seed)
     point = pointfit.fit(problem.posterior, rng)
-    return Scene.of(problem.posterior, point.optima, rng, study=problem.study)
+    return ResidualAnalysis.of(problem.posterior, point.optima, rng, study=problem.study)
 
 
 LINEAR = """
@@ -98,7 +100,7 @@ def test_outliers_are_set_aside_where_they_are_few_and_far(kind: str) -> None:
         assert aside == (kind == "few far")
 
 
-FAMILIES: dict[str, Callable[[Scene], Iterator[Explanation]]] = {
+FAMILIES: dict[str, Callable[[ResidualAnalysis], Iterator[Explanation]]] = {
     "transient": effects.transient,
     "drift": effects.drift,
     "step": effects.step,
@@ -140,7 +142,9 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     problem = problem_of('[record]\nfile = "record.h5"\n', tmp_path)
     rng = np.random.default_rng(1)
     optima = pointfit.fit(problem.posterior, rng).optima
-    found = max(effects.delay(Scene.of(problem.posterior, optima, rng)), key=lambda e: e.nats)
+    found = max(
+        effects.delay(ResidualAnalysis.of(problem.posterior, optima, rng)), key=lambda e: e.nats
+    )
     assert found.nats > LIMIT
     assert found.text.startswith("displacement" if late > 0 else "voltage")
     assert abs(0.8 * float(found.text.split()[-2]) / 1000 - abs(late)) < 0.03
@@ -183,7 +187,7 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
     posterior = problem.posterior.altered(displacement=shifted, training=windows)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(posterior, rng).optima
-    (found,) = effects.step(Scene.of(posterior, optima, rng, [slice(320, 480)]))
+    (found,) = effects.step(ResidualAnalysis.of(posterior, optima, rng, [slice(320, 480)]))
     assert found.nats > LIMIT
     assert found.text.endswith(f"um at {time:g} s")
     assert found.fix.endswith(f"to end or begin at {time:g}")
@@ -207,7 +211,7 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(problem.posterior, rng).optima
-    small = Scene.of(problem.posterior, optima, rng, study=problem.study)
+    small = ResidualAnalysis.of(problem.posterior, optima, rng, study=problem.study)
     assert small.unexplained < LIMIT
     fitted: list[float] = []
     explain(small, fitted.append)
@@ -270,10 +274,12 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
     None gains by it. What does not move the drive's reversals loses nothing either.
     """
     nats = {}
-    monkeypatch.setattr("bwbayes.diagnosis.scene.READINGS", 500)
+    monkeypatch.setattr("bwbayes.diagnosis.residual_analysis.READINGS", 500)
     for stride in (4, 1):
         if stride == 1:
-            monkeypatch.setattr("bwbayes.diagnosis.scene.thinned", lambda whole, *_: whole)
+            monkeypatch.setattr(
+                "bwbayes.diagnosis.residual_analysis.thinned", lambda whole, *_: whole
+            )
         seen = scene(kind, 2, tmp_path)
         assert stride == seen.stride
         assert 500 == seen.posterior.only.readings.rows.size

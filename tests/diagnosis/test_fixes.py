@@ -22,7 +22,7 @@ from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.running.explaining import explained
 from bwbayes.diagnosis.explanations import likely_causes
-from bwbayes.diagnosis.scene import Explanation
+from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, bench
@@ -42,7 +42,7 @@ own_offset = false
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SamplingResult:
     """What came of a plant: its causes and the fix, then whether bands pass and the coverage."""
 
     causes: tuple[str, ...]
@@ -108,7 +108,7 @@ def followed(
     return parse(CONFIG, "config")
 
 
-def study(kind: str, seed: int, folder: Path) -> Outcome:
+def study(kind: str, seed: int, folder: Path) -> SamplingResult:
     """Fit a plant, follow the leading cause's fix, if there is one, and predict the next record."""
     put(bench(kind, (6, seed)).records, folder)
     config = parse(CONFIG, "config")
@@ -119,7 +119,7 @@ def study(kind: str, seed: int, folder: Path) -> Outcome:
     if found:
         config = followed(config, problem, found[0], kind, seed, folder)
     judged = judge(problem_of(config, folder), source, again=False)
-    return Outcome(
+    return SamplingResult(
         tuple(cause.kind for cause in found),
         bool({cause.kind for cause in found} & CAUSES.get(kind, set())),
         found[0].fix if found else "",

@@ -18,7 +18,7 @@ from bwbayes.diagnosis.identifiability import (
     spectrum,
     undetermined,
 )
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.record.teststand import VirtualTestStand
@@ -44,11 +44,11 @@ def measured(
     return posterior_of_record(record, FIXED)
 
 
-def at_truth(posterior: Posterior) -> PointFit:
+def at_truth(posterior: Posterior) -> MAPEstimate:
     columns = [posterior.prior.names.index(name) for name in posterior.names]
     mode = posterior.prior.unconstrain(truth(posterior)[:, columns])[0]
     unit = np.eye(mode.size)
-    return PointFit(mode, unit, 0.0, mode[np.newaxis], unit)
+    return MAPEstimate(mode, unit, 0.0, mode[np.newaxis], unit)
 
 
 def sine(amplitude: float, frequency: float, periods: float = 10.0) -> Waveform:

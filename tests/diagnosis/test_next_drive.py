@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import BandValidation
 from tests.diagnosis.plants import CAUSES, bench
 from tests.diagnosis.test_fixes import CONFIG, put
 from tests.measured import keep
@@ -21,7 +21,7 @@ from tests.prediction.runs import covered, judge, problem_of
 SEEDS, GOOD = range(5), 100
 
 
-def fitted(kind: str, seed: int, folder: Path) -> tuple[Verdict, float]:
+def fitted(kind: str, seed: int, folder: Path) -> tuple[BandValidation, float]:
     """Return the verdict on a plant's fit, and how much its bands cover of the next record."""
     put(bench(kind, (7, seed)).records, folder)
     source = np.random.default_rng((7, seed))

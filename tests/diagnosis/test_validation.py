@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import WORDS, cause
-from bwbayes.diagnosis.departures import Standardized
+from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.scene import Explanation
-from bwbayes.diagnosis.validation import Background, Verdict, assess
+from bwbayes.diagnosis.residual_analysis import Explanation
+from bwbayes.diagnosis.validation import BandValidation, ValidationContext, assess
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.bands import KINDS, Bands, LeadIn
 from bwbayes.record.io.grid import clock
@@ -35,13 +35,15 @@ def one_of(generator: np.random.Generator, *values: float) -> float:
     return float(generator.choice(values))
 
 
-def judged(bands: Bands, background: Background, beyond: Sequence[Finding] = ()) -> Verdict:
+def judged(
+    bands: Bands, background: ValidationContext, beyond: Sequence[Finding] = ()
+) -> BandValidation:
     verdict = assess(bands, background, beyond=beyond)
     assert verdict is not None
     return verdict
 
 
-def good(generator: np.random.Generator, number: int) -> Verdict:
+def good(generator: np.random.Generator, number: int) -> BandValidation:
     """Judge a record that its bands describe, of any length and memory."""
     length = one_of(generator, 5.0, 8.0, 14.0, 30.0, 60.0)
     memory = float(np.exp(generator.uniform(np.log(0.05), 0)))
@@ -49,7 +51,7 @@ def good(generator: np.random.Generator, number: int) -> Verdict:
     interval, sensor = one_of(generator, 0.005, 0.02), one_of(generator, 0.1, 0.3, 0.5)
     parameters = discrepancy * one_of(generator, 0.05, 0.3, 0.8)
     record = made(generator, length, interval, memory, discrepancy, sensor, parameters)
-    believed = Background(memory * one_of(generator, 0.8, 1.0, 1.5), 0.0, FITTED)
+    believed = ValidationContext(memory * one_of(generator, 0.8, 1.0, 1.5), 0.0, FITTED)
     return judged(bands_of(record, training=bool(number % 2)), believed)
 
 
@@ -88,7 +90,7 @@ def test_bands_of_any_shares_are_judged(
     # A quantile may round to either side of the sd of all.
     for common_sd in (sizes[0], share * kinds["parameter"][0], kinds["sensor"][0]):
         found = replace(bands, measured=measured, common_sd=float(common_sd))
-        standard = Standardized.of(found, memory, noise_log_sd)
+        standard = StandardizedResiduals.of(found, memory, noise_log_sd)
         for size in (standard.mean_size, standard.square_size, standard.varying_size):
             assert 1 - 1e-9 <= size <= readings * (1 + 1e-9)
         assert np.isfinite(standard.z).all()
@@ -100,7 +102,7 @@ def test_bands_of_any_shares_are_judged(
 def unsure_alarms(known: float, believed: float) -> int:
     """Count false alarms of 400 records whose noise the fit knows like so many readings would."""
     generator = np.random.default_rng(5)
-    background = Background(0.2, np.sqrt(1 / (2 * believed)), FITTED)
+    background = ValidationContext(0.2, np.sqrt(1 / (2 * believed)), FITTED)
     count = 0
     for _ in range(400):
         record = made(generator, 20.0, 0.02, 0.2, parameters=0.05)
@@ -165,7 +167,7 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
         spoilt = SPOILT[kind](generator, record, float(record.sds["sensor"].mean()))
         far = Finding("range", "100 V exceeds the training range", "train on more")
         beyond = [far] * (kind == "extrapolation")
-        verdict = judged(bands_of(record, spoilt), Background(memory, 0.0, FITTED), beyond)
+        verdict = judged(bands_of(record, spoilt), ValidationContext(memory, 0.0, FITTED), beyond)
         assert verdict.holds is False, number
         assert verdict.reasons
         assert verdict.cause is not None
@@ -188,7 +190,7 @@ def test_a_step_is_named_with_its_time_and_a_hum_with_its_source(
     record = made(np.random.default_rng(number), length=20.0, interval=0.005, sensor=0.1)
     sd = float(record.sds["sensor"].mean())
     row = round(along * record.time.size)
-    background = Background(record.memory, 0.0, FITTED)
+    background = ValidationContext(record.memory, 0.0, FITTED)
     shapes = {
         f"um at {clock(record.time[row], 0.005)} s": record.time >= record.time[row],
         f"(mains: {mains} Hz)": np.sin(2 * np.pi * mains * record.time),
@@ -205,7 +207,7 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
     for number in range(10):
         record = made(np.random.default_rng([8, number]), length=30)
         wide = replace(record, sds={kind: 3 * sd for kind, sd in record.sds.items()})
-        verdict = judged(bands_of(wide), Background(record.memory, 0.0, FITTED))
+        verdict = judged(bands_of(wide), ValidationContext(record.memory, 0.0, FITTED))
         assert verdict.holds is False
         assert "times too wide" in verdict.reasons[-1]
 
@@ -236,7 +238,7 @@ def test_a_few_readings_that_are_far_off_have_a_cause_too(readings: int) -> None
 
 def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     record = made(np.random.default_rng(1), length=3, memory=1.0)
-    verdict = judged(bands_of(record), Background(1.0, 0.0, FITTED))
+    verdict = judged(bands_of(record), ValidationContext(1.0, 0.0, FITTED))
     assert verdict.holds is None
     assert "is too small to validate the bands" in verdict.reasons[0]
     assert verdict.cause is None
@@ -250,7 +252,7 @@ def test_a_band_that_misses_most_of_a_short_record_fails() -> None:
     alarms, missed = 0, 0
     for number in range(20):
         record = made(np.random.default_rng([10, number]), length=3.0, memory=1.0)
-        background = Background(record.memory, 0.0, FITTED)
+        background = ValidationContext(record.memory, 0.0, FITTED)
         bands = bands_of(record, 3.5 * float(record.sds["sensor"].mean()))
         assert bands.measured is not None
         covered = np.mean(bands.covers("sensor", 95, bands.measured))
@@ -266,7 +268,7 @@ def test_a_band_wider_than_the_motion_decides_nothing() -> None:
     """Held out, a rest passes whatever the model does; what was fitted may rest."""
     record = made(np.random.default_rng(2), length=30)
     still = replace(record, mean=0.01 * record.mean)
-    background = Background(record.memory, 0.0, FITTED)
+    background = ValidationContext(record.memory, 0.0, FITTED)
     verdict = judged(bands_of(still), background)
     assert verdict.holds is None
     assert "is wider than the motion of" in verdict.reasons[0]
@@ -279,7 +281,7 @@ def test_a_band_many_times_wider_than_the_noise_is_noted(discrepancy: float, not
     record = made(
         np.random.default_rng(2), length=30, memory=0.1, discrepancy=discrepancy, parameters=0.01
     )
-    background = Background(record.memory, 0.0, FITTED)
+    background = ValidationContext(record.memory, 0.0, FITTED)
     verdict = judged(bands_of(record, training=True), background)
     assert verdict.holds is True
     assert noted == any("as wide as the sensor's noise alone" in note for note in verdict.notes)
@@ -290,7 +292,7 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
     """Where they fail it is the likely cause too."""
     record = made(np.random.default_rng(3), length=30)
     bands = replace(bands_of(record), scored_from=100)
-    background = Background(record.memory, 0.0, FITTED)
+    background = ValidationContext(record.memory, 0.0, FITTED)
     note = "the lead-in of 0 to 1 s does not fit the model (p < 0.001)"
     lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
     verdict = judged(replace(bands, lead_in=lead), background)
@@ -298,7 +300,7 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
     assert () == verdict.notes
     # Too short to tell, but covered: that it does not fit is not said either.
     few = made(np.random.default_rng(1), length=3, memory=1.0)
-    verdict = judged(replace(bands_of(few), lead_in=lead), Background(1.0, 0.0, FITTED))
+    verdict = judged(replace(bands_of(few), lead_in=lead), ValidationContext(1.0, 0.0, FITTED))
     assert verdict.holds is None
     assert () == verdict.notes
     assert bands.measured is not None
@@ -316,7 +318,7 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
 def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
     """Not three outliers, whatever their evidence is."""
     poor = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
-    background = Background(poor.memory, 0.0, FITTED)
+    background = ValidationContext(poor.memory, 0.0, FITTED)
     tails = Explanation("heavy tails", "outliers", "do", nats=900.0, rmse=(9.0, 8.9), foreign=True)
     creep = Explanation("creep", "creep", "do", nats=500.0, rmse=(9.0, 2.0))
     for explanations, kind in (
@@ -350,7 +352,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
         (poor, False, 0.0, True),
         (noisy, True, 0.0, True),
     ):
-        background = Background(record.memory, 0.0, FITTED, extent)
+        background = ValidationContext(record.memory, 0.0, FITTED, extent)
         verdict = judged(bands_of(record, training=training), background)
         assert verdict.holds is holds
         assert holds or "on the training readings" in verdict.reasons[0]
@@ -379,7 +381,7 @@ def test_no_fit_passes_while_a_better_model_is_known(
     """However well its bands cover. Twins: one that chance may find, and noise of another kind."""
     record = made(np.random.default_rng(1), length=30)
     noisy = Explanation("noise by voltage", "noise", "do", nats=900.0, noise=True)
-    background = Background(record.memory, 0.0, FITTED)
+    background = ValidationContext(record.memory, 0.0, FITTED)
     verdict = assess(bands_of(record, training=True), background, explanations=[noisy, explanation])
     assert verdict is not None
     assert verdict.holds is (True if said is None else None)
@@ -393,7 +395,7 @@ def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
     slow = Explanation("sensor lag", "a slow sensor", "set it", nats=22.0, spec=ModelSpec())
     verdict = assess(
         bands_of(record, training=True),
-        Background(record.memory, 0.0, FITTED),
+        ValidationContext(record.memory, 0.0, FITTED),
         explanations=[slow, late],
     )
     assert verdict is not None
@@ -416,7 +418,7 @@ def test_a_few_outliers_are_no_cause_of_an_error_everywhere(size: float) -> None
         sd = float(record.sds["sensor"].mean())
         spoilt = scale * sd * process(record.time.size, 0.01 / 1.5, rng)
         spoilt[rng.choice(record.time.size, 6, replace=False)] += 8 * max(scale, 5.0) * sd
-        cause = judged(bands_of(record, spoilt), Background(0.1, 0.0, FITTED)).cause
+        cause = judged(bands_of(record, spoilt), ValidationContext(0.1, 0.0, FITTED)).cause
         assert cause is not None
         named[scale] += "outliers" in cause.kind.split(" or ")
     assert named == {0.0: 10, size: 0}

@@ -161,7 +161,7 @@ def test_what_is_rehearsed_simulates_and_whitens_but_needs_no_products(
     """Another process does it, in which an error would not be seen."""
     posterior = replace(of_operator(name), engine="numba")
     monkeypatch.setattr(compiled.kernels, "sums", None)
-    compiled.rehearse(posterior)
+    compiled.warm_up(posterior)
 
 
 @pytest.mark.slow

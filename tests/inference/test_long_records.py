@@ -12,14 +12,14 @@ from dataclasses import replace
 import numpy as np
 from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import pilot_moves
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from tests.inference.problems import short_posterior
 
 posterior = replace(short_posterior(samples={samples}, dynamics="lag"), engine="{engine}")
 generator = np.random.default_rng(1)
 place = np.median(posterior.prior.unconstrain(posterior.prior.draw(generator, 500)), axis=0)
 nearby = 1e-6 * np.eye(place.size)
-point = PointFit(place, nearby, 0.0, place[np.newaxis], nearby)
+point = MAPEstimate(place, nearby, 0.0, place[np.newaxis], nearby)
 begin = start(posterior, point, 0, 64, generator)
 (block,) = advance(posterior, [begin], [pilot_moves()], 1)
 assert np.isfinite(block.log_density).all()

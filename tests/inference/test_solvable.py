@@ -23,7 +23,7 @@ from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.linear import CASES, Linear, Normal, every_case
 from tests.sampled import converged
 
-PLAN = SamplingPlan(ess=4000, ensembles=16, walkers=12, block=25, least_pilot_steps=100)
+PLAN = SamplingPlan(ess=4000, ensembles=16, walkers=12, block=25, min_pilot_steps=100)
 ALARM = 6.0
 LEVELS = (0.05, 0.5, 0.95)
 

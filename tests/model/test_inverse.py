@@ -168,11 +168,11 @@ def test_a_spring_that_swings_slowly_is_undone(hold: Hold) -> None:
     theta = theta_of(actuator, mass=100.0, damping=300.0)
     voltage = assert_returned(actuator, theta, smooth(2000))
     assert np.max(np.abs(voltage)) < 120.0
-    with_creep = replace(actuator, creep=Creep((0.1, 1.0), reference=SPAN))
+    add_prior_creep = replace(actuator, creep=Creep((0.1, 1.0), reference=SPAN))
     if hold == "first":
-        theta = theta_of(with_creep, mass=100.0, damping=300.0)
+        theta = theta_of(add_prior_creep, mass=100.0, damping=300.0)
         with pytest.raises(InputError, match=r"creep of 0\.05 of the drive cannot be undone"):
-            inverse(with_creep, theta, smooth(2000))
+            inverse(add_prior_creep, theta, smooth(2000))
 
 
 def test_a_displacement_that_begins_in_motion_is_missed_at_its_beginning_alone() -> None:

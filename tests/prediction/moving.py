@@ -19,7 +19,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, STAGES, made
 from bwbayes.prediction.bands import KINDS, Bands, Kind
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
@@ -110,7 +110,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
 
 def predicted(case: Case, posterior: Posterior, record: Record, seed: int) -> Bands:
     """Predict a record with draws that are all the truth."""
-    start = Start(case.from_rest, lead_in=case.lead_in)
+    start = InitialConditions(case.from_rest, lead_in=case.lead_in)
     draws = np.zeros((DRAWS, posterior.prior.dimensions))
     return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
 

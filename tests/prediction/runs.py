@@ -20,9 +20,9 @@ from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, explained
 from bwbayes.app.running.predictions import validate_predictions
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import Background, Verdict
+from bwbayes.diagnosis.validation import BandValidation, ValidationContext
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import predict_record, predict_windows
@@ -43,7 +43,7 @@ class Judged:
     problem: Problem
     draws: FloatArray
     bands: Mapping[str, Bands]
-    verdicts: Mapping[str, Verdict]
+    verdicts: Mapping[str, BandValidation]
 
     def column(self, name: str) -> FloatArray:
         """Return the draws of one parameter."""
@@ -64,7 +64,7 @@ def problem_of(config: str | Config, folder: Path) -> Problem:
 
 def posterior_draws(
     posterior: Posterior, source: np.random.Generator
-) -> tuple[PointFit, FloatArray]:
+) -> tuple[MAPEstimate, FloatArray]:
     """Fit, and draw (KEPT, free) in the parameters' own units."""
     point = pointfit.fit(posterior, source)
     draws, weights = weighted_draws(posterior, source, point)
@@ -72,7 +72,7 @@ def posterior_draws(
 
 
 def weighted_draws(
-    posterior: Posterior, source: np.random.Generator, point: PointFit | None = None
+    posterior: Posterior, source: np.random.Generator, point: MAPEstimate | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return draws (draws, free) in the parameters' own units and weights (draws,)."""
     if point is None:
@@ -131,7 +131,7 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
-    background = Background.of(posterior, draws)
+    background = ValidationContext.of(posterior, draws)
     verdicts = validate_predictions(problem, bands, background, {})
     if again:
         places = posterior.prior.unconstrain(best[np.newaxis])

@@ -15,7 +15,7 @@ from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
@@ -87,7 +87,7 @@ def test_another_record_is_forecast_from_its_lead_in(from_rest: bool, own_offset
             posterior,
             draws,
             other,
-            Start(from_rest, own_offset, lead_in, after=after),
+            InitialConditions(from_rest, own_offset, lead_in, after=after),
             np.random.default_rng(3),
         )
         for after in (True, False)

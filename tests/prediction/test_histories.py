@@ -14,7 +14,7 @@ import pytest
 from bwbayes.model.operator import Span
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import choose_histories
-from bwbayes.prediction.initial_state import Start, estimate_initial_states
+from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests.prediction.moving import RATE, Case, posterior_of_case
@@ -38,7 +38,7 @@ def record_after(reach: float) -> Record:
 @pytest.mark.parametrize("reach", [30.0, 60.0])
 def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: float) -> None:
     record = record_after(reach)
-    start = Start(lead_in=1.0)
+    start = InitialConditions(lead_in=1.0)
     begun = estimate_initial_states(POSTERIOR, DRAWS, record, start, np.random.default_rng(2))
     spans = [likelihood.actuator.span for likelihood in begun.histories.likelihoods]
     drawn = np.array([spans[k] for k in begun.histories.which])
@@ -51,7 +51,9 @@ def test_a_lead_in_that_goes_beyond_earlier_drives_tells_their_reach(reach: floa
 def test_a_planned_voltage_has_any_history() -> None:
     planned = replace(record_after(30.0), displacement=None)
     draws = POSTERIOR.prior.theta(np.empty((500, 0)))
-    begun = estimate_initial_states(POSTERIOR, draws, planned, Start(), np.random.default_rng(2))
+    begun = estimate_initial_states(
+        POSTERIOR, draws, planned, InitialConditions(), np.random.default_rng(2)
+    )
     histories = begun.histories
     counts = np.bincount(histories.which, minlength=len(histories.likelihoods))
     assert np.max(np.abs(counts - 500 / len(counts))) < 2
@@ -60,22 +62,24 @@ def test_a_planned_voltage_has_any_history() -> None:
 def test_every_draw_is_simulated_with_its_own_history() -> None:
     """In pieces as at once, and as one draw alone."""
     planned = replace(record_after(30.0), displacement=None)
-    begun = estimate_initial_states(POSTERIOR, DRAWS, planned, Start(), np.random.default_rng(3))
+    begun = estimate_initial_states(
+        POSTERIOR, DRAWS, planned, InitialConditions(), np.random.default_rng(3)
+    )
     whole = begun.displacement(planned.voltage)
     pieces = np.hstack([*begun.pieces(planned.voltage, 77)])
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
     for row in (0, 7, 39):
         actuator = begun.histories.likelihoods[begun.histories.which[row]].actuator
-        one = actuator.advance(begun.model[[row]], planned.voltage, unrest=begun.unrest[[row]])[0][
-            0
-        ]
+        one = actuator.advance(
+            begun.model[[row]], planned.voltage, initial_transient=begun.initial_transient[[row]]
+        )[0][0]
         np.testing.assert_allclose(whole[row], one, atol=1e-9)
 
 
 def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
     """As often as 4,001 states of each say, within four standard errors."""
     record = record_after(60.0)
-    start = Start(lead_in=0.05)
+    start = InitialConditions(lead_in=0.05)
     draws = POSTERIOR.prior.theta(np.empty((2000, 0)))
     spans = [Span(-40.0, 40.0), Span(-60.0, 60.0), Span(-95.0, 95.0)]
     window = start.window(record)
@@ -124,7 +128,7 @@ def level_error(seed: int) -> tuple[float, float]:
     moved = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     voltage, moved = voltage[12 * second :], moved[12 * second :]
     record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), 1 / RATE)
-    start = Start(own_offset=False, lead_in=0.6)
+    start = InitialConditions(own_offset=False, lead_in=0.6)
     bands = predict_record(POSTERIOR, np.empty((100, 0)), record, start, rng)
     error = np.mean((moved - bands.mean)[bands.scored_from :])
     assert record.displacement is not None
@@ -156,7 +160,7 @@ def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
         theta[draw, column] *= 0.4
         theta[draw, names.index("d")] = np.sum(theta[draw, elements])
     voltage = 60 * np.sin(2 * np.pi * np.arange(int(4 * RATE)) / RATE)
-    start = Start(own_offset=False, lead_in=0.6)
+    start = InitialConditions(own_offset=False, lead_in=0.6)
     record = Record(voltage, 0.5 * voltage, 1 / RATE)
     begun = estimate_initial_states(posterior, theta, record, start, np.random.default_rng(1))
     assert (begun.offset_sd > 0).all()

@@ -13,7 +13,7 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.prediction.loops import (
-    Traced,
+    TracedLoop,
     initial_curve,
     measure_loops,
     measures,
@@ -32,7 +32,7 @@ def columns(actuator: Actuator, **known: float) -> dict[str, FloatArray]:
     return {name: np.array([known.get(name, 0.0)]) for name in actuator.parameters}
 
 
-def measured(loop: Traced) -> dict[str, float]:
+def measured(loop: TracedLoop) -> dict[str, float]:
     every = {name: values for name, values in measures(loop).items() if values is not None}
     return {name: float(values[0]) for name, values in every.items()}
 

@@ -35,7 +35,7 @@ from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import LEVELS, Bands
-from bwbayes.prediction.initial_state import Start, estimate_initial_states
+from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
 from tests.measured import keep
 from tests.prediction.moving import (
     RATE,
@@ -147,7 +147,7 @@ def test_lead_ins_that_do_not_fit_are_found() -> None:
         assert reading is not None
         added = np.minimum(time, 1.0), np.exp(-time / 0.38), time > 0.5
         for spoilt in (1.3 * reading, *(reading + 20 * one for one in added)):
-            other, start = replace(record, displacement=spoilt), Start(lead_in=1.0)
+            other, start = replace(record, displacement=spoilt), InitialConditions(lead_in=1.0)
             begun = estimate_initial_states(
                 posterior, theta, other, start, np.random.default_rng(number)
             )

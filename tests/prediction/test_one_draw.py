@@ -18,7 +18,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth
@@ -114,7 +114,7 @@ def test_a_lead_in_tells_the_offset_as_the_dense_matrix_does(
 ) -> None:
     """Mean and variance, at the record's own interval; and all bands have that variance."""
     record = another(posterior, interval)
-    start = Start(from_rest=True, lead_in=LEAD_IN)
+    start = InitialConditions(from_rest=True, lead_in=LEAD_IN)
     bands = predict_record(posterior, draw, record, start, np.random.default_rng(1))
     offset, sd = offset_of_lead_in(posterior, record)
     mean = simulated(posterior, record.voltage, interval) + offset
@@ -166,7 +166,7 @@ def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     assert 0.9 * top < sign * left < top
     held = Record(np.full(60, sign * 100.0), None, INTERVAL)
     bands = predict_record(
-        posterior, np.repeat(draw, 400, axis=0), held, Start(), np.random.default_rng(5)
+        posterior, np.repeat(draw, 400, axis=0), held, InitialConditions(), np.random.default_rng(5)
     )
     # Late, when the dynamics have settled; h stays as the voltage does.
     h = named["d"] * held.voltage[-1] + named["offset"] - bands.mean[-1]

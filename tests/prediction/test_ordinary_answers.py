@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.record import write_record
 from tests.measured import keep
 from tests.prediction.runs import judge, problem_of
@@ -35,7 +35,7 @@ def drive(generator: np.random.Generator, seconds: float) -> FloatArray:
     return voltage
 
 
-def answers(seed: int, folder: Path, gain: float = 1.0) -> dict[str, Verdict]:
+def answers(seed: int, folder: Path, gain: float = 1.0) -> dict[str, BandValidation]:
     """Record the stand, and once more in motion; fit the first and predict the other.
 
     The other has so many times the displacement.

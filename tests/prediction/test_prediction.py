@@ -12,7 +12,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import Bands, Kind
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of
@@ -64,7 +64,7 @@ def draws(posterior: Posterior) -> FloatArray:
 
 
 def predicted(
-    posterior: Posterior, draws: FloatArray, record: Record, start: Start, seed: int = 3
+    posterior: Posterior, draws: FloatArray, record: Record, start: InitialConditions, seed: int = 3
 ) -> Bands:
     return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
 
@@ -88,9 +88,9 @@ def test_a_window_is_the_same_part_of_the_whole_record(
 def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray) -> None:
     """A command acts when it is held, whatever the training record's voltage was."""
     planned = replace(made(), displacement=None)
-    output = predicted(posterior, draws, planned, Start(from_rest=True))
+    output = predicted(posterior, draws, planned, InitialConditions(from_rest=True))
     command = predicted(
-        posterior, draws, replace(planned, voltage_is="command"), Start(from_rest=True)
+        posterior, draws, replace(planned, voltage_is="command"), InitialConditions(from_rest=True)
     )
     theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
     theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
@@ -101,14 +101,14 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
         posterior,
         draws,
         replace(planned, voltage_is="command"),
-        Start(from_rest=True, hold="first"),
+        InitialConditions(from_rest=True, hold="first"),
     )
     np.testing.assert_allclose(output.mean, given.mean, rtol=1e-9)
 
 
 def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
     planned = replace(made(start=1.2), displacement=None)
-    bands = predicted(posterior, draws, planned, Start(from_rest=True))
+    bands = predicted(posterior, draws, planned, InitialConditions(from_rest=True))
     theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
     theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
     path = np.concatenate([[0.0], np.full(3000, planned.voltage[0]), planned.voltage])
@@ -120,9 +120,14 @@ def test_a_window_of_another_record_is_that_part_of_the_whole(
     posterior: Posterior, draws: FloatArray
 ) -> None:
     record = made(start=0.4)
-    whole = predicted(posterior, draws, record, Start(lead_in=1.0))
+    whole = predicted(posterior, draws, record, InitialConditions(lead_in=1.0))
     part = predict_record(
-        posterior, draws, record, Start(lead_in=1.0), np.random.default_rng(3), window=(3.0, 7.0)
+        posterior,
+        draws,
+        record,
+        InitialConditions(lead_in=1.0),
+        np.random.default_rng(3),
+        window=(3.0, 7.0),
     )
     assert (100, 0) == (whole.scored_from, part.scored_from)
     for (name, expected), (_, got) in zip(whole.columns(), part.columns(), strict=True):
@@ -132,7 +137,7 @@ def test_a_window_of_another_record_is_that_part_of_the_whole(
             posterior,
             draws,
             record,
-            Start(lead_in=1.0),
+            InitialConditions(lead_in=1.0),
             np.random.default_rng(3),
             window=(0.0, 0.5),
         )
@@ -145,7 +150,7 @@ def test_missing_readings_are_not_judged_and_bands_go_on(
     assert record.displacement is not None
     reading = record.displacement.copy()
     reading[::7] = np.nan
-    bands = predicted(posterior, draws, replace(record, displacement=reading), Start())
+    bands = predicted(posterior, draws, replace(record, displacement=reading), InitialConditions())
     assert bands.pit is not None
     assert bands.crps is not None
     np.testing.assert_array_equal(np.isnan(reading), np.isnan(bands.pit))
@@ -158,4 +163,4 @@ def test_a_lead_in_that_leaves_nothing_is_refused(
     posterior: Posterior, draws: FloatArray, lead_in: float
 ) -> None:
     with pytest.raises(InputError, match="lead-in"):
-        predicted(posterior, draws, made(), Start(lead_in=lead_in))
+        predicted(posterior, draws, made(), InitialConditions(lead_in=lead_in))

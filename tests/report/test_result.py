@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import Verdict
+from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
 from bwbayes.report.result import RENAMED, summary
@@ -57,7 +57,7 @@ def test_the_means_error_is_that_of_a_known_process() -> None:
 @pytest.mark.parametrize("holds", [True, False, None])
 def test_drives_are_validated_only_where_all_bands_passed(holds: bool | None) -> None:
     run = replace(example.run(), facts={"drive": "0 to 95 V"})
-    verdict = Verdict("verification", training=False, holds=holds)
+    verdict = BandValidation("verification", training=False, holds=holds)
     validated = summary(replace(run, verdicts={"verification": verdict}))["validated_drives"]
     assert validated == ("0 to 95 V" if holds else None)
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.sampling.chain import PHASES, Block, Chain, EnsembleState, Phase
-from bwbayes.sampling.curvature import QuadraticMap, SkewMap, TotalMap
+from bwbayes.sampling.curvature import QuadraticMap, SkewMap, TotalRatioMap
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.storage import ChainFile
 
@@ -59,7 +59,7 @@ def proposal(phase: Phase) -> StudentMixture:
         return StudentMixture(weights, centers, factors)
     bends, scales = np.zeros((FREE * (FREE + 1) // 2, FREE)), np.zeros((FREE, FREE))
     bends[0, 1], scales[0, 1] = generator.standard_normal(2)
-    totals = TotalMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
+    totals = TotalRatioMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
     skew = SkewMap(centers[1], np.exp(centers[2]), np.full(FREE, 0.8))
     bend = QuadraticMap(centers[0], factors[0], bends, scales)
     return StudentMixture(weights, centers, factors, (totals, skew, bend))
@@ -68,7 +68,7 @@ def proposal(phase: Phase) -> StudentMixture:
 def new(path: Path) -> ChainFile:
     generator = np.random.default_rng(0)
     mode = generator.standard_normal(FREE)
-    point = PointFit(mode, np.eye(FREE), -3.5, np.stack([mode, -mode]), 4 * np.eye(FREE))
+    point = MAPEstimate(mode, np.eye(FREE), -3.5, np.stack([mode, -mode]), 4 * np.eye(FREE))
     chain = Chain([state(generator) for _ in range(ENSEMBLES)])
     chain.freeze("pilot", proposal("pilot"))
     return ChainFile.create(path, chain, point, STEPS, ATTRIBUTES)

@@ -8,39 +8,39 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import Chain, Phase
-from bwbayes.sampling.diagnostics import Check, Outcome
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import Watcher, first_chain, sample
+from bwbayes.sampling.sampler import ProgressCallback, init_chain, sample
 from tests.sampling.targets import gaussian
 
 PLAN = SamplingPlan(
     ess=400,
     walkers=12,
     block=20,
-    least_pilot_steps=100,
-    most_pilot_steps=400,
-    most_steps=1000,
+    min_pilot_steps=100,
+    max_pilot_steps=400,
+    max_steps=1000,
 )
-LONG = replace(PLAN, most_steps=4_000)
+LONG = replace(PLAN, max_steps=4_000)
 POSTERIOR, POINT = gaussian(3)
 
 
 def new_chain(plan: SamplingPlan = PLAN) -> Chain:
-    return first_chain(POSTERIOR, POINT, plan, np.random.default_rng(1))
+    return init_chain(POSTERIOR, POINT, plan, np.random.default_rng(1))
 
 
 def run(
     plan: SamplingPlan = PLAN,
     seed: int = 1,
     posterior: Posterior = POSTERIOR,
-    point: PointFit = POINT,
-    watcher: Watcher = lambda *_: None,
-) -> tuple[Chain, Outcome]:
+    point: MAPEstimate = POINT,
+    watcher: ProgressCallback = lambda *_: None,
+) -> tuple[Chain, SamplingResult]:
     """Sample a target to its end."""
-    chain = first_chain(posterior, point, plan, np.random.default_rng(seed))
+    chain = init_chain(posterior, point, plan, np.random.default_rng(seed))
     with ThreadPoolExecutor(1) as executor:
         return chain, sample(posterior, plan, chain, executor, watcher)
 
@@ -50,9 +50,9 @@ class Watched:
 
     def __init__(self) -> None:
         self.blocks: list[Phase] = []
-        self.checks: list[Check] = []
+        self.checks: list[ConvergenceDiagnostics] = []
 
-    def __call__(self, phase: Phase, result: Check | None) -> None:
+    def __call__(self, phase: Phase, result: ConvergenceDiagnostics | None) -> None:
         """Hear of a block, or of a check."""
         if result is None:
             self.blocks.append(phase)

@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.ensemble import advance, start
@@ -66,12 +66,12 @@ def target(log_density: Callable[[FloatArray], FloatArray], free: int) -> Poster
     return cast(Posterior, Target(log_density, Unchanged(free)))
 
 
-def gaussian(free: int, correlation: float = 0.5) -> tuple[Posterior, PointFit]:
+def gaussian(free: int, correlation: float = 0.5) -> tuple[Posterior, MAPEstimate]:
     """Return a Gaussian target of unit variances and equal correlations, and its point fit."""
     covariance = np.full((free, free), correlation) + (1 - correlation) * np.eye(free)
     posterior = target(Gaussian(np.linalg.inv(covariance)), free)
     mode = np.zeros(free)
-    return posterior, PointFit(mode, covariance, 0.0, mode[np.newaxis], 25 * np.eye(free))
+    return posterior, MAPEstimate(mode, covariance, 0.0, mode[np.newaxis], 25 * np.eye(free))
 
 
 @dataclass(frozen=True)

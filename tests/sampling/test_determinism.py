@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from bwbayes.sampling.chain import PHASES, Phase
-from bwbayes.sampling.diagnostics import Check, Outcome
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile
 from tests.forks import FORKS
 from tests.sampling.chains import arrays, assert_same
@@ -27,7 +27,7 @@ from tests.sampling.targets import gaussian
 
 POSTERIOR, POINT = gaussian(2)
 PLAN = SamplingPlan(
-    ess=200, walkers=8, block=10, least_pilot_steps=40, most_pilot_steps=200, most_steps=500
+    ess=200, walkers=8, block=10, min_pilot_steps=40, max_pilot_steps=200, max_steps=500
 )
 PIECES = 5
 
@@ -42,7 +42,7 @@ class Stopper:
     def __init__(self, blocks: int) -> None:
         self.left = blocks
 
-    def __call__(self, _: Phase, result: Check | None) -> None:
+    def __call__(self, _: Phase, result: ConvergenceDiagnostics | None) -> None:
         """Hear of a block, or of a check."""
         if result is None:
             self.left -= 1
@@ -51,17 +51,17 @@ class Stopper:
 
 
 def begin(path: Path, seed: int = 1) -> None:
-    chain = first_chain(POSTERIOR, POINT, PLAN, np.random.default_rng(seed))
+    chain = init_chain(POSTERIOR, POINT, PLAN, np.random.default_rng(seed))
     ChainFile.create(path, chain, POINT, PLAN.block, {})
 
 
-def go_on(path: Path, executor: Executor, blocks: int = 0, per_task: int = 1) -> Outcome:
+def go_on(path: Path, executor: Executor, blocks: int = 0, per_task: int = 1) -> SamplingResult:
     plan = replace(PLAN, ensembles_per_task=per_task)
     return sample(POSTERIOR, plan, ChainFile.resume(path), executor, Stopper(blocks))
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Outcome]:
+def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], SamplingResult]:
     path = tmp_path_factory.mktemp("straight") / "chain"
     begin(path)
     with ThreadPoolExecutor(1) as executor:
@@ -78,7 +78,9 @@ def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
         yield pool
 
 
-def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any], Outcome]) -> None:
+def assert_same_end(
+    path: Path, outcome: SamplingResult, expected: tuple[dict[str, Any], SamplingResult]
+) -> None:
     assert_same(expected[0], arrays(ChainFile.read(path)))
     assert (expected[1].converged, expected[1].stop_reason) == (
         outcome.converged,
@@ -94,7 +96,7 @@ def assert_same_end(path: Path, outcome: Outcome, expected: tuple[dict[str, Any]
 def test_straight(
     tmp_path: Path,
     executor: Executor,
-    expected: tuple[dict[str, Any], Outcome],
+    expected: tuple[dict[str, Any], SamplingResult],
     per_task: int,
 ) -> None:
     begin(tmp_path / "chain")
@@ -103,7 +105,7 @@ def test_straight(
 
 
 def test_in_five_pieces(
-    tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], Outcome]
+    tmp_path: Path, executor: Executor, expected: tuple[dict[str, Any], SamplingResult]
 ) -> None:
     path = tmp_path / "chain"
     begin(path)

@@ -13,7 +13,7 @@ from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling.diagnostics import (
-    Check,
+    ConvergenceDiagnostics,
     as_chains,
     check,
     effective_draws,
@@ -24,7 +24,7 @@ from tests.sampling.targets import student
 from tests.stand import autoregressive
 
 ENOUGH = np.full(2, 3e3)
-GOOD = Check(1000, np.ones(2), ENOUGH, ENOUGH, ENOUGH, np.full(2, 4.0), 0.4, 0)
+GOOD = ConvergenceDiagnostics(1000, np.ones(2), ENOUGH, ENOUGH, ENOUGH, np.full(2, 4.0), 0.4, 0)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.9, 0.98])
@@ -63,7 +63,7 @@ def test_what_is_not_finite_anywhere_never_counts_as_converged(
 ) -> None:
     draws = autoregressive(0.5, 600, (4, 16, 2), np.random.default_rng(1))
     draws[where] = value
-    assert [] != check(draws, np.full((12, 4, 16), 20), 50).shortcomings(1000)
+    assert [] != check(draws, np.full((12, 4, 16), 20), 50).failures(1000)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_what_is_not_finite_anywhere_never_counts_as_converged(
     ],
 )
 def test_each_shortcoming_is_told(change: dict[str, FloatArray | float], says: str) -> None:
-    assert [says] == replace(GOOD, **change).shortcomings(2000)  # type: ignore[arg-type]
+    assert [says] == replace(GOOD, **change).failures(2000)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("variance", [0.3, 0.5, 0.8])

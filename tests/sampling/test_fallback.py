@@ -17,7 +17,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Chain, draws
-from bwbayes.sampling.diagnostics import Outcome
+from bwbayes.sampling.diagnostics import SamplingResult
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import FIRST_CHECK, sample
 from tests.sampling.chains import arrays, assert_same
@@ -60,28 +60,28 @@ def plant_every(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(StudentMixture, "fitted", narrow)
 
 
-def planted(planting: Planting) -> tuple[Chain, Outcome]:
+def planted(planting: Planting) -> tuple[Chain, SamplingResult]:
     with pytest.MonkeyPatch.context() as patch:
         planting(patch)
         return run(LONG)
 
 
 @pytest.fixture(scope="module")
-def refitted() -> tuple[Chain, Outcome]:
+def refitted() -> tuple[Chain, SamplingResult]:
     return planted(plant_first)
 
 
 @pytest.fixture(scope="module")
-def fallen_back() -> tuple[Chain, Outcome]:
+def fallen_back() -> tuple[Chain, SamplingResult]:
     return planted(plant_every)
 
 
 def test_proposals_that_do_not_cover_their_draws_are_given_up(
-    fallen_back: tuple[Chain, Outcome],
+    fallen_back: tuple[Chain, SamplingResult],
 ) -> None:
     """In half of the budget; what they drew does not count, and what counts they did not."""
     chain, outcome = fallen_back
-    half = LONG.most_steps / 2 / LONG.block
+    half = LONG.max_steps / 2 / LONG.block
     assert half < chain.set_aside
     assert chain.set_aside < 1.5 * half
     assert chain.proposals["sampling"] is not None
@@ -156,7 +156,7 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
     def tuned(sampling: sampler._Sampling) -> None:
         tuned_to_a_narrow_one(sampling, 0.66)
 
-    def samplings() -> list[tuple[Chain, Outcome]]:
+    def samplings() -> list[tuple[Chain, SamplingResult]]:
         return [run(LONG, seed) for seed in range(1, 6)]
 
     monkeypatch.setattr(sampler._Sampling, "_tune", tuned)
@@ -166,6 +166,6 @@ def test_draws_that_lag_behind_what_was_predicted_are_set_aside(
         assert 0 < chain.set_aside
         assert chain.refit is not None
         assert () == outcome.remarks
-    monkeypatch.setattr(sampler, "LARGEST_SLOWDOWN", np.inf)
+    monkeypatch.setattr(sampler, "MAX_SLOWDOWN", np.inf)
     fast, slow = (sum(len(c.history("sampling")) for c, _ in x) for x in (first, samplings()))
     assert 2 * fast < slow

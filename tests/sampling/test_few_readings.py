@@ -16,7 +16,7 @@ import scipy
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import choose
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.sampling.plan import SamplingPlan
@@ -51,7 +51,7 @@ def without_discrepancy(posterior: Posterior, coordinates: FloatArray) -> BoolAr
     return np.asarray(free[:, column] < 0.02).reshape(coordinates.shape[:-1])
 
 
-def share_by_weights(posterior: Posterior, point: PointFit) -> tuple[float, float]:
+def share_by_weights(posterior: Posterior, point: MAPEstimate) -> tuple[float, float]:
     """Return the share of the mode without a discrepancy by importance sampling, and its error."""
     around = StudentMixture.around(point.optima, *map_estimate.mode_weights(posterior, point))
     # Twice as wide as the modes: what is between them is reached too.

@@ -21,17 +21,17 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.sampling import sampler
 from bwbayes.sampling.chain import Phase
-from bwbayes.sampling.diagnostics import Check, check
+from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, check
 from bwbayes.sampling.plan import SamplingPlan
 from tests.sampling.hard_chains import BLOCK, HARD, good, hard, moved
 from tests.sampling.samplings import run
 from tests.sampling.targets import TARGETS, gaussian, target
 
 PLAN = SamplingPlan(
-    ess=200, walkers=12, block=25, least_pilot_steps=50, most_pilot_steps=200, most_steps=400
+    ess=200, walkers=12, block=25, min_pilot_steps=50, max_pilot_steps=200, max_steps=400
 )
 
 
@@ -42,22 +42,22 @@ PLAN = SamplingPlan(
 def test_hard_chain_never_passes(name: str) -> None:
     for seed in range(2):
         draws = hard(name, np.random.default_rng(seed))
-        assert [] != check(draws, moved(draws), BLOCK).shortcomings(1), seed
+        assert [] != check(draws, moved(draws), BLOCK).failures(1), seed
 
 
 def test_twin_good_chain_passes_with_a_much_larger_target() -> None:
     for seed in range(10):
         draws = good(np.random.default_rng(seed))
-        assert [] == check(draws, moved(draws), BLOCK).shortcomings(1000), seed
+        assert [] == check(draws, moved(draws), BLOCK).failures(1000), seed
 
 
 # Targets
 
 
-def point_at(*optima: list[float], width: float = 1.0) -> PointFit:
+def point_at(*optima: list[float], width: float = 1.0) -> MAPEstimate:
     places = np.array(optima)
     covariance = width**2 * np.eye(places.shape[1])
-    return PointFit(places[0], covariance, 0.0, places, 25 * covariance)
+    return MAPEstimate(places[0], covariance, 0.0, places, 25 * covariance)
 
 
 def two_far_modes(x: FloatArray) -> FloatArray:
@@ -113,12 +113,12 @@ def test_hard_target_never_converges(name: str) -> None:
     density, point = HARD_TARGETS[name]
     _, outcome = run(PLAN, 1, target(density, 2), point)
     assert not outcome.converged
-    assert re.match(f"step limit {PLAN.most_steps} (reached|out of reach): ", outcome.stop_reason)
+    assert re.match(f"step limit {PLAN.max_steps} (reached|out of reach): ", outcome.stop_reason)
 
 
 def test_far_modes_converge_to_their_weights() -> None:
     """The proposal is fitted to both, so that walkers change between them."""
-    chain, outcome = run(replace(PLAN, most_steps=4000), 2, target(two_far_modes, 2), MODES)
+    chain, outcome = run(replace(PLAN, max_steps=4000), 2, target(two_far_modes, 2), MODES)
     assert outcome.converged
     share = np.mean(chain.coordinates("sampling")[..., 0] > 0)
     error = np.sqrt(0.8 * 0.2 / np.min(outcome.check.ess_bulk))
@@ -142,23 +142,23 @@ def thin_rings(x: FloatArray) -> FloatArray:
     return density
 
 
-def interrupt(_: Phase, check: Check | None) -> None:
+def interrupt(_: Phase, check: ConvergenceDiagnostics | None) -> None:
     if check is None:  # there is one more block
         raise KeyboardInterrupt
 
 
 def test_budget_that_is_out_of_reach_is_not_used_up() -> None:
     """It is known after a tenth; going on ends at once, and with a budget that may do goes on."""
-    plan, posterior = replace(PLAN, most_steps=8000), target(thin_rings, 2)
+    plan, posterior = replace(PLAN, max_steps=8000), target(thin_rings, 2)
     chain, outcome = run(plan, 2, posterior, point_at([0.0, 0.0]))
     assert not outcome.converged
     assert outcome.stop_reason.startswith("step limit 8000 out of reach: about ")
     steps = chain.steps("sampling")
-    assert steps + chain.set_aside * plan.block < 0.3 * plan.most_steps
+    assert steps + chain.set_aside * plan.block < 0.3 * plan.max_steps
     with ThreadPoolExecutor(1) as pool:
         again = sampler.sample(posterior, plan, chain, pool)
         assert again.stop_reason == outcome.stop_reason
-        longer = replace(plan, most_steps=int(outcome.check.steps_needed))
+        longer = replace(plan, max_steps=int(outcome.check.steps_needed))
         with pytest.raises(KeyboardInterrupt):
             sampler.sample(posterior, longer, chain, pool, interrupt)
 
@@ -177,7 +177,7 @@ GOOD = {
 @pytest.mark.parametrize("name", GOOD)
 def test_good_run_converges(name: str, block: int, one_in: int) -> None:
     (posterior, point), runs = GOOD[name]
-    plan = replace(PLAN, block=block, most_steps=1500)
+    plan = replace(PLAN, block=block, max_steps=1500)
     for seed in range(runs // 2 // one_in):
         _, outcome = run(plan, seed, posterior, point)
         assert outcome.converged, (seed, outcome.stop_reason)

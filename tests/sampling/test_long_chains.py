@@ -26,19 +26,19 @@ from bwbayes.sampling.storage import ChainFile
 from bwbayes.sampling.chain import Block, draws, log_densities
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.plan import SamplingPlan
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from tests.sampling.targets import gaussian
 
 posterior, point = gaussian(10)
-plan = SamplingPlan(walkers=64, most_steps=int(sys.argv[2]))
+plan = SamplingPlan(walkers=64, max_steps=int(sys.argv[2]))
 generator = np.random.default_rng(1)
-chain = first_chain(posterior, point, plan, generator)
+chain = init_chain(posterior, point, plan, generator)
 mixture = StudentMixture.fitted(generator.standard_normal((2000, 10)))
 path = Path(sys.argv[1])
 moved, moves = np.full(64, 20), {"mixture": (20, 20)}
 file = ChainFile.create(path, chain, point, plan.block, {})
 file.freeze("sampling", mixture)
-for phase, blocks in (("pilot", 60), ("tuning", 2), ("sampling", plan.most_steps // 50)):
+for phase, blocks in (("pilot", 60), ("tuning", 2), ("sampling", plan.max_steps // 50)):
     for _ in range(blocks):
         places = generator.standard_normal((4, 50, 64, 10)) + np.arange(4.0).reshape(4, 1, 1, 1)
         density = -0.5 * np.sum(places**2, axis=-1)
@@ -51,7 +51,7 @@ again = ChainFile.resume(path)
 with ThreadPoolExecutor(1) as executor:
     outcome = sample(posterior, plan, again, executor)
 assert not outcome.converged
-assert outcome.check.steps == plan.most_steps == again.steps("sampling")
+assert outcome.check.steps == plan.max_steps == again.steps("sampling")
 kept = draws(posterior, again)
 assert kept.shape[:3] == log_densities(again).shape
 """

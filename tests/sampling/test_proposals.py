@@ -20,7 +20,7 @@ from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Declaration, lognormal
 from bwbayes.sampling import proposals
-from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalMap, fit_maps
+from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalRatioMap, fit_maps
 from bwbayes.sampling.proposals import StudentMixture
 
 # Two components far apart, so that a draw shows which one it came from, and a wide one.
@@ -115,10 +115,10 @@ def log_banana(x: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * (x[:, 0] ** 2 + across**2 + beside**2))
 
 
-def any_totals(free: int, generator: np.random.Generator) -> TotalMap:
+def any_totals(free: int, generator: np.random.Generator) -> TotalRatioMap:
     rows = generator.permutation(free)[: free // 2 * 2].reshape(-1, 2)
     center, scale = generator.normal(0, 5, rows.shape), np.exp(generator.normal(0, 1, rows.shape))
-    return TotalMap(rows, center, scale)
+    return TotalRatioMap(rows, center, scale)
 
 
 def any_skew(free: int, generator: np.random.Generator) -> SkewMap:
@@ -142,7 +142,7 @@ def any_bend(free: int, generator: np.random.Generator) -> QuadraticMap:
 @pytest.mark.parametrize("any_map", [any_totals, any_skew, any_bend])
 @given(free=st.integers(2, 15), seed=st.integers(0, 10**6))
 def test_straight_undoes_bent_and_tells_how_much_it_stretches(
-    any_map: Callable[[int, np.random.Generator], QuadraticMap | SkewMap | TotalMap],
+    any_map: Callable[[int, np.random.Generator], QuadraticMap | SkewMap | TotalRatioMap],
     free: int,
     seed: int,
 ) -> None:
@@ -280,7 +280,7 @@ def test_the_density_is_that_of_the_draws(
 
 
 # Logarithms of two sds, of which 100 readings tell the sum of the squares, beside two others.
-TOTAL = TotalMap(np.array([[2, 1]]), np.array([[-1.0, -7.0]]), np.array([[2.0, 4.0]]))
+TOTAL = TotalRatioMap(np.array([[2, 1]]), np.array([[-1.0, -7.0]]), np.array([[2.0, 4.0]]))
 READINGS = 100
 
 
@@ -308,7 +308,7 @@ def test_total_and_ratio_are_those_of_the_sds_and_change_no_volume(seed: int) ->
     generator = np.random.default_rng(seed)
     rows = generator.permutation(5)[:4].reshape(2, 2)
     center, scale = generator.normal(0, 5, (2, 2)), np.exp(generator.normal(0, 1, (2, 2)))
-    map_, x = TotalMap(rows, center, scale), generator.normal(0, 2, (3, 5))
+    map_, x = TotalRatioMap(rows, center, scale), generator.normal(0, 2, (3, 5))
     y, log_slope = map_.to_straight(x)
     for (i, j), c, s in zip(rows, center, scale, strict=True):
         a, b = np.exp(c[0] + s[0] * x[:, i]), np.exp(c[1] + s[1] * x[:, j])
@@ -356,9 +356,9 @@ def test_the_sds_of_each_record_are_put_in_line_where_both_are_free_and_lognorma
             free(SENSOR_SD, "c"),
         )
     )
-    map_ = TotalMap.of_noise(prior)
+    map_ = TotalRatioMap.of_noise(prior)
     assert map_ is not None
     np.testing.assert_array_equal([[2, 0]], map_.rows)
     np.testing.assert_allclose(np.full((1, 2), np.log(0.5)), map_.center)
     np.testing.assert_array_equal([[2.0, 2.0]], map_.scale)
-    assert TotalMap.of_noise(JointPrior((free(SENSOR_SD, "a"),))) is None
+    assert TotalRatioMap.of_noise(JointPrior((free(SENSOR_SD, "a"),))) is None

@@ -198,10 +198,10 @@ def _config_or_proposal(
     for option, key in ("table", "table"), ("displacement", "displacement_file"):
         init += "" if naming[key] is None else f" --{option} {shlex.quote(str(naming[key]))}"
     init = with_naming(init, tables, naming["fs"])
-    if command != "check" and proposal.pointless is not None:
+    if command != "check" and proposal.blocking_issue is not None:
         raise InputError(
-            f"{path}: {proposal.pointless.error}; if the record is right as it is, write a config "
-            f"with `{init}` and run that"
+            f"{path}: {proposal.blocking_issue.error}; if the record is right as it is, "
+            f"write a config with `{init}` and run that"
         )
     if not quiet:
         train = ", ".join(f"{a:g} to {b:g}" for a, b in config.records["record"].train or ())

@@ -24,13 +24,13 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
-from bwbayes.app.config import LARGEST_SEED
+from bwbayes.app.config import MAX_SEED
 from bwbayes.app.verbs import Verb
 from bwbayes.errors import ExitStatus, InputError
 
 if TYPE_CHECKING:
     from bwbayes.app.running.progress import StepProgress
-    from bwbayes.diagnosis.validation import Standing
+    from bwbayes.diagnosis.validation import ValidationSummary
     from bwbayes.report.report import Product, Report
 
 type AnyCommand = Callable[..., Any]
@@ -43,7 +43,7 @@ RANGES = {
     "replicates": click.IntRange(1),
     "steps": click.IntRange(1),
     "ess": click.FloatRange(1),
-    "seed": click.IntRange(0, LARGEST_SEED),
+    "seed": click.IntRange(0, MAX_SEED),
 }
 
 folder_argument = click.argument("folder", type=FILE)
@@ -234,7 +234,7 @@ def require_new_or_resumed(
 
 
 def present(
-    product: Product, files: Sequence[Path], standing: Standing, *, quiet: bool = False
+    product: Product, files: Sequence[Path], standing: ValidationSummary, *, quiet: bool = False
 ) -> int:
     """Show a product of a run and its files; return the worse of the run's and its own status."""
     report = product.report()

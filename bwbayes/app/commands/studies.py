@@ -92,7 +92,7 @@ def calibrate(
         click.echo(f"report: {page}")
     if calibration.passed:
         return 0
-    first, *others = calibration.shortcomings
+    first, *others = calibration.failures
     more = f", and {len(others)} more" if others else ""
     click.echo(f"CALIBRATION FAILED: {first}{more}; see {page}", err=True)
     return ExitStatus.NOT_CONVERGED

@@ -4,7 +4,7 @@ Here are constants that configs and the command line share, without waiting for 
 """
 
 # What files hold as a whole number.
-LARGEST_SEED = 2**63 - 1
+MAX_SEED = 2**63 - 1
 
 # Models that are compared if no others are named: from no hysteresis at all to the two ways of
 # remembering it, a state or a stack of turning points, without and with the asymmetry of measured

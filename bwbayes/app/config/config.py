@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self
 import tomlkit
 from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
 
-from bwbayes.app.config import LARGEST_SEED
+from bwbayes.app.config import MAX_SEED
 from bwbayes.app.config.keys import ConfigTable, key, one_line
 from bwbayes.app.config.settings import (
     ModelConfig,
@@ -29,7 +29,7 @@ from bwbayes.app.config.settings import (
 )
 from bwbayes.errors import InputError, suggestion
 
-LARGEST_FILE = 1_000_000  # bytes
+MAX_FILE_SIZE = 1_000_000  # bytes
 
 # What a record is called that is the only one.
 ALONE = "record"
@@ -52,7 +52,7 @@ class Config(ConfigTable):
 
     name: Annotated[str, Field(min_length=1)] | None = key(None, example='"bender 7"')
     """The run's name; by default the config's file name."""
-    seed: int = key(1, ge=0, le=LARGEST_SEED, example="7", called="random_seed rng")
+    seed: int = key(1, ge=0, le=MAX_SEED, example="7", called="random_seed rng")
     """Seed of all random numbers."""
     record: Annotated[
         Annotated[RecordConfig, Tag(ONE)] | Annotated[dict[Name, RecordConfig], Tag(SEVERAL)],
@@ -153,7 +153,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise InputError(f"{path}: is not a regular file; give one")
-        if path.stat().st_size > LARGEST_FILE:
+        if path.stat().st_size > MAX_FILE_SIZE:
             raise InputError(f"{path}: is larger than 1 MB; no config is; check the path")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError) as error:
@@ -165,7 +165,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 def is_config(path: Path) -> bool:
     """Tell by its content whether a file is meant as a config, be it a faulty one."""
     try:
-        if path.stat().st_size > LARGEST_FILE:
+        if path.stat().st_size > MAX_FILE_SIZE:
             return False
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeError):

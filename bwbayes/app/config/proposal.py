@@ -50,7 +50,7 @@ class ConfigProposal:
     remarks: tuple[str, ...]
 
     @property
-    def pointless(self) -> Finding | None:
+    def blocking_issue(self) -> Finding | None:
         """What makes a fit pointless, if anything."""
         kinds = ("no relation", "reversed sign", "swapped columns", "late voltage")
         return next((finding for finding in self.findings if finding.kind in kinds), None)

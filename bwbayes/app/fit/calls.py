@@ -77,7 +77,7 @@ def fit(
         What is wrong with the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
-    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
+    from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve
     from bwbayes.app.running import run
     from bwbayes.app.running.explaining import improve_model
@@ -100,7 +100,7 @@ def fit(
         problem=problem,
     )
     warn([note for note in result.notes if note not in problem.remarks], 3)
-    return result.knowing(_scratch=scratch)
+    return result.with_cache(_scratch=scratch)
 
 
 def compare(
@@ -164,7 +164,7 @@ def compare(
     from bwbayes.app.config.keywords import models_of
     from bwbayes.app.fit.fitted import Run
     from bwbayes.app.jobs import compare as job
-    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch
+    from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch
     from bwbayes.app.running.progress import ProgressLine, StepProgress
     from bwbayes.report.outputs import refuse_existing
 
@@ -277,7 +277,7 @@ def resume(
     InputWarning
         As :func:`fit` does.
     """
-    from bwbayes.app.jobs.at_work import console_of, warn
+    from bwbayes.app.jobs.fit_methods import console_of, warn
     from bwbayes.app.running import run
     from bwbayes.app.running.folder import RunFolder
 
@@ -347,8 +347,8 @@ def campaign(
 
     from bwbayes.app.config.config import dump
     from bwbayes.app.config.keywords import config_of
-    from bwbayes.app.jobs.at_work import console_of, folder_or_scratch, warn
     from bwbayes.app.jobs.campaign import config_text, resume, start
+    from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
     from bwbayes.record import read_record, write_record
 
     text, where = "", Path()

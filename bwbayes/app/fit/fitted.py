@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
-    from bwbayes.app.jobs.at_work import at_work
     from bwbayes.app.jobs.control import compensate as compensate_fit
     from bwbayes.app.jobs.control import export as export_fit
     from bwbayes.app.jobs.control import track as track_fit
     from bwbayes.app.jobs.design import design as design_fit
+    from bwbayes.app.jobs.fit_methods import fit_method
     from bwbayes.app.jobs.predict import predict as predict_record
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
-    from bwbayes.diagnosis.validation import Standing
+    from bwbayes.diagnosis.validation import ValidationSummary
     from bwbayes.report.report import Report
 
 
@@ -47,9 +47,9 @@ class _Method:
         self.verb = verb
 
     def __get__(self, fit: Run | None, _: object = None) -> Any:
-        from bwbayes.app.jobs.at_work import at_work
+        from bwbayes.app.jobs.fit_methods import fit_method
 
-        method = at_work(self.verb.load())
+        method = fit_method(self.verb.load())
         return method if fit is None else MethodType(method, fit)
 
 
@@ -78,12 +78,16 @@ class Run(Shown, Stages):
         return self.problem.config.name or self.problem.config.model.hysteresis
 
     @cached_property
-    def standing(self) -> Standing:
+    def standing(self) -> ValidationSummary:
         """Whether the bands hold, all together: as its folder says, if it does."""
-        from bwbayes.diagnosis.validation import Standing
+        from bwbayes.diagnosis.validation import ValidationSummary
 
         numbers = self.folder.numbers()
-        return Standing.read(numbers) if numbers else Standing.of(self.verdicts.values())
+        return (
+            ValidationSummary.read(numbers)
+            if numbers
+            else ValidationSummary.of(self.verdicts.values())
+        )
 
     @property
     def holds(self) -> bool | None:
@@ -196,11 +200,11 @@ class Run(Shown, Stages):
 
     # Every verb is a method, see below. Type checkers do not run that, and see these.
     if TYPE_CHECKING:
-        predict = at_work(predict_record)
-        compensate = at_work(compensate_fit)
-        design = at_work(design_fit)
-        export = at_work(export_fit)
-        track = at_work(track_fit)
+        predict = fit_method(predict_record)
+        compensate = fit_method(compensate_fit)
+        design = fit_method(design_fit)
+        export = fit_method(export_fit)
+        track = fit_method(track_fit)
 
     def compare(self, *others: Run, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.
@@ -216,13 +220,13 @@ class Run(Shown, Stages):
 
         Options and errors are as in :func:`bwbayes.resume`.
         """
-        from bwbayes.app.jobs.at_work import console_of, warn
+        from bwbayes.app.jobs.fit_methods import console_of, warn
         from bwbayes.app.running import run
 
         files = self._scratch is None
         fit = run.resume(self.folder, console_of(progress), files=files, **options)
         warn(fit.notes, 3)
-        return fit.knowing(_scratch=self._scratch)
+        return fit.with_cache(_scratch=self._scratch)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the run to a folder of its own, all that ``bwbayes run`` writes, and return it.
@@ -233,13 +237,13 @@ class Run(Shown, Stages):
             The folder exists and ``overwrite`` is not given, or it cannot be written.
         """
         from bwbayes.app.running import run
-        from bwbayes.app.running.figure_worker import Artist
+        from bwbayes.app.running.figure_worker import FigureWorker
 
         copied = RunFolder.create(Path(folder), self.problem, overwrite)
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
             shutil.copyfile(self.folder.backend, copied.backend)
-            run.write_files(self, copied, Artist())
+            run.write_files(self, copied, FigureWorker())
         return copied.path
 
     @property

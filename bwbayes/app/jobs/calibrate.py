@@ -32,7 +32,7 @@ from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, judge
 from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import RANKED, Entry, Experiment, replicate
+from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, replicate
 from bwbayes.errors import InputError
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.outputs import save
@@ -63,7 +63,7 @@ def start(
     return CalibrationFolder.create(out, problem, overwrite, line)
 
 
-def experiment(problem: Problem) -> Experiment:
+def experiment(problem: Problem) -> CalibrationSetup:
     """Return what the replicates of a problem have in common.
 
     Held out are the validation windows of its own record; other records are made again with each
@@ -82,7 +82,7 @@ def experiment(problem: Problem) -> Experiment:
         for name, v in problem.validations.items()
         if v.record is not None
     }
-    return Experiment(problem.posterior, problem.plan, windows, others)
+    return CalibrationSetup(problem.posterior, problem.plan, windows, others)
 
 
 def resume(
@@ -147,7 +147,7 @@ def resume(
                     (
                         "sampling",
                         f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS "
-                        f"{plan.ess:g}, at most {plan.most_steps} steps",
+                        f"{plan.ess:g}, at most {plan.max_steps} steps",
                     ),
                 ],
                 provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
@@ -177,7 +177,7 @@ def _append(folder: CalibrationFolder, line: str) -> None:
 
 
 def _read(
-    folder: CalibrationFolder, common: Experiment, identity: str
+    folder: CalibrationFolder, common: CalibrationSetup, identity: str
 ) -> tuple[int, dict[int, Entry]]:
     """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()

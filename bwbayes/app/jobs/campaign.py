@@ -178,8 +178,8 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
         config = parse(text, "campaign.toml").with_record(file)
     else:
         proposal = propose(file, where)
-        if proposal.pointless is not None:
-            raise InputError(f"{file}: {proposal.pointless.error}")
+        if proposal.blocking_issue is not None:
+            raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config
     problem = resolve(config.model_copy(update={"name": file.stem}), where)
     path = campaign.run(file.stem)

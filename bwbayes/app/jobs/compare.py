@@ -37,7 +37,7 @@ from bwbayes.comparison.compared import Comparison
 from bwbayes.comparison.evidence import evidence, screening_evidence
 from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
 from bwbayes.comparison.recommendation import recommend
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.prediction.scores import score
@@ -293,7 +293,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     return replace(result, standing=fit.standing) if is_finished else result
 
 
-def _standing(folder: RunFolder, files: bool) -> Standing:
+def _standing(folder: RunFolder, files: bool) -> ValidationSummary:
     """Finish a run, and say whether its bands hold."""
     with warnings.catch_warnings():
         # What is wrong with a model is among what speaks against it.

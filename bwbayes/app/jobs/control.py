@@ -21,8 +21,8 @@ from typing import Any, Literal
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.jobs.at_work import limits_of
-from bwbayes.app.problem.alike import options_alike
+from bwbayes.app.jobs.fit_methods import limits_of
+from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
 from bwbayes.control.exported import Exported, exported
@@ -227,7 +227,7 @@ def _reference(
         if isinstance(requested, str) and not path.suffix and not path.exists():
             hint = suggestion(requested, SHAPES)
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
-        alike = options_alike(path, read_as, reading)
+        alike = column_options_from(path, read_as, reading)
         alike.pop("voltage_is", None)
         values, interval = read_reference(path, Naming(**alike))
         return Reference(values, interval, path.stem, smoothed)

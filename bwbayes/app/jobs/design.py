@@ -19,8 +19,8 @@ from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.jobs.at_work import limits_of
-from bwbayes.app.problem.alike import options_alike
+from bwbayes.app.jobs.fit_methods import limits_of
+from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import promises as rank
@@ -208,7 +208,9 @@ def _drive(
     """Return the voltage of a signal's name or of a record's file, at an interval."""
     if str(path) in signal_names():
         return signal(str(path)).sample(1 / interval)[1]
-    record = read_record(path, need_displacement=False, **options_alike(path, read_as, reading))
+    record = read_record(
+        path, need_displacement=False, **column_options_from(path, read_as, reading)
+    )
     if np.isclose(record.interval, interval, rtol=1e-6):
         return record.voltage
     samples = np.arange(0.0, record.duration, interval) / record.interval

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.alike import options_alike
+from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, path_text, refuse_unwritable, suggestion
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
@@ -123,19 +123,22 @@ def predict(
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
         reading = {**(reading or {}), "table": table, "displacement_file": displacement_file}
-        alike = options_alike(record, problem.config.records[of].read_as, reading)
+        alike = column_options_from(record, problem.config.records[of].read_as, reading)
         record = read_record(record, need_displacement=False, **alike)
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
-    start = Start(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
+    start = InitialConditions(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
     other = Validation((), record, start, window, of)
     name, watching = name or "prediction", partial(watch, "predictions")
     return predict_another(problem, fit.flat_draws, other, name, watching)
 
 
 def write_prediction(
-    prediction: Prediction, files: Sequence[Path], standing: Standing, watch: Watch = unwatched
+    prediction: Prediction,
+    files: Sequence[Path],
+    standing: ValidationSummary,
+    watch: Watch = unwatched,
 ) -> None:
     """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
 

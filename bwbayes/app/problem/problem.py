@@ -18,7 +18,7 @@ from pathlib import Path
 
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.alike import record_naming
+from bwbayes.app.problem.column_options import record_naming
 from bwbayes.app.problem.parameters import as_config, recoverable, study_of, with_model
 from bwbayes.app.problem.records import (
     Slices,
@@ -324,8 +324,8 @@ def _plan(config: Config, posterior: Posterior) -> SamplingPlan:
         ensembles=settings.ensembles,
         walkers=walkers,
         block=settings.block,
-        most_steps=settings.steps,
-        most_pilot_steps=settings.pilot_steps,
+        max_steps=settings.steps,
+        max_pilot_steps=settings.pilot_steps,
         ensembles_per_task=best_ensembles_per_task(settings.ensembles, walkers, samples),
         tries=best_tries(walkers, readings),
         ahead=best_ahead(walkers, samples),

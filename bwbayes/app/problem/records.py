@@ -23,7 +23,7 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError, suggestion
 from bwbayes.inference.study import place_of
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.formats import require_readable
 from bwbayes.record.record import Window
@@ -44,7 +44,7 @@ class Validation:
 
     windows: Slices = ()
     record: Record | None = None
-    start: Start = field(default_factory=Start)
+    start: InitialConditions = field(default_factory=InitialConditions)
     judged: tuple[float, float] | None = None
     of: str = "record"
 
@@ -263,7 +263,7 @@ def validations_of(
         # Its hold is its own, unless given.
         hold = None if config.model.hold == "auto" else config.model.hold
         lead_in = source.lead_in, source.lead_in_from
-        start = Start(source.from_rest, source.own_offset, *lead_in, hold)
+        start = InitialConditions(source.from_rest, source.own_offset, *lead_in, hold)
         judged, key = None, "lead_in: "
         try:
             start.window(record)

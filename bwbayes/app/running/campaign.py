@@ -16,12 +16,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run, finished
-from bwbayes.app.problem.alike import options_alike
+from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import Standing
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus, InputError
 from bwbayes.population.population import (
     FEWEST,
@@ -31,7 +31,7 @@ from bwbayes.population.population import (
     population,
 )
 from bwbayes.population.specimen import Specimen
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
 from bwbayes.report.figures import drawn
 from bwbayes.report.report import (
@@ -88,7 +88,7 @@ class Row:
         if not numbers["converged"]:
             reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
             return cls(file.stem, file.name, "not converged", reason, numbers)
-        standing = Standing.read(numbers)
+        standing = ValidationSummary.read(numbers)
         status = standing.status if standing.holds else f"validation {standing.status}"
         return cls(file.stem, file.name, status, "; ".join(standing.lines), numbers)
 
@@ -245,11 +245,11 @@ class Campaign(Product):
         first = self.fit(self.population.names[0])
         problem = first.problem
         if not isinstance(record, Record):
-            alike = options_alike(record, next(iter(problem.config.records.values())).read_as)
+            alike = column_options_from(record, next(iter(problem.config.records.values())).read_as)
             record = read_record(record, need_displacement=False, **alike)
         source = generator(problem.config.seed, "next specimen")
         draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
-        start, like = Start(from_rest, True, lead_in), next(iter(problem.records))
+        start, like = InitialConditions(from_rest, True, lead_in), next(iter(problem.records))
         other = Validation((), record, start, of=like)
         return predict_another(problem, draws, other, "next specimen")
 

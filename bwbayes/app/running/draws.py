@@ -9,7 +9,7 @@ import numpy as np
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.voltage_noise import path_covariance, widened
 from bwbayes.sampling.chain import constrain_steps, draws, thinning
 from bwbayes.sampling.storage import ChainFile
@@ -19,7 +19,7 @@ from bwbayes.watching import Watch, unwatched
 VOLTAGE_NOISE = "voltage_noise_covariance"
 
 
-def voltage_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) -> dict[str, str]:
+def voltage_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched) -> dict[str, str]:
     """Return what a chain notes of what noise on the voltages leaves unsure; nothing without."""
     paths = {name: record.path for name, record in problem.records.items()}
     if not any(path.noise_sd for path in paths.values()):

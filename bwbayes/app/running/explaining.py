@@ -30,10 +30,10 @@ from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likel
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.model import without
-from bwbayes.diagnosis.scene import Explanation, Scene
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
 from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
@@ -56,10 +56,10 @@ def explained(
     return explain(_scene(problem, name, places), watch)
 
 
-def _scene(problem: Problem, name: str, places: FloatArray) -> Scene:
+def _scene(problem: Problem, name: str, places: FloatArray) -> ResidualAnalysis:
     """Return a training record as explanations see it."""
     posterior, record = problem.posterior, problem.records[name]
-    return Scene.of(
+    return ResidualAnalysis.of(
         posterior.alone(name),
         posterior.select_draws(places, name),
         generator(problem.config.seed, f"explanations {record.sha256}"),
@@ -83,7 +83,7 @@ def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
             yield f"explained better by: {text}. Fix: {explanation.fix}."
 
 
-def chosen_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) -> tuple[str, str]:
+def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched) -> tuple[str, str]:
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
@@ -130,7 +130,7 @@ def chosen_noise(problem: Problem, point: PointFit, watch: Watch = unwatched) ->
     return best, f"noise: {best} ({', '.join(against)})"
 
 
-def find_map(problem: Problem, watch: WatchSteps = unwatched) -> tuple[Problem, PointFit, str]:
+def find_map(problem: Problem, watch: WatchSteps = unwatched) -> tuple[Problem, MAPEstimate, str]:
     """Return a problem with the noise that it shows, its MAP estimate, and why it has that noise.
 
     The problem as it is, and no reason, if its config names a noise. ``watch`` is called with the
@@ -146,7 +146,7 @@ def find_map(problem: Problem, watch: WatchSteps = unwatched) -> tuple[Problem, 
     return chosen, point, why
 
 
-def _fit_point(problem: Problem, watch: Watch) -> PointFit:
+def _fit_point(problem: Problem, watch: Watch) -> MAPEstimate:
     source = generator(problem.config.seed, "point fit")
     return map_estimate.fit(problem.posterior, source, watch)
 

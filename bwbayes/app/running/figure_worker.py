@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 PLOTS = ""
 
 
-class Artist:
+class FigureWorker:
     """Draws in another process what is known already, and at the end in this one what is left."""
 
     def __init__(self, pool: Executor | None = None) -> None:
@@ -43,14 +43,14 @@ class Artist:
         if pool is not None:
             pool.submit(_begin)
 
-    def rehearse(self, posterior: Posterior) -> None:
+    def warm_up(self, posterior: Posterior) -> None:
         """Let the other process compile what this one needs later, and load what draws."""
         if self.pool is None:
             return
         if posterior.engine == "numba":
-            from bwbayes.inference.compiled import rehearse  # noqa: PLC0415
+            from bwbayes.inference.compiled import warm_up  # noqa: PLC0415
 
-            self.pool.submit(rehearse, posterior)
+            self.pool.submit(warm_up, posterior)
         self.pool.submit(_load)
 
     def draw(self, result: Result) -> None:
@@ -121,12 +121,12 @@ def _works(result: Result) -> dict[str, Callable[[], Any]]:
 
 
 @contextmanager
-def artist_of(workers: int | None) -> Iterator[Artist]:
+def artist_of(workers: int | None) -> Iterator[FigureWorker]:
     """Give who draws, in a process of its own if several workers may work."""
     if 1 in (workers, os.cpu_count()):
-        yield Artist()
+        yield FigureWorker()
         return
     # A process may be copied while it runs.
     copied = sys.platform == "linux" and threading.active_count() == 1
     with processes(1, "fork" if copied else "spawn") as pool:
-        yield Artist(pool)
+        yield FigureWorker(pool)

@@ -20,11 +20,16 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.rivals import disagreement
-from bwbayes.diagnosis.scene import Explanation
-from bwbayes.diagnosis.validation import Background, Standing, Verdict, assess
+from bwbayes.diagnosis.validation import (
+    BandValidation,
+    ValidationContext,
+    ValidationSummary,
+    assess,
+)
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.untried import with_creep
+from bwbayes.inference.prior_creep import add_prior_creep
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
@@ -49,7 +54,7 @@ class Prediction(Shown, Bands):
     """
 
     scores: Scores | None = None
-    verdict: Verdict | None = None
+    verdict: BandValidation | None = None
     remarks: tuple[str, ...] = ()
 
     @property
@@ -58,9 +63,9 @@ class Prediction(Shown, Bands):
         return None if self.verdict is None else self.verdict.holds
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> ValidationSummary:
         """Whether the bands hold, as one carries that along."""
-        return Standing.of([self.verdict] if self.verdict else [])
+        return ValidationSummary.of([self.verdict] if self.verdict else [])
 
     @property
     def notes(self) -> list[str]:
@@ -146,7 +151,7 @@ def predict_another(
     beyond = beyond_training(posterior, path.voltage, other.record.interval)
     subset = thinned(flat, generator(problem.config.seed, "draws"))
     bands = _of_another(problem, subset, other, name, beyond, part(watch, 0.0, 0.8))
-    background = Background.of(posterior, flat)
+    background = ValidationContext.of(posterior, flat)
     verdict = assess(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
     rest = _from_rest_remark(problem, subset, other, bands, beyond)
@@ -333,16 +338,16 @@ def _reaching(
     posterior = problem.posterior
     if any(finding.kind in ("slow", "duration") for finding in beyond):
         source = generator(problem.config.seed, f"creep {record.sha256}")
-        posterior, draws = with_creep(posterior, draws, record.duration, source)
+        posterior, draws = add_prior_creep(posterior, draws, record.duration, source)
     return posterior.alone(of), posterior.select_draws(draws, of)
 
 
 def validate_predictions(
     problem: Problem,
     bands: Iterable[Bands],
-    background: Background,
+    background: ValidationContext,
     explanations: Mapping[str, Sequence[Explanation]],
-) -> dict[str, Verdict]:
+) -> dict[str, BandValidation]:
     """Validate all bands that have readings, by name.
 
     ``explanations`` are by the name of the training record.

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from bwbayes.app.running.workers import open_executor, side_by_side
 from bwbayes.sampling.chain import Phase
-from bwbayes.sampling.diagnostics import LENGTH, Check
+from bwbayes.sampling.diagnostics import LENGTH, ConvergenceDiagnostics
 from bwbayes.sampling.plan import SamplingPlan
 
 
@@ -91,10 +91,10 @@ class Progress(ProgressLine):
         super().__init__(console, "sampling ...", announced=False)
         self.plan = plan
         self.steps = 0.0  # of all ensembles together, since this was made
-        self.check: Check | None = None
+        self.check: ConvergenceDiagnostics | None = None
         self.end: float | None = None  # when it will be done, by the check; of a monotonic clock
 
-    def __call__(self, phase: Phase, check: Check | None) -> None:
+    def __call__(self, phase: Phase, check: ConvergenceDiagnostics | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
         if check is None:
             self.steps += self.plan.block / self.plan.ensembles
@@ -105,7 +105,7 @@ class Progress(ProgressLine):
             if self.steps and not check.disagreements() and check.lowest_ess > 0:
                 needed = check.steps * self.plan.ess / check.lowest_ess
                 needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
-                remaining = max(min(needed, self.plan.most_steps) - check.steps, 0)
+                remaining = max(min(needed, self.plan.max_steps) - check.steps, 0)
                 now = time.monotonic()
                 if np.isfinite(needed):
                     self.end = now + remaining * (now - self.started_at) / self.steps

@@ -23,24 +23,24 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.draws import voltage_noise
 from bwbayes.app.running.explaining import find_map
-from bwbayes.app.running.figure_worker import Artist
+from bwbayes.app.running.figure_worker import FigureWorker
 from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine, choose
-from bwbayes.inference.map_estimate import PointFit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import write_bands, write_summary
 from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
-from bwbayes.sampling.sampler import first_chain, sample
+from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.watching import WatchSteps, part, unwatched
 
 
-def begin(folder: RunFolder) -> tuple[Problem, PointFit]:
+def begin(folder: RunFolder) -> tuple[Problem, MAPEstimate]:
     """Return a run's problem and its MAP estimate, which is worked out if it is not there yet.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
@@ -61,7 +61,7 @@ def resume(
     predict: bool = True,
     files: bool = True,
     executor: str | Executor | None = None,
-    artist: Artist | None = None,
+    artist: FigureWorker | None = None,
     problem: Problem | None = None,
     answer: Callable[[Run], None] | None = None,
 ) -> Run:
@@ -77,7 +77,7 @@ def resume(
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     start_time = time.monotonic()
-    artist = artist or Artist()
+    artist = artist or FigureWorker()
     with folder.locked(), one_thread():
         config = problem.config if problem else load(folder.config)
         targets = {"ess": ess, "steps": steps, "engine": engine}
@@ -89,10 +89,10 @@ def resume(
                 _rewrite(folder, config.model_copy(update={"sampling": sampling}))
             with ProgressLine(console, "reading the run ...", announced=False):
                 problem = problem or folder.problem()
-            artist.rehearse(problem.posterior)
+            artist.warm_up(problem.posterior)
             problem, chain = _open_chain(folder, problem, console, engine)
             plan = problem.plan
-            fit = Run(chain, folder).knowing(problem=problem)
+            fit = Run(chain, folder).with_cache(problem=problem)
             with Progress(console, plan) as progress:
                 if not fit.kept:
                     # It is written last, as the sign that all is done; now there is more to do.
@@ -104,7 +104,7 @@ def resume(
             f"sampled {models} models, {models / ess:.1f} for each of {ess:.0f} effective draws",
             highlight=False,
         )
-        fit = fit.knowing(outcome=outcome)
+        fit = fit.with_cache(outcome=outcome)
         if not predict:
             return fit
         if not fit.kept:
@@ -129,7 +129,7 @@ def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Run:
     with folder.locked(), one_thread():
         folder.require_finished()
         fit = finished(folder)
-        write_files(fit, folder, Artist(), watch)
+        write_files(fit, folder, FigureWorker(), watch)
     return fit
 
 
@@ -156,7 +156,7 @@ def _open_chain(
             "parameters": json.dumps(posterior.names),
             **unsure,
         }
-        first = first_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
+        first = init_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
         chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
         return problem, chain
     chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))
@@ -178,13 +178,15 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-def write_files(fit: Run, folder: RunFolder, artist: Artist, watch: WatchSteps = unwatched) -> None:
+def write_files(
+    fit: Run, folder: RunFolder, artist: FigureWorker, watch: WatchSteps = unwatched
+) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done.
 
     ``watch`` is called with the name of a step and the share of it that is done.
     """
     result, bands = fit.result, folder.path / "bands.csv"
-    numbers = fit.knowing(folder=folder).numbers
+    numbers = fit.with_cache(folder=folder).numbers
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
     artist.draw(result)

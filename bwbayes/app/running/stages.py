@@ -21,23 +21,23 @@ from bwbayes.sampling.storage import ChainFile
 from bwbayes.watching import Watch, WatchSteps, counted, parts, unwatched, watched
 
 if TYPE_CHECKING:
-    from bwbayes.app.jobs.at_work import Scratch
+    from bwbayes.app.jobs.fit_methods import Scratch
     from bwbayes.app.problem.problem import Problem
-    from bwbayes.app.running.figure_worker import Artist
+    from bwbayes.app.running.figure_worker import FigureWorker
     from bwbayes.arrays import FloatArray
-    from bwbayes.diagnosis.consistency import Agreement
+    from bwbayes.diagnosis.consistency import Consistency
     from bwbayes.diagnosis.drive_lock import DriveLock
     from bwbayes.diagnosis.identifiability import InformationGain
     from bwbayes.diagnosis.innovations import Innovations
     from bwbayes.diagnosis.predictive_checks import PredictiveChecks
-    from bwbayes.diagnosis.scene import Explanation
-    from bwbayes.diagnosis.validation import Background, Verdict
+    from bwbayes.diagnosis.residual_analysis import Explanation
+    from bwbayes.diagnosis.validation import BandValidation, ValidationContext
     from bwbayes.prediction.bands import Bands
     from bwbayes.prediction.loops import Loops
     from bwbayes.prediction.scores import Scores
     from bwbayes.prediction.steps import StepResponse
     from bwbayes.report.result import Result
-    from bwbayes.sampling.diagnostics import Outcome
+    from bwbayes.sampling.diagnostics import SamplingResult
 
 
 class RunStage[T](cached_property[T]):
@@ -89,7 +89,7 @@ class Stages:
     watch: WatchSteps = unwatched
     _scratch: Scratch | None = None
 
-    def knowing(self, **results: object) -> Self:
+    def with_cache(self, **results: object) -> Self:
         """Return this run with attributes that are there already, computed ones too."""
         run = copy(self)
         run.__dict__.update(results)  # a cached property is a plain attribute
@@ -125,15 +125,15 @@ class Stages:
         save(folder.result, state, {"outcome": self.outcome, **self._computed})
 
     @cached_property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> SamplingResult:
         """How the sampling ended, or stands."""
         if self.kept:
-            outcome: Outcome = self.kept["outcome"]
+            outcome: SamplingResult = self.kept["outcome"]
             return outcome
         from bwbayes.app.running.workers import open_executor
         from bwbayes.sampling.sampler import sample
 
-        plan = replace(self.problem.plan, most_steps=self.chain.steps("sampling"))
+        plan = replace(self.problem.plan, max_steps=self.chain.steps("sampling"))
         with open_executor(1) as pool:
             return sample(self.problem.posterior, plan, self.chain, pool)
 
@@ -214,11 +214,11 @@ class Stages:
         return self.flat_draws[[int(np.argmax(self.sampled.log_density))]]
 
     @cached_property
-    def background(self) -> Background:
+    def background(self) -> ValidationContext:
         """What the validation of bands needs to know of the fit."""
-        from bwbayes.diagnosis.validation import Background
+        from bwbayes.diagnosis.validation import ValidationContext
 
-        return Background.of(self.problem.posterior, self.flat_draws)
+        return ValidationContext.of(self.problem.posterior, self.flat_draws)
 
     @RunStage
     def step_responses(self, _: Watch) -> dict[str, StepResponse]:
@@ -260,7 +260,7 @@ class Stages:
         }
 
     @RunStage
-    def consistency(self, watch: Watch) -> dict[str, Agreement]:
+    def consistency(self, watch: Watch) -> dict[str, Consistency]:
         """Return how each of several records agrees with the others, by record."""
         from bwbayes.diagnosis.consistency import agreements
 
@@ -297,7 +297,7 @@ class Stages:
         }
 
     @always
-    def verdicts(self, _: Watch) -> dict[str, Verdict]:
+    def verdicts(self, _: Watch) -> dict[str, BandValidation]:
         """Return whether the bands hold, and why not, by the bands' name."""
         from bwbayes.app.running.predictions import validate_predictions
 
@@ -378,7 +378,7 @@ class Stages:
         """What is computed by now, by stage."""
         return {name: vars(self)[name] for name in STAGES if name in vars(self)}
 
-    def compute(self, watch: WatchSteps = unwatched, artist: Artist | None = None) -> Result:
+    def compute(self, watch: WatchSteps = unwatched, artist: FigureWorker | None = None) -> Result:
         """Compute all stages in turn; return the run as the report is made of it.
 
         ``watch`` is called with the name of a stage and the share of it that is done; the

@@ -25,13 +25,13 @@ from bwbayes.model.declaration import Values
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-__all__ = ["products", "rehearse", "whiten"]
+__all__ = ["products", "warm_up", "whiten"]
 
 # States of the noise that the lanes hold; more are filtered by :mod:`whitening` alone.
 LANE_STATES = 2
 
 
-def rehearse(posterior: Posterior) -> None:
+def warm_up(posterior: Posterior) -> None:
     """Simulate and whiten one model, which compiles what :func:`products` does not need.
 
     What one process has compiled is there for others, such as one that is at the products.

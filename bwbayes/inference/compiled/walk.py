@@ -31,7 +31,7 @@ def walk(
     actuator: Actuator,
     theta: FloatArray,
     voltage: FloatArray,
-    unrest: FloatArray | None = None,
+    initial_transient: FloatArray | None = None,
     *,
     from_rest: bool = False,
 ) -> Callable[[int], FloatArray]:
@@ -45,10 +45,12 @@ def walk(
     column = actuator.columns(theta)
     actuator.check(column)
     if not actuator.stages:
-        return _walk_core(actuator, column, voltage, unrest, from_rest)
+        return _walk_core(actuator, column, voltage, initial_transient, from_rest)
     # The offset comes last.
     inner = replace(actuator, stages=actuator.inputs)
-    core = _walk_core(inner, column | {"offset": np.zeros(len(theta))}, voltage, unrest, from_rest)
+    core = _walk_core(
+        inner, column | {"offset": np.zeros(len(theta))}, voltage, initial_transient, from_rest
+    )
     memories: tuple[FloatArray, ...] | None = None
 
     def onwards(last: int) -> FloatArray:
@@ -68,7 +70,7 @@ def _walk_core(
     actuator: Actuator,
     column: Values,
     voltage: FloatArray,
-    unrest: FloatArray | None,
+    initial_transient: FloatArray | None,
     from_rest: bool,
 ) -> Callable[[int], FloatArray]:
     """Walk along the way up to creep and dynamics."""
@@ -84,7 +86,7 @@ def _walk_core(
     sections = actuator.sections(column)
     named = physics(actuator, sections, column, stage.rest, voltage)
     models = by_rows(named, STATE // LANES)
-    moving, *crept = sections.begin(unrest)
+    moving, *crept = sections.begin(initial_transient)
     models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
     for row, lag in enumerate(crept, LAG // LANES):
         models[:, row] = lag[:, 0]

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.consistency import Agreement
+from bwbayes.diagnosis.consistency import Consistency
 from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.loops import Loops
@@ -182,14 +182,14 @@ def draw_spectrum(residual: tuple[FloatArray, FloatArray], noise: FloatArray) ->
     return figure
 
 
-def draw_agreement(agreements: Mapping[str, Agreement]) -> Figure:
+def draw_agreement(agreements: Mapping[str, Consistency]) -> Figure:
     """Draw each record's residuals, along time, in the joint fit and in a fit of its own."""
     count = len(agreements)
     figure, panels = style.new_figure(11, 0.9 + 1.9 * count, count, gap=0.5)
     for (panel,), (name, agreement) in zip(panels, agreements.items(), strict=True):
         for values, color, label in (
-            (agreement.joint, style.COLORS[0], f"joint fit: {agreement.joint_um:.3g} µm rms"),
-            (agreement.own, style.COLORS[1], f"own fit: {agreement.own_um:.3g} µm rms"),
+            (agreement.joint, style.COLORS[0], f"joint fit: {agreement.joint_rms_um:.3g} µm rms"),
+            (agreement.own, style.COLORS[1], f"own fit: {agreement.single_rms_um:.3g} µm rms"),
         ):
             dots: style.Look = {"ms": 2, "mew": 0, "alpha": 0.7}
             panel.plot(agreement.time, values, ".", color=color, label=label, **dots)

@@ -16,7 +16,7 @@ from hypothesis import given
 import bwbayes as bw
 from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.alike import options_alike, record_naming
+from bwbayes.app.problem.column_options import column_options_from, record_naming
 from bwbayes.app.problem.problem import resolve
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.record import Record, read_record, write_record
@@ -78,7 +78,7 @@ def test_a_second_file_of_the_same_columns_is_read_as_the_first(
         kept = [i for i, q in enumerate(quantities) if q in ("time", "voltage") or not planned]
         second = folder / "second.csv"
         written(second, [names[i] for i in kept], [quantities[i] for i in kept], 3.0)
-        record = readable(second, **options_alike(second, noted))
+        record = readable(second, **column_options_from(second, noted))
         whole = folder / "whole.csv"
         written(whole, names, quantities, 3.0)
         expected = readable(
@@ -107,8 +107,8 @@ def test_a_file_of_other_columns_is_read_by_itself(
         written(folder / "first.csv", names, quantities, 1.0)
         second = folder / "second.csv"
         written(second, ["time_s", "voltage_V", "displacement_um"], [*QUANTITIES], 3.0)
-        assert {} == options_alike(second, record_naming(source, folder))
-        assert {} == options_alike(second, None)
+        assert {} == column_options_from(second, record_naming(source, folder))
+        assert {} == column_options_from(second, None)
         assert record_naming(RecordConfig(file="first.csv"), folder) is None
 
 
@@ -151,7 +151,7 @@ def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
         (tmp_path / f"{name}.txt").rename(tmp_path / f"{name}2.txt")
     problem = folder.problem()
     np.testing.assert_allclose(problem.records["record"].voltage, voltage)
-    alike = options_alike(tmp_path / "u2.txt", problem.config.records["record"].read_as)
+    alike = column_options_from(tmp_path / "u2.txt", problem.config.records["record"].read_as)
     plan = readable(tmp_path / "u2.txt", **alike)
     measured = readable(tmp_path / "u2.txt", displacement_file=tmp_path / "x2.txt", **alike)
     assert (plan.readings, measured.readings) == (0, 300)

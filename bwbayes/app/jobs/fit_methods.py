@@ -25,7 +25,7 @@ from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
 
 
-def at_work[**P, R](
+def fit_method[**P, R](
     job: Callable[Concatenate[Run, P], R],
 ) -> Callable[Concatenate[Run, P], R]:
     """Make a job the method of a fit: it needs convergence, and warns as a command prints.

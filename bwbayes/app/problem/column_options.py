@@ -40,7 +40,7 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     return {**stated, "columns": columns, "all_columns": names}
 
 
-def options_alike(
+def column_options_from(
     path: str | Path, noted: dict[str, Any] | None, reading: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.least_squares import LeastSquares
-from bwbayes.inference.map_estimate import PointFit, fit, mode_weights
+from bwbayes.inference.map_estimate import MAPEstimate, fit, mode_weights
 from bwbayes.inference.posterior import Posterior
 from tests.diagnosis.plants import bench
 from tests.diagnosis.test_fixes import CONFIG, put
@@ -29,11 +29,11 @@ def case(name: str) -> Posterior:
 
 
 @pytest.fixture(scope="module")
-def fits() -> dict[str, tuple[Posterior, PointFit]]:
+def fits() -> dict[str, tuple[Posterior, MAPEstimate]]:
     return {name: (case(name), fit(case(name), np.random.default_rng(1))) for name in CASES}
 
 
-Fits = dict[str, tuple[Posterior, PointFit]]
+Fits = dict[str, tuple[Posterior, MAPEstimate]]
 
 
 @pytest.mark.parametrize("steps", [False, True])

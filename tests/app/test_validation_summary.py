@@ -18,7 +18,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.validation import Standing, Verdict
+from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
 
 OFF = "95% bands cover 55% of 50 readings"
 STATUS = {False: 3, None: 5}
@@ -38,9 +38,9 @@ IN_PYTHON: dict[str, Callable[[bw.Run, Path], Any]] = {
 }
 
 
-def verdict(holds: bool | None) -> Verdict:
+def verdict(holds: bool | None) -> BandValidation:
     cause = Finding("loop", "the operator", "try another") if holds is False else None
-    return Verdict("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
+    return BandValidation("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
 
 
 @pytest.fixture(
@@ -102,7 +102,7 @@ def test_python_warns_of_it(
     name: str, fit: bw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     verdicts = fit.verdicts | {"held-out": verdict(False)}
-    monkeypatch.setitem(fit.__dict__, "standing", Standing.of(verdicts.values()))
+    monkeypatch.setitem(fit.__dict__, "standing", ValidationSummary.of(verdicts.values()))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         made = IN_PYTHON[name](fit, tmp_path / "out")

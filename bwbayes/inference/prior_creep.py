@@ -36,7 +36,7 @@ from bwbayes.model.reversals import time_between_turns
 ROUNDS = 4
 
 
-def with_creep(
+def add_prior_creep(
     posterior: Posterior, draws: FloatArray, duration: float, generator: np.random.Generator
 ) -> tuple[Posterior, FloatArray]:
     """Return a fit's posterior with creep in its model, and its draws with strengths of creep.

@@ -83,7 +83,7 @@ class Explanation(Finding):
 
 
 @dataclass(frozen=True)
-class Scene:
+class ResidualAnalysis:
     """A fit of one record, and other places from which its extensions are fitted too.
 
     Attributes
@@ -127,7 +127,7 @@ class Scene:
         held_out: Sequence[slice] = (),
         begin: float = 0.0,
         study: Study | None = None,
-    ) -> Scene:
+    ) -> ResidualAnalysis:
         """Fit a posterior of one record once more, from its optima (optima, free).
 
         Something at the start of the record may have drawn the fit to an optimum that the rest of
@@ -160,7 +160,7 @@ class Scene:
         held_out = thinned_windows(held_out, stride_of(posterior, whole))
         return cls(best, whole, starts, generator, held_out, begin, study)
 
-    def with_rough_noise(self) -> Scene | None:
+    def with_rough_noise(self) -> ResidualAnalysis | None:
         """Return the same with a rough discrepancy, if it has a smooth one; else none.
 
         A smooth discrepancy takes up what an explanation is to explain, and no climb leads from

@@ -16,11 +16,11 @@ from scipy.signal import fftconvolve
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.untried import with_creep
+from bwbayes.inference.prior_creep import add_prior_creep
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import Start
+from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests import measured
@@ -99,12 +99,12 @@ def fitted(
 
 
 def predicted(posterior: Posterior, draws: FloatArray, plan: Record) -> Bands:
-    start = Start(from_rest=True, own_offset=False)
+    start = InitialConditions(from_rest=True, own_offset=False)
     return predict_record(posterior, draws, plan, start, np.random.default_rng(2))
 
 
 def extended(posterior: Posterior, draws: FloatArray, plan: Record) -> Bands:
-    longer = with_creep(posterior, draws, plan.duration, np.random.default_rng(1))
+    longer = add_prior_creep(posterior, draws, plan.duration, np.random.default_rng(1))
     return predicted(*longer, plan)
 
 
@@ -149,7 +149,7 @@ def test_a_model_that_creeps_stays_as_it_is() -> None:
     actuator = Actuator("lag", interval=INTERVAL, creep=Creep((0.1, 1.0)))
     posterior = posterior_of(voltage, readings, actuator, "discrepancy", FIXED)
     draws = posterior.prior.draw(np.random.default_rng(1), 3)
-    got, same = with_creep(posterior, draws, 1000.0, np.random.default_rng(1))
+    got, same = add_prior_creep(posterior, draws, 1000.0, np.random.default_rng(1))
     assert got is posterior
     assert same is draws
 
