@@ -47,7 +47,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def begun(given: Path, path: Path, **options: bool) -> CampaignFolder:
+def begun(given: Path, path: Path, **options: Any) -> CampaignFolder:
     config = config_text(given / "small.toml")
     return start(given / "records", config, given, path, **{"pictures": False, **options})
 
@@ -124,6 +124,37 @@ def test_the_command_says_which_records_were_refused_and_ends_with_2(
     assert "REFUSED: broken: broken.csv:2:" in said.err
     assert "6 records: 3 refused, 3 passed" in said.out
     assert_same_end(whole, tmp_path / "batch")
+
+
+def test_columns_and_units_of_all_records_are_said_once(bwbayes: Type, tmp_path: Path) -> None:
+    """By the options of other commands; a config's are its keys, and a campaign's do not change."""
+    folder, batch = tmp_path / "records", tmp_path / "batch"
+    folder.mkdir()
+    stand = record(0)
+    for name in ("a", "b"):
+        table = np.column_stack([stand.voltage, 1e3 * np.asarray(stand.displacement)])
+        np.savetxt(folder / f"{name}.csv", table, delimiter=";", header=f"Monitor;{name}")
+    (tmp_path / "small.toml").write_text(CONFIG)
+    command = ("campaign", folder, "--out", batch, "--unit", "displacement=V")
+    assert "units: displacement in 'V' is unknown" in bwbayes(*command).err
+    said = bwbayes(*command, "--config", tmp_path / "small.toml")
+    assert "in a config say columns, units" in said.err
+    said = bwbayes("campaign", "--resume", batch, "--fs", "3")
+    assert "--table are for a file; give a FOLDER of records" in said.err
+    reading = {
+        "columns": {"voltage": "1", "displacement": "2"},
+        "units": {"voltage": "V", "displacement": "nm"},
+        "fs": 1 / stand.interval,
+    }
+    for name in ("a", "b"):
+        origin = start(folder, "", tmp_path, batch, reading=reading)
+        read = module._run_folder(folder / f"{name}.csv", origin)[1].record
+        np.testing.assert_allclose(
+            np.asarray(read.displacement), np.asarray(stand.displacement), atol=1e-9
+        )
+        assert read.interval == pytest.approx(stand.interval)
+    with pytest.raises(InputError, match="a campaign of another config"):
+        start(folder, "", tmp_path, batch, reading={**reading, "fs": 3.0})
 
 
 def test_a_campaign_tells_what_share_of_its_combining_is_done(

@@ -18,6 +18,7 @@ from bwbayes.app.commands.shared import (
     naming_options,
     options_of,
     quiet_option,
+    refuse_beside_config,
     resumable,
     seed_option,
     show_report,
@@ -179,11 +180,7 @@ def _config_or_proposal(
 
     if is_config(path):
         config = load(path)
-        if any(value not in (None, {}) for value in naming.values()):
-            raise InputError(
-                f"{path}: --column, --unit, --fs, --table and --displacement are for a record; in "
-                "a config say columns, units, fs, table and displacement_file under [record]"
-            )
+        refuse_beside_config(path, naming)
         return config if record is None else config.with_record(record), False
     try:
         proposal = _proposed(path, path.parent, naming)

@@ -183,6 +183,15 @@ def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, An
     return reading
 
 
+def refuse_beside_config(config: Path, reading: Mapping[str, Any]) -> None:
+    """Refuse what says how a file is read beside a config, which says that itself."""
+    if any(value not in (None, {}) for value in reading.values()):
+        raise InputError(
+            f"{config}: --column, --unit, --fs, --table and --displacement are for a record; in "
+            "a config say columns, units, fs, table and displacement_file under [record]"
+        )
+
+
 def command_as_typed() -> str:
     """Return the command as it was typed, but for the options that say which columns are meant."""
     words, typed = ["bwbayes"], iter(sys.argv[1:])

@@ -11,9 +11,12 @@ from rich.console import Console
 from bwbayes.app.commands.shared import (
     FILE,
     WithParts,
+    column_options,
     options_of,
     present,
     quiet_option,
+    reading_of,
+    refuse_beside_config,
     require_new_or_resumed,
     resumable,
     seed_option,
@@ -105,6 +108,7 @@ def calibrate(
 @click.option("--resume", "resumed", type=FILE, help="Resume the campaign in this folder.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
 @click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
+@column_options
 @options_of(
     Verb("bwbayes.app.fit.calls:campaign"), "config", "folder", "overwrite", "pictures", "progress"
 )
@@ -131,6 +135,7 @@ def campaign(
         from bwbayes.app.jobs.campaign import config_text, resume, start
         from bwbayes.app.running.folder import CampaignFolder
 
+    reading = reading_of(options, folder, "a FOLDER of records")
     new = {"out": out, "config": config, "overwrite": overwrite, "pictures": no_pictures}
     require_new_or_resumed(
         "campaign", "a FOLDER of records or --resume CAMPAIGN", folder, resumed, new
@@ -138,9 +143,13 @@ def campaign(
     if folder is None:
         batch = CampaignFolder.open(Path(str(resumed)))
     else:
-        text, where = ("", folder) if config is None else (config_text(config), config.parent)
+        text, where = "", folder
+        if config is not None:
+            refuse_beside_config(config, reading)
+            text, where = config_text(config), config.parent
         out = out or Path("results") / folder.absolute().name
-        batch = start(folder, text, where, out, pictures=not no_pictures, overwrite=overwrite)
+        kept = {"pictures": not no_pictures, "overwrite": overwrite}
+        batch = start(folder, text, where, out, **kept, reading=reading)
     with resumable(batch.resuming):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
     if not quiet:

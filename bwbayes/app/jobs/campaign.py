@@ -13,10 +13,11 @@ import os
 import shutil
 import warnings
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
@@ -32,6 +33,7 @@ from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.population.specimen import specimen_of
+from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import SUFFIXES
 from bwbayes.report.outputs import save, write_summary
 
@@ -74,16 +76,20 @@ def start(
     *,
     pictures: bool = True,
     overwrite: bool = False,
+    reading: Mapping[str, Any] | None = None,
 ) -> CampaignFolder:
     """Make the folder ``out`` of a campaign, or open the same one that was begun.
 
     ``config`` is that of all ``records``, as TOML, its files relative to the folder ``where``;
-    empty lets each record propose its own. With ``pictures`` every run has figures and report.
+    empty lets each record propose its own, read as ``reading`` says, keyword arguments of
+    ``read_record``. With ``pictures`` every run has figures and report.
 
     Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
-    origin = Origin(str(records.absolute()), str(where.absolute()), pictures)
+    said = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    Naming(**said)  # what cannot be is refused before any record is
+    origin = Origin(str(records.absolute()), str(where.absolute()), pictures, said)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
@@ -173,11 +179,12 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
 
 def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Problem]:
     """Return a record's run as it stands, if it is of this record and config; a new one if not."""
-    where = Path(campaign.origin().where)
+    origin = campaign.origin()
+    where = Path(origin.where)
     if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = propose(file, where)
+        proposal = propose(file, where, Naming(**origin.reading))
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config

@@ -219,12 +219,14 @@ class CalibrationFolder(RunFolder):
 class Origin(NamedTuple):
     """Where a campaign began: the folder of its records, the folder that its config's files are in.
 
-    ``pictures`` tells whether every run draws its figures.
+    ``pictures`` tells whether every run draws its figures; ``reading`` how files are read where no
+    config says it, as keyword arguments of ``read_record``.
     """
 
     records: str
     where: str
     pictures: bool
+    reading: Mapping[str, Any] = {}
 
 
 @dataclass(frozen=True)
@@ -281,7 +283,9 @@ class CampaignFolder(Folder):
         """
         try:
             noted = json.loads(self.mark.read_bytes())
-            return Origin(str(noted["records"]), str(noted["where"]), bool(noted["pictures"]))
+            reading = dict(noted.get("reading", {}))
+            where = str(noted["records"]), str(noted["where"])
+            return Origin(*where, bool(noted["pictures"]), reading)
         except (KeyError, TypeError, ValueError):
             raise InputError(
                 f"{self.mark}: does not say which records it is about; start again with "
