@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from enum import IntEnum
 from pathlib import PurePath
 from shlex import quote
-from typing import Any
+from typing import Any, NoReturn
 
 # Of a longer text, as a stranger's file may cause, the beginning and the end are shown.
 LONGEST = 600
@@ -140,6 +140,20 @@ def path_text(path: str | PurePath) -> str:
 def one_line(text: str) -> str:
     """Return a text with blanks for line breaks and all else that does not print."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+class Renamed:
+    """An earlier name of an attribute: whoever asks for it is told the new one."""
+
+    def __init__(self, now: str) -> None:
+        self.now = now
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: object, owner: type) -> NoReturn:
+        missing = f"{owner.__name__} has no attribute {self.name!r}"
+        raise AttributeError(f"{missing}; it is {self.now} now")
 
 
 class InputWarning(UserWarning):

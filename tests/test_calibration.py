@@ -27,9 +27,9 @@ import pytest
 
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.calibration.evaluation import LIMIT, Calibration, judge
+from bwbayes.calibration.evaluation import LIMIT, Calibration, evaluate_calibration
 from bwbayes.calibration.replicates import CalibrationSetup, Replicate
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.inference.parameters import JointPrior
@@ -62,11 +62,11 @@ def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
     lines += [f"{name} = {{ prior = {text} }}" for name, text in priors.items()]
     changed = parse("[record]\nfile = 'x'\n[parameters]\n" + "\n".join(lines), "changes")
     parameters = config.parameters | changed.parameters
-    return resolve(config.model_copy(update={"parameters": parameters}), CONFIG.parent)
+    return resolve_config(config.model_copy(update={"parameters": parameters}), CONFIG.parent)
 
 
 def judged(outcome: list[Replicate]) -> Calibration:
-    return judge([one.entry for one in outcome], np.random.default_rng(SEED))
+    return evaluate_calibration([one.entry for one in outcome], np.random.default_rng(SEED))
 
 
 @pytest.mark.slow

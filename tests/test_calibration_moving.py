@@ -31,8 +31,8 @@ from scipy import stats
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import resolve
-from bwbayes.calibration.evaluation import Calibration, judge
+from bwbayes.app.problem.problem import resolve_config
+from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.replicates import CalibrationSetup, Replicate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
@@ -158,7 +158,7 @@ def typical_experiment(variant: Variant, folder: Path) -> CalibrationSetup:
     write_record(typical(0.02, 4.0, 1.0, generator), folder / "typical.csv")
     write_record(typical(0.025, 4.0, 0.7, generator), folder / "other.csv")
     text = CONFIG.format(**variant._asdict())
-    return experiment(resolve(parse(text, "typical"), folder))
+    return experiment(resolve_config(parse(text, "typical"), folder))
 
 
 Sound = tuple[CalibrationSetup, list[Replicate]]
@@ -182,7 +182,7 @@ def remarks(outcome: Calibration) -> list[str]:
 
 def figures(common: CalibrationSetup, every: list[Replicate]) -> dict[str, Any]:
     """Return what is kept of a calibration."""
-    outcome = judge([one.entry for one in every], np.random.default_rng(SEED))
+    outcome = evaluate_calibration([one.entry for one in every], np.random.default_rng(SEED))
     ranked = [one for one in every if len(one.draws)]
     return {
         "replicates": len(every),
@@ -204,7 +204,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Sound:
 
 def test_default_priors_and_records_in_motion_are_calibrated(sound: Sound) -> None:
     common, every = sound
-    outcome = judge([one.entry for one in every], np.random.default_rng(SEED))
+    outcome = evaluate_calibration([one.entry for one in every], np.random.default_rng(SEED))
     assert [] == remarks(outcome)
     assert len(outcome.unconverged) <= MOST_UNCONVERGED * len(every)
     assert together_test(every, common.posterior.prior) > LEVEL

@@ -17,7 +17,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import draws
@@ -40,7 +40,7 @@ def campaign(seed: int) -> Problem:
         "sampling": config.sampling.model_copy(update={"ess": 400.0}),
         "stand": config.stand.model_copy(update={"sample_rate": SAMPLE_RATE}),
     }
-    return resolve(config.model_copy(update=changes), RUNS)
+    return resolve_config(config.model_copy(update=changes), RUNS)
 
 
 def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:

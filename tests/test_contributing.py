@@ -177,8 +177,8 @@ def product(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, Any], t
     shutil.copytree(folder / "my", folder / "failed")
     numbers = json.loads((folder / "failed/summary.json").read_text())
     numbers["validation"]["held-out"] |= {
-        "holds": False,
-        "verdict": "held-out: it does not hold",
+        "passed": False,
+        "message": "held-out: it does not hold",
     }
     (folder / "failed/summary.json").write_text(json.dumps(numbers))
     lines = [

@@ -18,7 +18,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
@@ -46,7 +46,7 @@ def replicate(seed: int, discrepancy: str) -> Replicate:
         'discrepancy = "process"', f'discrepancy = "{discrepancy}"'
     )
     config = parse(re.sub(r"ess = \d+", "ess = 500", text), "coverage")
-    problem = resolve(config.model_copy(update={"seed": seed}), CONFIG.parent)
+    problem = resolve_config(config.model_copy(update={"seed": seed}), CONFIG.parent)
     posterior = problem.posterior
     outcome, chain = sampled(problem)
     assert outcome.converged, outcome.stop_reason

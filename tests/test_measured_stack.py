@@ -21,7 +21,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import InitialConditions
-from bwbayes.prediction.prediction import predict_record, thinned
+from bwbayes.prediction.prediction import predict_record, thin_draws
 from bwbayes.record import Record, read_record
 from tests.app import small
 
@@ -192,7 +192,7 @@ def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
     fit = finished(RunFolder.open(folder))
-    return fit.problem.posterior, thinned(fit.flat_draws, np.random.default_rng(1))
+    return fit.problem.posterior, thin_draws(fit.flat_draws, np.random.default_rng(1))
 
 
 def cut(record: Record, number: int, transient: float = 0.0) -> Record:
@@ -252,7 +252,7 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     assert parts["converged"]
     fit = finished(RunFolder.open(parts_folder))
     # So many draws are enough: most of their band is the discrepancy.
-    chosen = thinned(fit.flat_draws, np.random.default_rng(1), 250)
+    chosen = thin_draws(fit.flat_draws, np.random.default_rng(1), 250)
     usual, knocked = on_cuts(fit.problem.posterior, chosen)
     plain, _ = plain_on_cuts
     assert 0.88 <= usual[0] <= 0.99

@@ -21,7 +21,7 @@ from rich.console import Console
 
 import bwbayes
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
@@ -202,7 +202,7 @@ def test_an_operator_from_outside_goes_all_the_way(
     """
     kind = "TanhLoop"
     small.without_pictures(monkeypatch)
-    folder = RunFolder.create(tmp_path / "run", resolve(config(tmp_path, kind), tmp_path))
+    folder = RunFolder.create(tmp_path / "run", resolve_config(config(tmp_path, kind), tmp_path))
     result = resume(folder, Console(quiet=True), workers=1)
     assert result.outcome.converged
     summary = json.loads(folder.summary.read_text(encoding="utf-8"))
@@ -220,7 +220,7 @@ def test_an_operator_from_outside_goes_all_the_way(
 def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     """Of a problem whose truth may be stated in the operator's own parameters."""
     stated = config(tmp_path, kind).model_copy(update={"truth": TRUTH[kind]})
-    posterior = resolve(stated, tmp_path).posterior
+    posterior = resolve_config(stated, tmp_path).posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)
@@ -277,7 +277,7 @@ def test_what_is_no_operator_is_one_clear_line(
     monkeypatch.syspath_prepend(tmp_path)
     bwbayes.write_record(record_of("TanhLoop"), tmp_path / "record.csv")
     with pytest.raises(InputError, match=r"^model\.hysteresis: [^\n]*$") as refused:
-        resolve(parse(CONFIG.replace("HYSTERESIS", name), "outside.toml"), tmp_path)
+        resolve_config(parse(CONFIG.replace("HYSTERESIS", name), "outside.toml"), tmp_path)
     assert said in str(refused.value)
 
 

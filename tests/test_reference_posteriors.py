@@ -23,7 +23,7 @@ import pytest
 
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
@@ -71,7 +71,7 @@ def reference(
         write_record(thinned, folder / "thinned.h5")
         source = RecordConfig(file="thinned.h5", train=config.records["record"].train)
         config = config.model_copy(update={"record": source})
-    return Reference(resolve(config, folder), case, result)
+    return Reference(resolve_config(config, folder), case, result)
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def answer(fitted: Record, other: Record, every: int, noise: str, folder: Path) 
     source = np.random.default_rng([82, every])
     draws, weights = weighted_draws(problem.posterior, source)
     chosen = draws[source.choice(len(draws), KEPT, p=weights)]
-    start = InitialConditions(from_rest=True, own_offset=False)
+    start = InitialConditions(from_rest=True, estimate_offset=False)
     bands = predict_record(problem.posterior, chosen, other, start, source)
     assert bands.measured is not None
     columns = [problem.posterior.names.index(name) for name in SHAPE]

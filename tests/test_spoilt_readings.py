@@ -72,11 +72,11 @@ def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: i
     (remark,) = (line for line in aside.problem.remarks if "set aside" in line)
     assert remark.startswith("10 readings set aside as isolated outliers, at ")
     assert width(aside.bands["rest"]) == pytest.approx(width(clean.bands["rest"]), rel=0.1)
-    assert aside.verdicts["training"].holds is not False
+    assert aside.validation["training"].passed is not False
     # The twin: left in, they widen the bands, and the verdict says why.
     assert width(left_in.bands["rest"]) > 1.5 * width(clean.bands["rest"])
-    verdict = left_in.verdicts["training"]
-    assert verdict.holds is False
+    verdict = left_in.validation["training"]
+    assert verdict.passed is False
     assert verdict.cause is not None
     assert "outliers" == verdict.cause.kind
 

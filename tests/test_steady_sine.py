@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.record import write_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
@@ -38,7 +38,7 @@ def steady_sine(seed: int, folder: Path) -> Problem:
     path = folder / f"sine_{seed}.csv"
     write_record(record, path)
     config = parse(f'seed = {seed}\n[record]\nfile = "{path.name}"\n', "steady sine")
-    return resolve(config, folder)
+    return resolve_config(config, folder)
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -15,7 +15,7 @@ from scipy import linalg, stats
 
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.replicates import CalibrationSetup, Replicate, replicates
+from bwbayes.calibration.replicates import CalibrationSetup, Replicate, run_replicates
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior
 
@@ -30,7 +30,7 @@ Plant = Callable[[FloatArray], FloatArray]
 def made(common: CalibrationSetup, count: int, seed: int = SEED) -> list[Replicate]:
     """Make so many replicates, on one thread."""
     with one_thread(), ThreadPoolExecutor(1) as pool:
-        return list(replicates(common, seed, range(count), pool))
+        return list(run_replicates(common, seed, range(count), pool))
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,7 @@ class Calibration:
         }
 
 
-def judge(entries: Sequence[Entry], generator: np.random.Generator) -> Calibration:
+def evaluate_calibration(entries: Sequence[Entry], generator: np.random.Generator) -> Calibration:
     """Judge replicates.
 
     Parameters

@@ -25,7 +25,7 @@ from bwbayes.errors import one_line
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
-from bwbayes.prediction.prediction import predict_windows, thinned
+from bwbayes.prediction.prediction import predict_windows, thin_draws
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
@@ -132,7 +132,7 @@ class Replicate:
     draws: FloatArray
 
 
-def replicates(
+def run_replicates(
     experiment: CalibrationSetup,
     seed: int,
     numbers: Iterable[int],
@@ -210,7 +210,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     chained, time = draws(posterior, chain), float(np.max(outcome.check.autocorrelation))
     longest = chained[..., 0].size // RANKED
     spacing = max(min(math.ceil(time) if math.isfinite(time) else 1, longest), 1)
-    free = thinned(chained[::-spacing].reshape(-1, chained.shape[-1]), choosing, RANKED)
+    free = thin_draws(chained[::-spacing].reshape(-1, chained.shape[-1]), choosing, RANKED)
     entry["converged"], entry["stop_reason"] = outcome.converged, outcome.stop_reason
     entry["steps"], entry["spacing"] = outcome.check.steps, spacing
     if len(free) < RANKED:
@@ -218,7 +218,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     drawn = experiment.measures(posterior, posterior.prior.theta(free))
     entry["ranks"] = dict(zip(names, np.sum(drawn < truth, axis=0).tolist(), strict=True))
     # Fewer draws than a run's, to save time.
-    flat = thinned(chained.reshape(-1, free.shape[1]), predicting, 400)
+    flat = thin_draws(chained.reshape(-1, free.shape[1]), predicting, 400)
     predictions = _predictions(experiment, posterior, flat, theta, simulated, predicting, others)
     entry["covered"] = {
         f"{name} {kind} {level}".strip(): share

@@ -30,7 +30,7 @@ from bwbayes.model.limits import Limits
 from bwbayes.watching import Watch, part, unwatched, watched
 
 
-def promises(
+def rank_designs(
     posterior: Posterior,
     draws: FloatArray,
     candidates: Mapping[str, FloatArray],
@@ -130,7 +130,7 @@ def promises(
         shares = np.array(remaining) / before
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
         scores.append(DesignScore(name, float(np.mean(shares)), error))
-    return sorted(scores, key=lambda promise: (bool(promise.refused), promise.left, promise.name))
+    return sorted(scores, key=lambda score: (bool(score.refused), score.sd_ratio, score.name))
 
 
 def _planned(posterior: Posterior, voltage: FloatArray) -> Posterior:

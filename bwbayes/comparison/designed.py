@@ -34,13 +34,13 @@ from bwbayes.shown import brief
 
 @dataclass(frozen=True)
 class DesignScore:
-    """What a candidate promises.
+    """Expected remaining standard deviation of a candidate signal.
 
     Attributes
     ----------
     name
         The candidate's name.
-    left
+    sd_ratio
         The part of the standard deviation that would be left: of the parameter, or of the
         parameter band's mean width along the chosen drive; nan if it is refused.
     error
@@ -52,7 +52,7 @@ class DesignScore:
     __repr__ = brief
 
     name: str
-    left: float
+    sd_ratio: float
     error: float
     refused: str = ""
 
@@ -75,8 +75,8 @@ class Design(Product, Sequence[DesignScore]):
         Their sampling interval, s.
     standing
         How the validation of the run came out.
-    promises
-        What each candidate promises, the best first; the first is not refused.
+    scores
+        The score of each candidate, the best first; the first is not refused.
     """
 
     NAME: ClassVar[str] = "design"
@@ -89,38 +89,38 @@ class Design(Product, Sequence[DesignScore]):
     signals: Mapping[str, FloatArray]
     interval: float
     standing: ValidationSummary
-    promises: Sequence[DesignScore]
+    scores: Sequence[DesignScore]
 
     @overload
     def __getitem__(self, index: int) -> DesignScore: ...
     @overload
     def __getitem__(self, index: slice) -> Sequence[DesignScore]: ...
     def __getitem__(self, index: int | slice) -> DesignScore | Sequence[DesignScore]:
-        return self.promises[index]
+        return self.scores[index]
 
     def __len__(self) -> int:
-        return len(self.promises)
+        return len(self.scores)
 
     @property
     def best(self) -> DesignScore:
         """The best candidate."""
-        return self.promises[0]
+        return self.scores[0]
 
     @property
-    def left(self) -> str:
+    def quantity(self) -> str:
         """What the promises are parts of, in words."""
         if self.parameter is not None:
             return f"sd left of {self.parameter}"
         return f"width left of the band along {self.drive}"
 
     @property
-    def alike(self) -> list[str]:
+    def tied(self) -> list[str]:
         """The candidates that cannot be told apart from the best."""
         best = self.best
         return [
-            promise.name
-            for promise in self.promises[1:]
-            if promise.left - best.left < 2 * float(np.hypot(promise.error, best.error))
+            score.name
+            for score in self.scores[1:]
+            if score.sd_ratio - best.sd_ratio < 2 * float(np.hypot(score.error, best.error))
         ]
 
     def records(self) -> dict[str, Record]:
@@ -135,7 +135,7 @@ class Design(Product, Sequence[DesignScore]):
             "target": self.parameter or self.drive or "",
             "best": self.best.name,
             "amplifier": asdict(self.amplifier),
-            "candidates": [asdict(promise) for promise in self.promises],
+            "candidates": [asdict(score) for score in self.scores],
         }
 
     def report(self) -> Report:
@@ -144,17 +144,19 @@ class Design(Product, Sequence[DesignScore]):
         from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415
 
         best, amplifier = self.best, self.amplifier
-        feasible = [promise for promise in self.promises if not promise.refused]
-        names = [promise.name for promise in feasible]
-        remaining, error = np.array([(p.left, p.error) for p in feasible]).T
-        lines = [f"{self.left} after one more record of it: {best.left:.1%} ± {best.error:.1%}"]
-        if self.alike:
-            lines.append(f"not to be told apart from it: {', '.join(self.alike)}")
+        feasible = [score for score in self.scores if not score.refused]
+        names = [score.name for score in feasible]
+        remaining, error = np.array([(p.sd_ratio, p.error) for p in feasible]).T
+        lines = [
+            f"{self.quantity} after one more record of it: {best.sd_ratio:.1%} ± {best.error:.1%}"
+        ]
+        if self.tied:
+            lines.append(f"indistinguishable from it: {', '.join(self.tied)}")
         limits = amplifier.low, amplifier.high
         rate = f", at most {amplifier.rate:.4g} V/s" if np.isfinite(amplifier.rate) else ""
         facts = [
             ("Run", self.run),
-            ("To be known better", self.left.replace(" left", "")),
+            ("To be known better", self.quantity.replace(" left", "")),
             ("Amplifier", "{:.4g} to {:.4g} V".format(*limits) + rate),
             ("Sampling interval", f"{self.interval:g} s"),
         ]
@@ -166,7 +168,7 @@ class Design(Product, Sequence[DesignScore]):
                 *standing_banner(self.standing),
                 Banner(kind_of(self.standing), f"Best: {best.name}", lines),
                 *remarks_banner(
-                    [f"{p.name} {p.refused}" for p in self.promises if p.refused],
+                    [f"{p.name} {p.refused}" for p in self.scores if p.refused],
                     "What the amplifier cannot make",
                 ),
             ],
@@ -177,7 +179,7 @@ class Design(Product, Sequence[DesignScore]):
                     "What each candidate would leave",
                     "The part that is expected to be left after one more record, with two Monte "
                     "Carlo errors to either side; at 100% a signal teaches nothing new.",
-                    partial(draw_promises, names, remaining, error, self.left),
+                    partial(draw_promises, names, remaining, error, self.quantity),
                 ),
                 replace(signal, name="best", title=f"The best signal: {best.name}", caption=shown),
                 Section("Request", [Facts(facts)], folded=False),
@@ -187,14 +189,14 @@ class Design(Product, Sequence[DesignScore]):
 
     def _table(self) -> Table:
         rows = []
-        for promise in self.promises:
-            voltage = self.signals[promise.name]
+        for score in self.scores:
+            voltage = self.signals[score.name]
             fastest = float(np.max(np.abs(np.diff(voltage)))) / self.interval
-            numbers = (promise.left, promise.error)
+            numbers = (score.sd_ratio, score.error)
             rows.append(
                 (
-                    promise.name,
-                    *("–" if promise.refused else f"{number:.1%}" for number in numbers),
+                    score.name,
+                    *("–" if score.refused else f"{number:.1%}" for number in numbers),
                     f"{voltage.min():.4g} V",
                     f"{voltage.max():.4g} V",
                     f"{fastest:,.0f} V/s",
@@ -206,10 +208,12 @@ class Design(Product, Sequence[DesignScore]):
         )
         return Table(
             "candidates",
-            self.left.capitalize() if self.parameter is None else f"SD left of {self.parameter}",
+            self.quantity.capitalize()
+            if self.parameter is None
+            else f"SD left of {self.parameter}",
             ("Candidate", "Left", "Error", *signal),
             rows,
-            records=[asdict(promise) for promise in self.promises],
+            records=[asdict(score) for score in self.scores],
             note="The error is that of Monte Carlo. Expected from the posterior's draws, with the "
             "model made linear in its parameters at each: what a fit would gain from a new record "
             "with an offset and an initial state of its own (none where the record that was fitted "

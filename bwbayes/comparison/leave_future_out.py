@@ -22,7 +22,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.prediction import thin_draws
 from bwbayes.sampling.chain import Phase, draws
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, autocorrelation_time
 from bwbayes.sampling.plan import SamplingPlan
@@ -220,7 +220,7 @@ def _scored(
     watch: Watch,
 ) -> Part:
     """Score the blocks on the way from the first posterior to the last; ``drawn`` are draws."""
-    chosen = {number: thinned(flat, rng, DRAWS) for number, flat in drawn.items()}
+    chosen = {number: thin_draws(flat, rng, DRAWS) for number, flat in drawn.items()}
     theta = path[0].prior.theta(np.concatenate([*chosen.values()]))
     log_likelihood = np.stack([p.log_likelihood(theta) for p in watched(path, watch)])
     counts = {number: len(flat) for number, flat in chosen.items()}
@@ -246,7 +246,7 @@ def _fitted(
 ) -> FloatArray | None:
     """Draw from the posterior of other readings, from draws of one nearby; None if that fails."""
     prior = posterior.prior
-    coordinates = prior.unconstrain(thinned(flat, rng, DRAWS))
+    coordinates = prior.unconstrain(thin_draws(flat, rng, DRAWS))
     density = posterior.log_density(coordinates)
     best = coordinates[np.argmax(density)]
     wide = np.atleast_2d(np.cov(prior.unconstrain(prior.draw(rng, DRAWS)), rowvar=False))

@@ -207,7 +207,7 @@ class Exported(Product):
         return environment.get_template("actuator.c.j2").render(
             **self.numbers(),
             parts_line=f"Parts: {', '.join(parts)}.",
-            warnings=[line for text in self.standing.said for line in wrap(text, 92)],
+            warnings=[line for text in self.standing.messages for line in wrap(text, 92)],
             held=actuator.hold == "zero",
             hysteresis_is=to_ascii(type(step).__doc__ or "").split("\n\n")[0],
             parameters_are=to_ascii(step.ROW),

@@ -242,7 +242,7 @@ class Compensation(Product):
         from bwbayes.report.figures import control as figures  # noqa: PLC0415  # slow to load
 
         name, shown = self.reference.name, (self.asked, self._commands)
-        validation = "" if self.standing.holds else f", validation {self.standing.status}"
+        validation = "" if self.standing.passed else f", validation {self.standing.status}"
         kind: BannerKind = kind_of(self.standing)
         if self.limit_kept is not True:
             validation += f", limit {'NOT KEPT' if self.limit_kept is False else 'uncertain'}"
@@ -350,7 +350,7 @@ class Compensation(Product):
 
     def __repr__(self) -> str:
         promise = f"compensation for {self.reference.name}: {self._promise()}"
-        return "\n".join([*self.standing.said, promise.replace("µ", "u")])
+        return "\n".join([*self.standing.messages, promise.replace("µ", "u")])
 
 
 def _span(edges: Sequence[float]) -> str:

@@ -45,8 +45,8 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "start": (
         "the start of the record (large residuals until {settled} s)",
-        "set lead_in_from = {settled} in [validation.{name}], or predict with "
-        "--lead-in-from {settled}",
+        "set lead_in_start = {settled} in [validation.{name}], or predict with "
+        "--lead-in-start {settled}",
     ),
     "drift": (
         "a drift of the readings",
@@ -63,7 +63,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "offset": (
         "an offset of {size} um",
-        "set own_offset = true and a longer lead_in in [validation.{name}], or predict with "
+        "set estimate_offset = true and a longer lead_in in [validation.{name}], or predict with "
         "--lead-in and without --same-offset",
     ),
     "gain": ("another gain (another actuator, load or sensor range)", REFIT),
@@ -107,8 +107,8 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
         return Finding(
             "lead-in",
             "a start that the lead-in does not show (a transient, a drift, or another actuator)",
-            f"set lead_in_from = {stop} in [validation.{bands.name}], or predict with "
-            f"--lead-in-from {stop}; a longer --lead-in or a --window may help too",
+            f"set lead_in_start = {stop} in [validation.{bands.name}], or predict with "
+            f"--lead-in-start {stop}; a longer --lead-in or a --window may help too",
             nats=likely.nats,
         )
     kinds = set(likely.kind.split(" or "))

@@ -18,7 +18,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study
-from bwbayes.inference.thinning import readings_at, stride_of, thin, thinned, thinned_windows
+from bwbayes.inference.thinning import readings_at, stride_of, thin, thin_posterior, thinned_windows
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
@@ -134,7 +134,7 @@ class ResidualAnalysis:
         it does not have: a fit of the rest says where else to start from.
         """
         theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
-        whole, posterior = posterior, thinned(posterior, theta, READINGS)
+        whole, posterior = posterior, thin_posterior(posterior, theta, READINGS)
         if posterior is not whole:
             posterior = posterior.altered(displacement=readings_at(posterior, whole, theta))
         rows = posterior.only.readings.rows

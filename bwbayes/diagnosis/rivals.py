@@ -21,7 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study
-from bwbayes.inference.thinning import stride_of, thin, thinned
+from bwbayes.inference.thinning import stride_of, thin, thin_posterior
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
@@ -63,7 +63,7 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
     whole = study.posterior
     place = map_estimate.local_minima(whole, rng, 1)[0]
     theta = whole.prior.theta(whole.prior.constrain(place[np.newaxis])[0])
-    stride = stride_of(thinned(whole, theta, READINGS), whole)
+    stride = stride_of(thin_posterior(whole, theta, READINGS), whole)
     known = dict(zip(whole.names, place.tolist(), strict=True))
     fits = []
     for spec in families(study.spec):

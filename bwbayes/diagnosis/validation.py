@@ -33,7 +33,7 @@ from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, joined
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.errors import ExitStatus
+from bwbayes.errors import ExitStatus, InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, titled
 from bwbayes.record.io.grid import clock
@@ -98,7 +98,7 @@ class BandValidation:
     ----------
     name, training, separate
         Those of the bands.
-    holds
+    passed
         False if the bands fail one of the tests; None if luck may have passed or failed them, or
         the record is too short to tell.
     reasons
@@ -114,7 +114,7 @@ class BandValidation:
 
     name: str
     training: bool
-    holds: bool | None
+    passed: bool | None
     reasons: tuple[str, ...] = ()
     cause: Finding | None = None
     notes: tuple[str, ...] = ()
@@ -123,7 +123,7 @@ class BandValidation:
     @property
     def status(self) -> str:
         """The outcome in a word."""
-        return STATUSES[self.holds]
+        return STATUSES[self.passed]
 
     @property
     def where(self) -> str:
@@ -140,8 +140,8 @@ class BandValidation:
     def summary(self) -> dict[str, object]:
         """The verdict as ``validation.NAME`` in summary.json has it."""
         return {
-            "holds": self.holds,
-            "verdict": self.line,
+            "passed": self.passed,
+            "message": self.line,
             "reasons": list(self.reasons),
             "cause": None if self.cause is None else self.cause.kind,
             "fix": None if self.cause is None else self.cause.fix,
@@ -155,64 +155,68 @@ class ValidationSummary:
 
     Attributes
     ----------
-    holds
+    passed
         False if they fail anywhere; else None if validation is inconclusive anywhere.
     lines
         What is off, a line for each record or window that fails, or that is inconclusive.
     """
 
-    holds: bool | None = True
+    passed: bool | None = True
     lines: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, verdicts: Iterable[BandValidation]) -> Self:
+    def of(cls, validation: Iterable[BandValidation]) -> Self:
         """Return what the verdicts of a run come to."""
-        return cls._of((verdict.holds, verdict.line) for verdict in verdicts)
+        return cls._of((verdict.passed, verdict.line) for verdict in validation)
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> Self:
         """Return what a converged run's ``summary.json`` says."""
         every = (summary.get("validation") or {}).items()
-        return cls._of((entry["holds"], entry.get("verdict", name)) for name, entry in every)
+        if any("passed" not in entry for _, entry in every):
+            raise InputError(
+                "summary.json: is an earlier version's; remove it and write it by `bwbayes resume`"
+            )
+        return cls._of((entry["passed"], entry.get("message", name)) for name, entry in every)
 
     @classmethod
     def _of(cls, answers: Iterable[tuple[bool | None, str]]) -> Self:
         every = list(answers)
-        for holds in (False, None):
-            lines = tuple(line for answer, line in every if answer is holds)
+        for passed in (False, None):
+            lines = tuple(line for answer, line in every if answer is passed)
             if lines:
-                return cls(holds, lines)
+                return cls(passed, lines)
         return cls()
 
     @property
     def status(self) -> str:
         """The outcome in a word."""
-        return STATUSES[self.holds]
+        return STATUSES[self.passed]
 
     @property
     def exit_status(self) -> ExitStatus:
         """What a command ends with that builds on it."""
         statuses = {False: ExitStatus.VALIDATION_FAILED, None: ExitStatus.VALIDATION_INCONCLUSIVE}
-        return statuses.get(self.holds, ExitStatus.SUCCESS)
+        return statuses.get(self.passed, ExitStatus.SUCCESS)
 
     @property
     def headline(self) -> str:
         """What stands above the lines; nothing if validation passed."""
         titles = {True: "", False: "VALIDATION FAILED", None: "Validation inconclusive"}
-        return titles[self.holds]
+        return titles[self.passed]
 
     @property
-    def said(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """What to say of it, a line each; nothing if validation passed."""
         return tuple(f"{self.headline}: {line}" for line in self.lines)
 
     @property
     def numbers(self) -> dict[str, object]:
         """What files of numbers have of it."""
-        return {"status": self.status, "verdicts": list(self.lines)}
+        return {"status": self.status, "messages": list(self.lines)}
 
 
-def assess(
+def validate_bands(
     bands: Bands,
     background: ValidationContext,
     *,
@@ -256,7 +260,7 @@ def assess(
             if reasons[0].startswith("the readings fall")
             else cause(bands, background.memory, beyond)
         )
-        return replace(doubted, holds=False, reasons=tuple(reasons), cause=why)
+        return replace(doubted, passed=False, reasons=tuple(reasons), cause=why)
     doubts = [
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"
         for text, chance in standard.chances()
@@ -279,7 +283,7 @@ def assess(
             f"bands; use a record {least / standard.effective_size:.2g} times as long"
         )
     return (
-        replace(doubted, holds=None, reasons=tuple(doubts), cause=followed or better)
+        replace(doubted, passed=None, reasons=tuple(doubts), cause=followed or better)
         if doubts
         else verdict
     )

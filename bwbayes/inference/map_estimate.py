@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.mode_finding import Mode, Target, refine
-from bwbayes.inference.thinning import thinned
+from bwbayes.inference.thinning import thin_posterior
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 
@@ -73,7 +73,7 @@ def fit(
     """
     # Drawn aside: what a short record is fitted from does not depend on them.
     probes = posterior.prior.theta(posterior.prior.draw(generator.spawn(1)[0], PROBES))
-    short = thinned(posterior, probes, SAMPLES)
+    short = thin_posterior(posterior, probes, SAMPLES)
     modes: list[Mode] = []
     if short is posterior:
         places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))

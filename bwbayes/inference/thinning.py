@@ -23,7 +23,7 @@ from bwbayes.model.reversals import monotone_stretches
 ERROR = 1e-3
 
 
-def thinned(posterior: Posterior, theta: FloatArray, samples: int) -> Posterior:
+def thin_posterior(posterior: Posterior, theta: FloatArray, samples: int) -> Posterior:
     """Thin each record of a posterior to so many samples, or as few as its displacement allows.
 
     That of most models at θ (models, parameters) changes by no more than :data:`ERROR`. A posterior

@@ -19,7 +19,7 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.population.normal import NormalLikelihoods
-from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.prediction import thin_draws
 
 # Draws of a specimen that are kept.
 DRAWS = 1000
@@ -87,7 +87,7 @@ def specimen_of(
         if column.name in table.physical and column.declaration.scope == "actuator"
     }
     columns = [i for i, p in enumerate(prior.free) if p.name in of_actuator]
-    chosen = thinned(draws, generator, DRAWS)
+    chosen = thin_draws(draws, generator, DRAWS)
     before = prior.draw(generator, 2000)
     logarithmic = np.array([prior.free[i].positive for i in columns], dtype=np.bool_)
     y = _coordinates(chosen[:, columns], logarithmic)

@@ -43,13 +43,13 @@ class InitialConditions:
         The actuator starts demagnetized and at rest: the voltage came from zero volts. Otherwise
         h is a state that an earlier drive within the voltage range could have left, and the
         dynamics may be moving.
-    own_offset
+    estimate_offset
         The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
         the training record, as it is for a planned voltage without a measurement.
     lead_in
         Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
         the discrepancy at most: after these the offset hardly widens the bands.
-    lead_in_from
+    lead_in_start
         Time at which it begins, s; by default that of the record's first sample. What comes before
         is simulated.
     hold
@@ -66,9 +66,9 @@ class InitialConditions:
     __repr__ = brief
 
     from_rest: bool = False
-    own_offset: bool = True
+    estimate_offset: bool = True
     lead_in: float | None = None
-    lead_in_from: float | None = None
+    lead_in_start: float | None = None
     hold: Hold | None = None
     after: bool = False
     settled: bool = False
@@ -91,9 +91,9 @@ class InitialConditions:
             )
         if record.displacement is None:
             return None
-        if self.from_rest and not self.own_offset and not self.after:
+        if self.from_rest and not self.estimate_offset and not self.after:
             return None
-        begin = record.start if self.lead_in_from is None else self.lead_in_from
+        begin = record.start if self.lead_in_start is None else self.lead_in_start
         first = round((begin - record.start) / record.interval)
         # White noise forgets at once: then a hundred readings tell the offset.
         longest = max(10 * memory, 100 * record.interval)
@@ -178,7 +178,7 @@ def estimate_initial_states(
     actuator = replace(training.actuator, interval=record.interval, hold=hold, span=span)
     memory = training.noise.correlation_time(training.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
-    own_offset = start.own_offset and window is not None
+    estimate_offset = start.estimate_offset and window is not None
     readings = Readings.of(np.zeros(1), [slice(0, 1)])
     if window is not None:
         assert record.displacement is not None
@@ -192,14 +192,14 @@ def estimate_initial_states(
         start.from_rest,
         span.half,
         # As wide as what was fitted: where this record's sensor was set to zero, nothing says.
-        training.extent if own_offset else 0.0,
+        training.extent if estimate_offset else 0.0,
     )
     theta, redrawn = _of_new_record(posterior, theta, start, generator)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
     likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
     if window is None:
         return _unseen(likelihoods, theta, generator, settled=start.settled)
-    if own_offset:
+    if estimate_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
         theta = whole.table.replaced(theta, "offset", level)
@@ -356,7 +356,7 @@ def _informed(
     window: slice,
     generator: np.random.Generator,
 ) -> InitialStates:
-    """Let the lead-in tell offset and initial transient of draws θ whose initial state is chosen."""
+    """Estimate offset and initial transient of draws θ, given their initial states."""
     likelihood = histories.likelihoods[0]
     posterior = LinearStart(*histories.each(theta, Likelihood.start))
     offsets = int(likelihood.offset_sd > 0)

@@ -59,7 +59,7 @@ class TailScales(NamedTuple):
     logs: FloatArray
 
 
-def thinned(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
+def thin_draws(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
     """Choose ``count`` of the draws (any, free) without repetition; all, if there are fewer."""
     if draws.shape[0] <= count:
         return draws

@@ -236,7 +236,7 @@ def _flat(blocks: Sequence[Block]) -> Iterator[Block]:
 
 def kind_of(standing: ValidationSummary, *, good: bool = True) -> Kind:
     """Return the kind of a banner: good only if the run's validation passed, too."""
-    return "good" if good and standing.holds else "note"
+    return "good" if good and standing.passed else "note"
 
 
 def remarks_banner(remarks: Sequence[str], headline: str = "Remarks") -> list[Banner]:
@@ -249,7 +249,7 @@ def standing_banner(standing: ValidationSummary, on: Target = "both") -> list[Ba
     if not standing.lines:
         return []
     about = [Text("Validation of the run that this report builds on:")]
-    kind: Kind = "note" if standing.holds is None else "bad"
+    kind: Kind = "note" if standing.passed is None else "bad"
     return [Banner(kind, standing.headline, items=standing.lines, blocks=about, on=on)]
 
 

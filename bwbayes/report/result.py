@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from bwbayes.diagnosis.innovations import Innovations
 from bwbayes.diagnosis.predictive_checks import PredictiveChecks
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
+from bwbayes.errors import Renamed
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.loops import Loops
@@ -29,14 +30,6 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import StepResponse
 from bwbayes.sampling.diagnostics import SamplingResult
 from bwbayes.shown import brief
-
-RENAMED = {
-    "agreement": "consistency",
-    "bands": "predictions",
-    "learned": "information_gain",
-    "replicated": "posterior_checks",
-    "steps": "step_responses",
-}
 
 
 @dataclass(frozen=True)
@@ -55,7 +48,7 @@ class Result:
         density is that of the chain's own.
     moves
         How often each kind of move was proposed to a walker for these draws, and accepted.
-    predictions, scores, verdicts
+    predictions, scores, validation
         Of all that was predicted; by the bands' names, for those with a measurement, their scores,
         and whether they hold. Empty unless converged, as is all that was worked out below.
     innovations, drive_locks, consistency, explanations, posterior_checks
@@ -84,7 +77,7 @@ class Result:
     moves: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     predictions: tuple[Bands, ...] = ()
     scores: Mapping[str, Scores] = field(default_factory=dict)
-    verdicts: Mapping[str, BandValidation] = field(default_factory=dict)
+    validation: Mapping[str, BandValidation] = field(default_factory=dict)
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
     loops: Loops | None = None
@@ -97,12 +90,13 @@ class Result:
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> object:
-            """Say what is called otherwise now."""
-            now = f"; it is {RENAMED[name]} now" if name in RENAMED else ""
-            raise AttributeError(f"a result has no attribute {name!r}{now}")
+    # Earlier names
+    agreement = Renamed("consistency")
+    bands = Renamed("predictions")
+    learned = Renamed("information_gain")
+    replicated = Renamed("posterior_checks")
+    steps = Renamed("step_responses")
+    verdicts = Renamed("validation")
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -122,13 +116,14 @@ class Result:
     @property
     def standing(self) -> ValidationSummary:
         """Whether all bands hold."""
-        return ValidationSummary.of(self.verdicts.values())
+        return ValidationSummary.of(self.validation.values())
 
     @property
-    def validation(self) -> dict[str, dict[str, Any]]:
+    def validation_numbers(self) -> dict[str, dict[str, Any]]:
         """Scores and verdict of all bands that have readings, by name."""
         return {
-            name: scores.numbers | (self.verdicts[name].summary if name in self.verdicts else {})
+            name: scores.numbers
+            | (self.validation[name].summary if name in self.validation else {})
             for name, scores in self.scores.items()
         }
 
@@ -195,9 +190,9 @@ def summary(result: Result) -> dict[str, object]:
     gain = result.information_gain
     return numbers | {
         "parameters": result.estimates,
-        "validation": result.validation,
+        "validation": result.validation_numbers,
         # No other drives: what a model lacks is of another size there.
-        "validated_drives": result.facts.get("drive") if result.standing.holds else None,
+        "validated_drives": result.facts.get("drive") if result.standing.passed else None,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.step_responses.items()},

@@ -40,7 +40,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     Of its ``numbers`` the ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` are shown if they
     are there, and without convergence ``go_on``, the command that goes on.
     """
-    if result.verdicts and all(verdict.training for verdict in result.verdicts.values()):
+    if result.validation and all(verdict.training for verdict in result.validation.values()):
         nothing = (
             "no readings are held out: the bands are validated on the training readings alone. "
             "Fix: leave a window out of train, and write it under [validation.held_out], as "
@@ -67,7 +67,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
     text = f"sampling: {check.steps} steps; acceptance: {accepted}; {cover}"
     moves = [Text(text, on="screen")]
-    if result.outcome.converged and result.verdicts and not result.standing.headline:
+    if result.outcome.converged and result.validation and not result.standing.headline:
         moves.append(Text(f"validation passed {drives_like(result.facts)}", on="screen"))
     shown = ("record", "fitted", "model", "noise")
     about = [f"{s}: {fact}" for s, fact in result.facts.items() if s.partition(" ")[0] in shown]
@@ -90,17 +90,17 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
         return [_not_converged(result, numbers)]
     if not standing.headline:
         headline = "Converged"
-        if result.verdicts:
-            is_held_out = any(not verdict.training for verdict in result.verdicts.values())
+        if result.validation:
+            is_held_out = any(not verdict.training for verdict in result.validation.values())
             data = "held-out data" if is_held_out else "the training data"
             headline += f"; validation passed on {data}, {drives_like(result.facts)}"
         return [Banner("good", headline, blocks=_results(result), on="page")]
     meaning = (
         "the readings do not tell whether the bands hold"
-        if standing.holds is None
+        if standing.passed is None
         else "the bands fail validation; the parameters may be biased too"
     )
-    open_verdicts = [v for v in result.verdicts.values() if v.holds is standing.holds]
+    open_verdicts = [v for v in result.validation.values() if v.passed is standing.passed]
     explained = []
     for verdict in open_verdicts:
         why = Markup("{}.").format("; ".join(verdict.reasons))
@@ -155,7 +155,7 @@ def _results(result: Result) -> list[Text]:
     texts = []
     scored = [bands for bands in result.predictions if bands.name in result.scores]
     for bands in [bands for bands in scored if not bands.training] or scored:
-        scores, verdict = result.scores[bands.name], result.verdicts.get(bands.name)
+        scores, verdict = result.scores[bands.name], result.validation.get(bands.name)
         status = Markup("validation {}. ").format(mark(verdict.status)) if verdict else ""
         texts.append(
             Markup(
@@ -189,9 +189,9 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     if result.scores:
         titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}
         scores = {name: result.scores[name] for name in titles}
-        records = tables.flat_records({name: result.validation[name] for name in titles})
+        records = tables.flat_records({name: result.validation_numbers[name] for name in titles})
         validation = [
-            tables.scores_table(scores, result.verdicts, titles, records),
+            tables.scores_table(scores, result.validation, titles, records),
             Section(
                 "Other scores",
                 [

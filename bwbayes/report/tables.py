@@ -137,7 +137,7 @@ def replicated_tables(result: Result) -> list[Table]:
 
 def scores_table(
     scores: Mapping[str, Scores],
-    verdicts: Mapping[str, BandValidation],
+    validation: Mapping[str, BandValidation],
     titles: Mapping[str, str],
     records: Sequence[Mapping[str, object]] = (),
 ) -> Table:
@@ -157,7 +157,7 @@ def scores_table(
         row = {
             "title": titles[name],
             "name": name,
-            "status": mark(verdicts[name].status) if name in verdicts else UNKNOWN,
+            "status": mark(validation[name].status) if name in validation else UNKNOWN,
             "nrmse": judged.nrmse,
             "error": error_text(judged),
             "largest": length_text(judged.max_error_um),

@@ -66,7 +66,7 @@ window = [0.2, 0.3]
 
 [validation.other]
 file = "record.csv"
-own_offset = true
+estimate_offset = true
 lead_in = 0.1
 """,
     """\

@@ -17,7 +17,7 @@ from filelock import FileLock
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 
 TEXT = """\
@@ -59,7 +59,7 @@ def config(*changes: tuple[str, str], text: str = TEXT) -> Config:
 
 def begun(path: Path, *changes: tuple[str, str]) -> RunFolder:
     """Return the folder of a run before its first step."""
-    return RunFolder.create(path, resolve(config(*changes), path.parent))
+    return RunFolder.create(path, resolve_config(config(*changes), path.parent))
 
 
 def typed(command: click.Command, *words: object) -> int:

@@ -17,7 +17,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import config_text, resume, start
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.progress import batch
@@ -102,7 +102,7 @@ def test_a_records_run_is_what_the_run_command_makes(
     file = given / "records/s000.csv"
     text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
     alone = resume_run(
-        RunFolder.create(tmp_path / "alone", resolve(parse(text, "alone"), given)),
+        RunFolder.create(tmp_path / "alone", resolve_config(parse(text, "alone"), given)),
         small.quiet(),
         workers=1,
         files=False,
@@ -241,7 +241,7 @@ def test_a_record_whose_validation_file_was_changed_is_fitted_again(tmp_path: Pa
     assert not folder.is_done(tmp_path / "records/s000.csv")
     assert ended(folder).exit_status == 3
     after = json.loads((first / "summary.json").read_text())["validation"]["next"]
-    assert (True, False) == (before["holds"], after["holds"])
+    assert (True, False) == (before["passed"], after["passed"])
 
 
 def test_the_worst_ending_is_the_exit_status() -> None:

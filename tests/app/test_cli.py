@@ -261,7 +261,7 @@ def test_scores_and_a_picture_lie_beside_the_bands(
     assert (2.0, 3.5) == pytest.approx((result["from_s"], result["to_s"]))
     assert 75 == result["samples"]
     assert 0 < result["scores"]["nrmse"]
-    assert result["holds"] in (True, None)
+    assert result["passed"] in (True, None)
     assert bands.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     bands.unlink()
     bwbayes(*predict, "new/bands.csv").assert_refused("bands.json: exists", "give `--overwrite`")
@@ -281,7 +281,7 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
     )
     assert "Likely cause: reversed sign of the displacement. Fix: change" in said.out
     result = json.loads((tmp_path / "bands.json").read_text())
-    assert (False, "sign") == (result["holds"], result["cause"])
+    assert (False, "sign") == (result["passed"], result["cause"])
 
 
 def test_a_files_own_columns_are_recognized(
@@ -297,7 +297,7 @@ def test_a_files_own_columns_are_recognized(
     assert 0 == said.status
     result = json.loads((tmp_path / "bands.json").read_text())
     assert record.samples == result["samples"]
-    assert result["holds"] in (True, None)
+    assert result["passed"] in (True, None)
 
 
 def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_path: Path) -> None:

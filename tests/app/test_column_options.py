@@ -17,7 +17,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.column_options import column_options_from, record_naming
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.record import Record, read_record, write_record
 from tests.app.conftest import Type
@@ -123,14 +123,14 @@ units = { time = "ms", voltage = "V", displacement = "nm" }
 [model]
 noise = "white"
 """
-    folder = RunFolder.create(tmp_path / "run", resolve(parse(text, "text"), tmp_path))
+    folder = RunFolder.create(tmp_path / "run", resolve_config(parse(text, "text"), tmp_path))
     problem = folder.problem()
     assert {
         "columns": {"time": "a", "voltage": "b", "displacement": "c"},
         "units": {"time": "ms", "voltage": "V", "displacement": "nm"},
         "all_columns": ["a", "b", "c"],
     } == problem.config.records["record"].read_as
-    assert problem.config == resolve(problem.config, folder.path).config
+    assert problem.config == resolve_config(problem.config, folder.path).config
 
 
 def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
@@ -146,7 +146,7 @@ def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
     bwbayes("init", *files).assert_refused("--displacement", "--unit displacement=um --fs")
     config = tmp_path / "a.toml"
     assert bwbayes("init", *files, *options, "--out", config).status == 0
-    folder = RunFolder.create(tmp_path / "run", resolve(load(config), tmp_path))
+    folder = RunFolder.create(tmp_path / "run", resolve_config(load(config), tmp_path))
     for name in "ux":
         (tmp_path / f"{name}.txt").rename(tmp_path / f"{name}2.txt")
     problem = folder.problem()

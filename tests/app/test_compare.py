@@ -17,7 +17,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record
@@ -144,7 +144,7 @@ def test_other_readings_are_refused(
 ) -> None:
     """Before anything is worked out, so that it does not matter what the draws are of."""
     config, records = config_of(record, KEYS | keys)
-    other = fits[1].with_cache(problem=resolve(config, Path(), records))
+    other = fits[1].with_cache(problem=resolve_config(config, Path(), records))
     with pytest.raises(InputError, match=line):
         fits[0].compare(other)
 

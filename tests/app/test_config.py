@@ -64,8 +64,8 @@ def refused(text: str) -> str:
             "validation.a: give one of window, file and signal; correct",
         ),
         (
-            RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in_from = 0.5",
-            "validation.a: lead_in_from is for another record; give file or signal",
+            RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in_start = 0.5",
+            "validation.a: lead_in_start is for another record; give file or signal",
         ),
         (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
         ("seed = 9223372036854775808\n" + RECORD, "seed"),

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.record import Record, write_record
@@ -45,7 +45,7 @@ def parts(record: Record, *cuts: int, own_clock: bool = False) -> list[Record]:
 
 def problem(record: Any, **keys: Any) -> Problem:
     config, records = config_of(record, keys)
-    return resolve(config, Path(), records)
+    return resolve_config(config, Path(), records)
 
 
 def densities(made: Problem) -> np.ndarray[Any, Any]:
@@ -178,4 +178,4 @@ def test_one_record_alone_continues_nothing_and_neither_does_a_signal() -> None:
 
     text = '[record.a]\nsignal = "step10"\n[record.b]\nsignal = "step10"\ncontinues = "a"\n'
     with pytest.raises(InputError, match="the stand starts every signal at rest; give files"):
-        resolve(parse(text, "two.toml"), Path())
+        resolve_config(parse(text, "two.toml"), Path())

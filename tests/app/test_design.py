@@ -28,16 +28,16 @@ def test_the_best_of_a_file_is_written_for_the_generator(
     assert 0 == said.status
     assert "fading" in said.out
     numbers = json.loads((tmp_path / "out/design.json").read_text())
-    assert ["fading", "steady", "tiny"] == [promise["name"] for promise in numbers["candidates"]]
+    assert ["fading", "steady", "tiny"] == [score["name"] for score in numbers["candidates"]]
     best = read_record(tmp_path / "out/best.csv", need_displacement=False)
     assert best.displacement is None
     assert best.interval == pytest.approx(0.02)
     expected = 100 * np.sin(2 * np.pi * best.time) * np.maximum(1 - 0.3 * best.time, 0)
     np.testing.assert_allclose(best.voltage, expected, atol=1e-4)
     page = (tmp_path / "out/design.html").read_text(encoding="utf-8")
-    for promise in numbers["candidates"]:
-        assert f">{promise['name']}<" in page
-        assert f"{promise['left']:.1%}" in page
+    for score in numbers["candidates"]:
+        assert f">{score['name']}<" in page
+        assert f"{score['sd_ratio']:.1%}" in page
     assert {"best.png", "promises.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
     # Once more nothing is replaced.
     bwbayes(*command).assert_refused("design.json: exists")
@@ -48,12 +48,12 @@ def test_the_best_of_a_file_is_written_for_the_generator(
 def test_the_preset_keeps_to_the_amplifiers_limits(fit: bw.Run) -> None:
     limits = {"voltage": (0.0, 150.0), "current": 2e-3, "capacitance": 5e-6}
     ranking = fit.design(Path("verification"), **limits)  # type: ignore[arg-type]
-    assert not any(promise.refused for promise in ranking if "sine" in promise.name)
+    assert not any(score.refused for score in ranking if "sine" in score.name)
     best = ranking.signals[ranking.best.name]
     assert best.min() >= -1e-6
     assert best.max() <= 150 + 1e-6
     assert np.max(np.abs(np.diff(best))) / ranking.interval <= 400 * (1 + 1e-6)
-    lefts = [promise.left for promise in ranking if not promise.refused]
+    lefts = [score.sd_ratio for score in ranking if not score.refused]
     assert lefts == sorted(lefts)
     assert 0 < lefts[0] < 1
 

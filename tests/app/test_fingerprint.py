@@ -14,7 +14,7 @@ import pytest
 from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import finished
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running import fingerprint as fingerprint_module
 from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
 from bwbayes.app.running.folder import RunFolder
@@ -26,7 +26,7 @@ from tests.app import small
 
 def require(run: Path, changed: Config) -> None:
     """Hold a config in the place of a run's own against the run's chain."""
-    require_own(resolve(changed, run), Path("x"), ChainFile.read(run / "chain").attributes())
+    require_own(resolve_config(changed, run), Path("x"), ChainFile.read(run / "chain").attributes())
 
 
 def with_d(config: Config, **changes: Any) -> Config:
@@ -126,7 +126,7 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_studys_digest_is_that_of_its_posterior(run: Path) -> None:
     config = load(run / "config.toml")
-    study = resolve(config, run).study
+    study = resolve_config(config, run).study
     prior = config.parameters["d"].prior
     assert prior is not None
     (training,) = study.records.values()
@@ -134,13 +134,13 @@ def test_a_studys_digest_is_that_of_its_posterior(run: Path) -> None:
     assert record.displacement is not None
     moved = replace(record, displacement=record.displacement + 1e-9)
     same = (
-        resolve(with_d(config, label="D", description="gain"), run).study,
-        resolve(config.model_copy(update={"name": "other", "validation": {}}), run).study,
+        resolve_config(with_d(config, label="D", description="gain"), run).study,
+        resolve_config(config.model_copy(update={"name": "other", "validation": {}}), run).study,
         replace(study, engine="numpy"),
     )
     others = (
-        resolve(with_d(config, prior=prior | {"sigma": 0.7}), run).study,
-        resolve(with_d(config, upper=9.0), run).study,
+        resolve_config(with_d(config, prior=prior | {"sigma": 0.7}), run).study,
+        resolve_config(with_d(config, upper=9.0), run).study,
         study.with_model(study.spec.with_parts(noise="smooth")),
         replace(study, per_record=("offset",)),
         *(

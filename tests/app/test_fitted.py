@@ -117,14 +117,14 @@ def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Run) -> None:
     assert '<th scope="col">Mean</th>' in page
 
 
-@pytest.mark.parametrize("holds", [True, False, None])
+@pytest.mark.parametrize("passed", [True, False, None])
 def test_the_heading_says_for_which_drives_validation_passed(
-    opened: Run, holds: bool | None
+    opened: Run, passed: bool | None
 ) -> None:
-    heading = opened.with_cache(standing=ValidationSummary(holds)).heading
+    heading = opened.with_cache(standing=ValidationSummary(passed)).heading
     drives = f" for drives like the training record's ({opened.problem.facts['drive']})"
-    assert heading.endswith(f"validation passed{drives}") == bool(holds)
-    assert (drives in heading) == bool(holds)
+    assert heading.endswith(f"validation passed{drives}") == bool(passed)
+    assert (drives in heading) == bool(passed)
 
 
 def test_the_notebooks_html_shows_names_as_they_are(opened: Run) -> None:
@@ -171,7 +171,7 @@ def test_saved_it_is_the_command_lines_run_bit_by_bit(
     [
         ((), {}),
         (("--after", "--lead-in", "1"), {"after": True, "lead_in": 1.0}),
-        (("--same-offset", "--window", "1", "2"), {"own_offset": False, "window": (1.0, 2.0)}),
+        (("--same-offset", "--window", "1", "2"), {"estimate_offset": False, "window": (1.0, 2.0)}),
     ],
 )
 def test_a_prediction_is_the_command_lines(
@@ -247,8 +247,8 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
     ):
         with pytest.raises(bw.NotConvergedError, match=line):
             ask()
-    assert made.holds is None
-    assert made.verdicts == {}
+    assert made.passed is None
+    assert made.validation == {}
     # The draws and the chain's figures stay.
     assert made.draws["d"].size
     assert made.draws.attrs["converged"] == 0
@@ -307,7 +307,7 @@ def test_bands_that_do_not_hold_are_a_warning(folder: Path, opened: Run) -> None
     ) as caught:
         bands = opened.predict(turned, from_rest=True, name="sine")
     assert {__file__} == {warning.filename for warning in caught}
-    assert bands.holds is False
+    assert bands.passed is False
     assert "VALIDATION FAILED" in repr(bands)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from tests.app import small
@@ -26,7 +26,7 @@ NOBODY = 65534
 
 @pytest.fixture(scope="module")
 def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    return resolve(small.config(), tmp_path_factory.mktemp("config"))
+    return resolve_config(small.config(), tmp_path_factory.mktemp("config"))
 
 
 def content(path: Path) -> dict[str, bytes]:

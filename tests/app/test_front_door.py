@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import Naming
@@ -86,7 +86,7 @@ def resolved(path: Path, naming: Naming | None = None) -> Problem:
     """Return the problem of a file that has no config: all but the sampling of a run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        return resolve(propose(path, path.parent, naming).config, path.parent)
+        return resolve_config(propose(path, path.parent, naming).config, path.parent)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))

@@ -16,7 +16,7 @@ import pytest
 
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.errors import InputError, InputWarning
@@ -50,7 +50,7 @@ def ended(path: Path, folder: Path) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         config = propose(path, path.parent).config
-        begun = RunFolder.create(folder / path.stem, resolve(config, path.parent))
+        begun = RunFolder.create(folder / path.stem, resolve_config(config, path.parent))
         result = resume(begun, small.quiet(), workers=1, ess=100, steps=300)
     assert (begun.path / "report.html").is_file()
     return result.standing.status if result.outcome.converged else "not converged"

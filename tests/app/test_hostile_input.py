@@ -30,7 +30,7 @@ import pytest
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs import check as app_check
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
@@ -140,7 +140,7 @@ def assert_used_or_refused(one: Case, said: Said, place: Path) -> None:
 
 def assert_becomes_a_run(place: Path) -> None:
     """Make the run's folder, and find the same numbers in it and nothing beside it."""
-    problem = resolve(load(place / "my.toml"), place)
+    problem = resolve_config(load(place / "my.toml"), place)
     before = {path.name for path in place.iterdir()}
     folder = RunFolder.create(place / "out", problem, overwrite=False)
     assert before | {"out"} == {path.name for path in place.iterdir()}

@@ -19,7 +19,7 @@ import bwbayes as bw
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
 from bwbayes.app.running.folder import RunFolder
@@ -67,7 +67,7 @@ def test_a_quadratic_gain_is_added_and_the_run_says_what_it_is_worth() -> None:
         r"model improved: quadratic.* nats, RMSE .* um, held out .* um\); set gain", note
     )
     assert "quadratic" in fit.problem.config.model.gain
-    assert fit.verdicts["rest"].holds is not False
+    assert fit.validation["rest"].passed is not False
 
 
 @pytest.mark.parametrize("kind", [pytest.param("good", marks=pytest.mark.slow), "transient"])
@@ -127,7 +127,7 @@ def test_the_noise_is_chosen_by_evidence(
     record: Record, expected: set[str], tmp_path: Path
 ) -> None:
     write_record(record, tmp_path / "record.h5")
-    problem = resolve(parse(CONFIG, "config"), tmp_path)
+    problem = resolve_config(parse(CONFIG, "config"), tmp_path)
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     noise, why = chosen_noise(problem, point)
     assert noise in expected
@@ -159,7 +159,7 @@ def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> Non
     write_record(saturating(), tmp_path / "record.h5")
     windows = [[0.0, 5.0], [7.5, 15.0], [17.5, 25.0], [27.5, 35.0], [37.5, 45.0], [47.5, 50.0]]
     config = parse(f'[record]\nfile = "record.h5"\ntrain = {windows}\n', "config")
-    problem = resolve(config, tmp_path)
+    problem = resolve_config(config, tmp_path)
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     rough = climb(problem.posterior, point.optima)
     other = problem.study.with_model(problem.study.spec.with_parts(noise="smooth")).posterior
@@ -178,7 +178,9 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
         write_record(thinned(record), tmp_path / f"{name}.h5")
     text = "".join(f'[record.{n}]\nfile = "{n}.h5"\nfrom_rest = true\n' for n in "ab")
     text += "[parameters]\n'offset[b]' = { fixed = 0.5 }\n"
-    problem = resolve(parse(f'{text}[model]\nper_record = ["sensor_sd"]\n', "config"), tmp_path)
+    problem = resolve_config(
+        parse(f'{text}[model]\nper_record = ["sensor_sd"]\n', "config"), tmp_path
+    )
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     noise, why = chosen_noise(problem, point)
     assert noise == "smooth"
@@ -201,7 +203,7 @@ def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
 def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     write_record(thinned(records(2)[0]), tmp_path / "record.h5")
     config = parse(f'{CONFIG}[model]\nnoise = "auto"\n[sampling]\nsteps = 50\n', "config")
-    folder = RunFolder.create(tmp_path / "run", resolve(config, tmp_path))
+    folder = RunFolder.create(tmp_path / "run", resolve_config(config, tmp_path))
     console = Console(file=io.StringIO(), width=200)
     fit = resume(folder, console, workers=1, files=False)
     assert fit.problem.config.model.noise == "smooth"

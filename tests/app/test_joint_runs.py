@@ -14,7 +14,7 @@ import bwbayes
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.calibration.replicates import replicate
@@ -62,14 +62,14 @@ from_rest = true
 
 
 def problem(*changes: tuple[str, str]) -> Problem:
-    return resolve(small.config(*changes, text=TEXT), Path())
+    return resolve_config(small.config(*changes, text=TEXT), Path())
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
-    folder = RunFolder.create(path, resolve(parse(TEXT, "joint.toml"), path.parent))
+    folder = RunFolder.create(path, resolve_config(parse(TEXT, "joint.toml"), path.parent))
     resume(folder, small.quiet(), workers=1)
     return folder
 
@@ -82,7 +82,7 @@ def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
     lone = lone.replace("[record.loops]", "[record]").replace('of = "loops"\n', "")
     _, head, tail = lone.replace(*changes).partition("[record]\n")
     text = f'{head}file = "loops.h5"\n{tail.partition(chr(10))[2]}'
-    alone = resolve(parse(text, ""), Path(), {"record": both.records["loops"]})
+    alone = resolve_config(parse(text, ""), Path(), {"record": both.records["loops"]})
     shared = [name for name in alone.defaults if name in both.defaults]
     assert {"d", "alpha", "sensor_sd"} <= {*shared}
     assert {n: alone.defaults[n] for n in shared} == {n: both.defaults[n] for n in shared}
@@ -160,7 +160,7 @@ def test_python_takes_a_list_or_a_dict_of_records(tmp_path: Path) -> None:
     made, records = config_of(table, {"train": (0, 1)})
     assert ["first"] == [*records]
     assert [[[0.0, 1.0]], [[0.5, 1.5]]] == [given.train for given in made.records.values()]
-    assert 2 == len(resolve(made, Path(), records).records)
+    assert 2 == len(resolve_config(made, Path(), records).records)
     with pytest.raises(InputError, match="two records are called 'later'; give a dict"):
         config_of([tmp_path / "later.h5", tmp_path / "later.h5"], {})
     nothing: list[Any] = [[], {}, 3, [3]]
@@ -227,6 +227,6 @@ def test_readings_do_not_count_twice(tmp_path: Path) -> None:
     write_record(measured(1), tmp_path / "a.h5")
     text = '[record.a]\nfile = "a.h5"\n[record.b]\nfile = "a.h5"\n'
     with pytest.raises(InputError, match=r"^record\.b: the same measurement as record\.a, whose"):
-        resolve(parse(text, ""), tmp_path)
+        resolve_config(parse(text, ""), tmp_path)
     apart = text.replace("[record.b]", "train = [0.0, 1.0]\n[record.b]") + "train = [1.0, 2.0]\n"
-    assert 2 == len(resolve(parse(apart, ""), tmp_path).records)
+    assert 2 == len(resolve_config(parse(apart, ""), tmp_path).records)

@@ -27,7 +27,7 @@ def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
 def test_an_exact_record_gives_its_parameters() -> None:
     fit = fitted(EXACT)
     assert fit.converged
-    assert fit.holds is not False, fit.standing.lines
+    assert fit.passed is not False, fit.standing.lines
     assert any("no noise" in note for note in fit.notes)
     means = dict(zip(fit.problem.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
     for name, value in {"d": 0.7, **TRUTH}.items():
@@ -38,7 +38,7 @@ def test_two_levels_are_a_coarse_sensor() -> None:
     fit = fitted(np.where(EXACT > 0, 10.0, 0.0))
     assert fit.converged
     assert any("coarse resolution" in note for note in fit.notes)
-    assert fit.holds is False
+    assert fit.passed is False
 
 
 @pytest.mark.parametrize("level", [0.0, 3.7])

@@ -14,7 +14,7 @@ import pytest
 import bwbayes
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem import problem as problem_module
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator, windows_of
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
@@ -27,7 +27,7 @@ from tests.record.spoilt import SPOILT, looping
 
 
 def of(text: str, folder: Path) -> Problem:
-    return resolve(parse(text, "my.toml"), folder)
+    return resolve_config(parse(text, "my.toml"), folder)
 
 
 def refused(text: str, folder: Path) -> str:
@@ -82,7 +82,7 @@ def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
 
 
 def test_resolved_config_resolves_to_the_same_numbers(tmp_path: Path) -> None:
-    first = resolve(small.config(), tmp_path)
+    first = resolve_config(small.config(), tmp_path)
     folder = RunFolder.create(tmp_path / "run", first, overwrite=False)
     again = RunFolder.open(folder.path.rename(tmp_path / "moved")).problem()
     assert first.config == again.config
@@ -259,7 +259,7 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
         f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
     ).remarks
     assert remark.startswith("a: switch-on transient: the displacement starts ")
-    assert f". Fix: lead_in_from = {finding.stop:.3g} under [validation.a]" in remark
+    assert f". Fix: lead_in_start = {finding.stop:.3g} under [validation.a]" in remark
 
 
 @pytest.mark.parametrize("lead_in", ["4.0", "100.0", "0.001"])
@@ -268,12 +268,12 @@ def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
 ) -> None:
     config = small.config(("from_rest = true", f"lead_in = {lead_in}"))
     with pytest.raises(InputError, match=r"validation\.sine\.lead_in: "):
-        resolve(config, tmp_path)
+        resolve_config(config, tmp_path)
 
 
 def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Path) -> None:
     def records(seed: int) -> tuple[str | None, ...]:
-        problem = resolve(small.config(("seed = 3", f"seed = {seed}")), tmp_path)
+        problem = resolve_config(small.config(("seed = 3", f"seed = {seed}")), tmp_path)
         assert "zero" == problem.posterior.only.actuator.hold
         truth = problem.config.truth
         names = ("d", "alpha", "beta", "sensor_sd")
@@ -288,7 +288,7 @@ def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Pat
 
 def test_with_another_noise_what_is_known_and_said_of_its_parameters_stays(tmp_path: Path) -> None:
     """But for what the other noise has not; what only it has gets its default."""
-    before = resolve(small.config(), tmp_path)
+    before = resolve_config(small.config(), tmp_path)
     discrepancy = {"discrepancy_sd", "discrepancy_time"}
     for noise, gone in (("discrepancy", set()), ("smooth", set()), ("white", discrepancy)):
         after = before.with_noise(noise).config

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.proposal import ConfigProposal, propose
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.record import Record, read_record
@@ -130,7 +130,7 @@ def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
     assert f"# spikes: {rows.size} isolated outliers" in proposal.text
     held = proposal.config.records["record"].exclude or []
     assert 0 < len(held) < rows.size
-    problem = resolve(proposal.config, path.parent)
+    problem = resolve_config(proposal.config, path.parent)
     aside = rows.size - len(held)
     said = f"{aside} reading{'s' * (aside > 1)} set aside"
     assert any(remark.startswith(said) for remark in problem.remarks), problem.remarks
@@ -217,7 +217,7 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     assert "reversed sign: the displacement falls" in done.output
     assert (path.parent / "page/check.html").exists()
     assert 0 == command("init", path, "--unit", "displacement=-um").return_value
-    problem = resolve(load(path.with_suffix(".toml")), path.parent)
+    problem = resolve_config(load(path.with_suffix(".toml")), path.parent)
     assert problem.record.displacement is not None
     np.testing.assert_allclose(problem.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
     assert () == problem.findings["record"]
@@ -240,7 +240,7 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     elsewhere = path.parent / "configs/a.toml"
     assert 0 == command("init", path, "--out", elsewhere).return_value
     assert "../mine.csv" == load(elsewhere).records["record"].file
-    assert 600 == resolve(load(elsewhere), elsewhere.parent).record.samples
+    assert 600 == resolve_config(load(elsewhere), elsewhere.parent).record.samples
     for unit in ("displacement", "length=nm", "displacement=furlong", "time=-s"):
         assert isinstance(command("init", path, "--unit", unit).exception, InputError)
 
@@ -258,7 +258,7 @@ def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write)
     windows = [*(proposal.config.records["record"].train or ())]
     windows += proposal.config.validation["held_out"].window or ()
     assert max(stop for _, stop in windows) <= time + 1e-9
-    assert () == resolve(proposal.config, path.parent).findings["record"]
+    assert () == resolve_config(proposal.config, path.parent).findings["record"]
 
 
 def test_readings_that_are_clipped_are_missing(write: Write) -> None:
@@ -275,7 +275,7 @@ def test_readings_that_are_clipped_are_missing(write: Write) -> None:
     limits = np.min(proposal.record.displacement), np.max(proposal.record.displacement)
     assert limits == pytest.approx(source.missing)
     again = f'{proposal.text}\n[validation.again]\nfile = "{path.name}"\n'
-    problem = resolve(parse(again, str(path)), path.parent)
+    problem = resolve_config(parse(again, str(path)), path.parent)
     assert () == problem.findings["record"]
     another = problem.validations["again"].record
     assert another is not None

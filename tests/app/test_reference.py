@@ -44,7 +44,7 @@ def config_with(key: Key) -> str:
         beside = [line for line in beside if line.split()[0] != key.name]
     if key.name == "signal":
         beside = []
-    if key.path == "validation.NAME.lead_in_from":
+    if key.path == "validation.NAME.lead_in_start":
         beside = ['file = "b.csv"']
     if key.path == "record.outliers":
         beside = ['file = "a.csv"']

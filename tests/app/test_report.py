@@ -88,7 +88,7 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
     cause = Finding("noise", "the noise is not like that", "try another noise")
     failed = BandValidation("held-out", False, False, ("covers 60%",), cause)
     held = BandValidation("training", True, True)
-    run = dataclasses.replace(example.run(), verdicts={"training": held, "held-out": failed})
+    run = dataclasses.replace(example.run(), validation={"training": held, "held-out": failed})
     text = page(run)
     places = [text.index(said) for said in ("VALIDATION FAILED", "try another noise", "94.3 ± 1.3")]
     assert sorted(places) == places
@@ -102,10 +102,10 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
 @pytest.mark.parametrize("held_out", [True, False])
 def test_a_run_that_holds_nothing_out_says_so_on_page_and_screen(held_out: bool) -> None:
     """With what to write; a run that holds readings out says nothing of it."""
-    verdicts = {"training": BandValidation("training", True, True)}
+    validation = {"training": BandValidation("training", True, True)}
     if held_out:
-        verdicts["held-out"] = BandValidation("held-out", False, True)
-    run = dataclasses.replace(example.run(), verdicts=verdicts)
+        validation["held-out"] = BandValidation("held-out", False, True)
+    run = dataclasses.replace(example.run(), validation=validation)
     for text in (page(run), as_text(run_report(run, {}), 400)):
         assert held_out == ("no readings are held out: the bands are validated on" not in text)
         assert held_out == ("under [validation.held_out]" not in text)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import InputWarning
@@ -79,7 +79,7 @@ def of_the_family(seed: int, most: int) -> Spoiled:
 
 def resolved(record: Record, model: str = "") -> Problem:
     config = parse(f'[record]\nfile = "record.h5"\n[model]\n{model}\n', "my.toml")
-    return resolve(config, Path(), {"record": record})
+    return resolve_config(config, Path(), {"record": record})
 
 
 def set_aside(problem: Problem) -> list[int]:

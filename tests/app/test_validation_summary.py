@@ -38,9 +38,9 @@ IN_PYTHON: dict[str, Callable[[bw.Run, Path], Any]] = {
 }
 
 
-def verdict(holds: bool | None) -> BandValidation:
-    cause = Finding("loop", "the operator", "try another") if holds is False else None
-    return BandValidation("held-out", training=False, holds=holds, reasons=(OFF,), cause=cause)
+def verdict(passed: bool | None) -> BandValidation:
+    cause = Finding("loop", "the operator", "try another") if passed is False else None
+    return BandValidation("held-out", training=False, passed=passed, reasons=(OFF,), cause=cause)
 
 
 @pytest.fixture(
@@ -49,18 +49,18 @@ def verdict(holds: bool | None) -> BandValidation:
         pytest.param(None, id="inconclusive", marks=pytest.mark.slow),
     ]
 )
-def holds(request: pytest.FixtureRequest) -> bool | None:
+def passed(request: pytest.FixtureRequest) -> bool | None:
     answer: bool | None = request.param
     return answer
 
 
 @pytest.fixture
-def judged(run: Path, tmp_path: Path, holds: bool | None) -> Path:
+def judged(run: Path, tmp_path: Path, passed: bool | None) -> Path:
     """Return a copy of a run of which the verdict on one window is as it is asked for."""
     folder = tmp_path / "judged"
     shutil.copytree(run, folder)
     numbers = json.loads((folder / "summary.json").read_text())
-    numbers["validation"]["held-out"] |= verdict(holds).summary
+    numbers["validation"]["held-out"] |= verdict(passed).summary
     (folder / "summary.json").write_text(json.dumps(numbers))
     return folder
 
@@ -69,26 +69,26 @@ def judged(run: Path, tmp_path: Path, holds: bool | None) -> Path:
     "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "track")) for n in COMMANDS]
 )
 def test_each_command_says_it_first_and_ends_with_its_status(
-    name: str, judged: Path, holds: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, judged: Path, passed: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     where = out / "bands.csv" if name == "predict" else out
     arguments = [name, str(judged), *COMMANDS[name], "--out", str(where)]
-    assert cli.main(arguments, standalone_mode=False) == STATUS[holds]
+    assert cli.main(arguments, standalone_mode=False) == STATUS[passed]
     said = capsys.readouterr()
     # All but one show a report on the screen, and the verdict above it.
     first = (said.err if name == "export" else said.out).partition("\n")[0]
-    assert first.startswith(f"{HEADLINE[holds]}: held-out")
+    assert first.startswith(f"{HEADLINE[passed]}: held-out")
     assert OFF in first
     (numbers,) = out.glob("*.json")
     key = "run_validation" if name == "predict" else "validation"
     known = json.loads(numbers.read_text())[key]
-    assert known["status"] == ("inconclusive" if holds is None else "failed")
-    assert [OFF in line for line in known["verdicts"]] == [True]
+    assert known["status"] == ("inconclusive" if passed is None else "failed")
+    assert [OFF in line for line in known["messages"]] == [True]
     for page in out.glob("*.html"):
         text = page.read_text(encoding="utf-8")
         kinds = re.findall(r'<section class="status (\w+)"', text)
-        assert kinds[0] == {False: "bad", None: "note"}[holds]
+        assert kinds[0] == {False: "bad", None: "note"}[passed]
         assert "good" not in kinds
         assert text.index(OFF) < text.index("<table")
     for code in out.glob("*.c"):
@@ -101,8 +101,8 @@ def test_each_command_says_it_first_and_ends_with_its_status(
 def test_python_warns_of_it(
     name: str, fit: bw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    verdicts = fit.verdicts | {"held-out": verdict(False)}
-    monkeypatch.setitem(fit.__dict__, "standing", ValidationSummary.of(verdicts.values()))
+    validation = fit.validation | {"held-out": verdict(False)}
+    monkeypatch.setitem(fit.__dict__, "standing", ValidationSummary.of(validation.values()))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         made = IN_PYTHON[name](fit, tmp_path / "out")
@@ -110,6 +110,6 @@ def test_python_warns_of_it(
     assert str(told.message).startswith(HEADLINE[False])
     assert Path(told.filename) == Path(__file__)
     if name != "design":
-        assert made.standing.holds is False
+        assert made.standing.passed is False
     if name == "compensate":
         assert repr(made).startswith(HEADLINE[False])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.draws import VOLTAGE_NOISE
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
@@ -45,7 +45,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder: Path) -> None:
-    problem = resolve(parse(TEXT, "my.toml"), folder)
+    problem = resolve_config(parse(TEXT, "my.toml"), folder)
     record, measured = problem.record, noisy_record(1)
     np.testing.assert_array_equal(record.voltage, measured.voltage)
     assert record.sha256 == measured.sha256
@@ -63,7 +63,7 @@ def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder
 
 
 def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folder: Path) -> None:
-    problem = resolve(parse(TEXT, "my.toml"), folder)
+    problem = resolve_config(parse(TEXT, "my.toml"), folder)
     kept = RunFolder.create(folder / "run", problem, overwrite=False)
     again = RunFolder.open(kept.path).problem()
     np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
@@ -74,7 +74,7 @@ def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folde
 def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(folder: Path) -> None:
     """And a chain from before the voltage's noise was removed is not read."""
     text = TEXT + 'hysteresis = "linear"\n[sampling]\ness = 100\nsteps = 200\nblock = 25\n'
-    kept = RunFolder.create(folder / "run", resolve(parse(text, "my.toml"), folder))
+    kept = RunFolder.create(folder / "run", resolve_config(parse(text, "my.toml"), folder))
     fit = resume(kept, small.quiet(), workers=1, predict=False)
     posterior, chain = fit.problem.posterior, fit.chain
     more = np.array(json.loads(str(chain.attributes()[VOLTAGE_NOISE])))
@@ -109,6 +109,6 @@ def test_noise_on_a_planned_voltage_is_said() -> None:
 
 def test_a_command_is_what_it_says(folder: Path) -> None:
     text = TEXT.replace('"noisy.h5"\n', '"noisy.h5"\nvoltage_is = "command"\n')
-    problem = resolve(parse(text, "my.toml"), folder)
+    problem = resolve_config(parse(text, "my.toml"), folder)
     np.testing.assert_array_equal(problem.posterior.only.voltage, problem.record.voltage)
     assert not any(remark.startswith("record: voltage has") for remark in problem.remarks)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.posterior import Posterior
@@ -39,7 +39,7 @@ def paper_record() -> Problem:
     """Return the problem of the paper's record, with the target of effective draws."""
     config = load(ROOT / "runs" / "ring_bender.toml")
     sampling = config.sampling.model_copy(update={"ess": ESS, "engine": "numba"})
-    return resolve(config.model_copy(update={"sampling": sampling}), ROOT / "runs")
+    return resolve_config(config.model_copy(update={"sampling": sampling}), ROOT / "runs")
 
 
 def by_engine(posterior: Posterior) -> dict[str, Posterior]:

@@ -27,7 +27,7 @@ from emcee.moves import StretchMove
 
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import open_executor
 from bwbayes.calibration.replicates import replicate
@@ -147,7 +147,7 @@ def draws_per_step(posterior: Posterior, state: EnsembleState, steps: int) -> fl
 
 def replicates(count: int) -> Table:
     """Measure replicates of ``runs/calibration.toml``: records so short that Python counts."""
-    common = experiment(resolve(load(ROOT / "runs" / "calibration.toml"), ROOT))
+    common = experiment(resolve_config(load(ROOT / "runs" / "calibration.toml"), ROOT))
     costs = [timed(partial(replicate, common, 1, number)).cpu for number in range(count + 1)]
     # The first one loads what is compiled.
     row: dict[str, Cell] = {"replicates": count, "core s": float(np.median(costs[1:]))}

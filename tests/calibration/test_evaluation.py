@@ -15,8 +15,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.calibration.evaluation import (
     FAMILY_LEVEL,
     Calibration,
+    evaluate_calibration,
     holm,
-    judge,
     smooth_power,
     smooth_test,
 )
@@ -50,7 +50,7 @@ def scores(count: int, seed: int = 1) -> FloatArray:
 
 
 def judged(made: list[Entry]) -> Calibration:
-    return judge(made, np.random.default_rng(2))
+    return evaluate_calibration(made, np.random.default_rng(2))
 
 
 def assert_near(expected: float, got: float, trials: int) -> None:

@@ -16,7 +16,7 @@ from bwbayes.calibration.replicates import (
     CalibrationSetup,
     Replicate,
     replicate,
-    replicates,
+    run_replicates,
 )
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
@@ -45,7 +45,8 @@ def small(**changes: object) -> CalibrationSetup:
 def test_replicate_depends_on_seed_and_number_alone() -> None:
     with ThreadPoolExecutor(2) as executor:
         made = {
-            one.entry["number"]: one.entry for one in replicates(small(), 1, [0, 1], executor, 2)
+            one.entry["number"]: one.entry
+            for one in run_replicates(small(), 1, [0, 1], executor, 2)
         }
     both = [made[0], made[1]]
     assert both[1] == replicate(small(), 1, 1).entry

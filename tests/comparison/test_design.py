@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.design import promises
+from bwbayes.comparison.design import rank_designs
 from bwbayes.comparison.designed import DesignScore
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior
@@ -52,7 +52,7 @@ def promised(
     target: str | FloatArray = "beta",
     amplifier: Limits = WIDE,
 ) -> list[DesignScore]:
-    return promises(*known, candidates, target, amplifier, np.random.default_rng(2))
+    return rank_designs(*known, candidates, target, amplifier, np.random.default_rng(2))
 
 
 def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
@@ -61,7 +61,7 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     exact, posterior = model.exact, model.posterior
     # Not about zero, so that the offset counts.
     voltage = 50 + 0.5 * decaying_sine(150)
-    (promise,) = promised((posterior, exact.draw(40_000, 1)), {"sine": voltage}, "d")
+    (score,) = promised((posterior, exact.draw(40_000, 1)), {"sine": voltage}, "d")
     # dx/dd is the lagged voltage, seen by two slopes.
     theta = posterior.prior.theta(exact.mean + np.array([[0.0, 0.0], [1e-3, 0.0]]))
     base, moved = posterior.likelihood.actuator.displacement(
@@ -71,8 +71,8 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     dense = model.covariance(voltage.size) + model.sd[1] ** 2
     information = slope @ np.linalg.solve(dense, slope)
     left = 1 / np.sqrt(1 + exact.covariance[0, 0] * information)
-    assert promise.left == pytest.approx(left, rel=0.02)
-    assert promise.error < 1e-4
+    assert score.sd_ratio == pytest.approx(left, rel=0.02)
+    assert score.error < 1e-4
 
 
 def test_large_loops_are_told_from_small_ones_and_four_from_one(
@@ -83,8 +83,8 @@ def test_large_loops_are_told_from_small_ones_and_four_from_one(
     for target in ("beta", decaying_sine(SAMPLES, periods=7.0, amplitude=50.0)):
         best, second, worst = promised(known, candidates, target)
         assert (best.name, second.name, worst.name) == ("four", "one", "small")
-        assert second.left - best.left > 3 * np.hypot(best.error, second.error)
-        assert 0 < best.left < worst.left <= 1
+        assert second.sd_ratio - best.sd_ratio > 3 * np.hypot(best.error, second.error)
+        assert 0 < best.sd_ratio < worst.sd_ratio <= 1
 
 
 def both(posterior: Posterior, voltage: FloatArray, reading: FloatArray) -> Posterior:
@@ -121,7 +121,7 @@ def ratios(
     known: tuple[Posterior, FloatArray], candidates: dict[str, FloatArray], truths: int
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the part of the sd that is left, over that promised, and the part itself, by name."""
-    left = {promise.name: promise.left for promise in promised(known, candidates)}
+    left = {score.name: score.sd_ratio for score in promised(known, candidates)}
     means = {
         name: float(np.mean([kept(known, voltage, seed) for seed in range(truths)]))
         for name, voltage in candidates.items()
@@ -136,7 +136,7 @@ def test_the_promise_is_kept_when_the_record_is_fitted(
     ratio, means = ratios(known, {"four": steady()}, 2)
     assert 0.65 < ratio["four"] < 1.5
     (once,) = promised(known, {"one": steady()[: SAMPLES // 4]})
-    assert means["four"] < once.left
+    assert means["four"] < once.sd_ratio
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_promises_of_eight_signals_are_kept_in_their_order(
     }
     ratio, means = ratios(known, candidates, 8)
     assert all(0.75 < value < 1.33 for value in ratio.values()), ratio
-    order = [promise.name for promise in promised(known, candidates)]
+    order = [score.name for score in promised(known, candidates)]
     rank = stats.spearmanr(range(len(order)), [means[name] for name in order]).statistic
     assert rank > 0.85
     keep("design", {"rank": float(rank), **ratio})

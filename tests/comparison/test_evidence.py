@@ -16,7 +16,7 @@ from scipy import integrate, stats
 
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
 from bwbayes.inference.parameters import JointPrior
@@ -110,7 +110,7 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     assert start is not None
     write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")
     source = RecordConfig(file="t.h5", train=config.record.train)
-    problem = resolve(config.model_copy(update={"record": source}), tmp_path)
+    problem = resolve_config(config.model_copy(update={"record": source}), tmp_path)
     made = estimated(problem.posterior, problem.plan, generator(1, "evidence"))
     away = made.log_evidence + made.log_prior_mass - np.mean(known["log_evidence"])
     keep("log evidence of the measured record", {"less dynesty's": round(float(away), 3)})
@@ -122,7 +122,7 @@ def test_nested_sampling_agrees() -> None:
 
     Its prior is not divided by the mass that the constraints leave.
     """
-    problem = resolve(load(FOLDER / "virtual.toml"), FOLDER)
+    problem = resolve_config(load(FOLDER / "virtual.toml"), FOLDER)
     plan = replace(problem.plan, ess=1000.0)
     made = estimated(problem.posterior, plan, generator(1, "evidence"))
     reference = json.loads((FOLDER / "virtual.json").read_text(encoding="utf-8"))

@@ -176,11 +176,11 @@ def test_tables_fit_eighty_columns_whatever_folders_are_called(length: int) -> N
         assert "\u2026" not in text
 
 
-@pytest.mark.parametrize(("holds", "status"), [(False, "VALIDATION FAILED"), (None, "Validation")])
+@pytest.mark.parametrize(("passed", "status"), [(False, "VALIDATION FAILED"), (None, "Validation")])
 def test_what_does_not_hold_is_said_before_what_is_recommended(
-    holds: bool | None, status: str
+    passed: bool | None, status: str
 ) -> None:
-    standing = ValidationSummary(holds, ("next: the bands cover 55%",))
+    standing = ValidationSummary(passed, ("next: the bands cover 55%",))
     wide = replace(model("wide", COMMON - 700 + 60 * noise(2)), standing=ValidationSummary())
     comparison = recommend([replace(model("good", COMMON), standing=standing), wide])
     first, second, *_ = as_text(comparison.report()).splitlines()

@@ -24,7 +24,7 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.fit.fitted import finished
 from bwbayes.app.jobs.compare import compare_models
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import begin
 from bwbayes.arrays import FloatArray
@@ -79,7 +79,9 @@ def plant(model: str, seed: int) -> tuple[Record, Record]:
     typical = Record.from_arrays(drives[0], 0.6 * drives[0] + noise, interval=INTERVAL)
     config, records = config_for(typical)
     (parts,) = models_of(model, config.model).values()
-    posterior = resolve(config.model_copy(update={"model": parts}), Path(), records).posterior
+    posterior = resolve_config(
+        config.model_copy(update={"model": parts}), Path(), records
+    ).posterior
     theta = posterior.prior.theta(posterior.prior.draw(rng, 1))
     actuator = posterior.likelihood.actuator
     of_actuator = posterior.only.table.actuator(theta)
@@ -111,7 +113,7 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
     for candidate in comparison.candidates:
         run = RunFolder.open(folder / re.sub(r"[^\w.-]+", "-", candidate.name).strip("-."))
         if candidate.converged:
-            mean = finished(run).predict(planned, from_rest=True, own_offset=False).mean
+            mean = finished(run).predict(planned, from_rest=True, estimate_offset=False).mean
         else:
             problem, point = begin(run)
             free, _ = problem.posterior.prior.constrain(point.mode[np.newaxis])

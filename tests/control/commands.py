@@ -14,7 +14,7 @@ import numpy as np
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
@@ -25,7 +25,7 @@ from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.noise import noise_model
 from bwbayes.model.limits import Limits
 from bwbayes.prediction.bands import LEVELS
-from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import LaserSensor, VirtualTestStand
 from bwbayes.record.waveforms import signal
@@ -53,7 +53,7 @@ def problem(discrepancy: str = "process", rate: float = 100.0, seed: int = 1) ->
         'discrepancy = "process"', f'discrepancy = "{discrepancy}"\nsample_rate = {rate}'
     )
     config = parse(re.sub(r"ess = \d+", "ess = 500", text), "compensation")
-    return resolve(config.model_copy(update={"seed": seed}), CONFIG.parent)
+    return resolve_config(config.model_copy(update={"seed": seed}), CONFIG.parent)
 
 
 def measured_voltage(rate: float, seed: int = 1) -> Problem:
@@ -78,7 +78,7 @@ def measured_voltage(rate: float, seed: int = 1) -> Problem:
         "seed": seed,
     }
     config, records = config_of(Record(voltage, reading, 1 / rate), keys)
-    return resolve(config, Path(), records)
+    return resolve_config(config, Path(), records)
 
 
 def discrepancy(samples: int, interval: float, source: np.random.Generator) -> FloatArray:
@@ -92,7 +92,7 @@ def drawn(of: Problem) -> FloatArray:
     outcome, chain = sampled(of)
     assert outcome.converged, outcome.stop_reason
     flat = draws(of.posterior, chain).reshape(-1, len(of.posterior.names))
-    return thinned(flat, generator(of.config.seed, "draws"))
+    return thin_draws(flat, generator(of.config.seed, "draws"))
 
 
 def about(of: Problem, spread: float, count: int, source: np.random.Generator) -> FloatArray:

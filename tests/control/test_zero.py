@@ -11,7 +11,7 @@ import pytest
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.control import export
 from bwbayes.app.jobs.fit_methods import limits_of
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.control.compensation import compensate
 from bwbayes.control.references import Reference, shaped
 from bwbayes.errors import InputError
@@ -40,7 +40,7 @@ def problem(**keys: Any) -> Problem:
     stand = VirtualTestStand("none", 1 / INTERVAL, true={"offset": OFFSET})
     run = stand.run(50 * (1 - np.cos(4 * np.pi * TIME)), np.random.default_rng(1))
     config, records = config_of(run, {"from_rest": True, **keys})
-    return resolve(config, Path(), records)
+    return resolve_config(config, Path(), records)
 
 
 def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -> None:
@@ -131,4 +131,4 @@ def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> 
     voltage = 60 + 40 * np.sin(4 * np.pi * TIME)
     record = Record(voltage, 0.5 * voltage + np.sin(TIME), INTERVAL)
     config, records = config_of(record, {})
-    assert limits_of(resolve(config, Path(), records), None, 0.0) == (0.0, 100.0)
+    assert limits_of(resolve_config(config, Path(), records), None, 0.0) == (0.0, 100.0)

@@ -37,7 +37,7 @@ file = "record.h5"
 from_rest = true
 [validation.next]
 file = "next.h5"
-own_offset = false
+estimate_offset = false
 """
 
 
@@ -90,7 +90,9 @@ def followed(
         window = [0.0, time] if time > 5 else [time, 10.0]
         changed = record.model_copy(update={"train": [window]})
         # The other side has another offset, and nobody knows which one the sensor has now.
-        later = config.validation["next"].model_copy(update={"own_offset": True, "lead_in": 5.0})
+        later = config.validation["next"].model_copy(
+            update={"estimate_offset": True, "lead_in": 5.0}
+        )
         return config.model_copy(update={"record": changed, "validation": {"next": later}})
     if cause.kind == "sign":
         records = [replace(each, displacement=-np.array(each.displacement)) for each in records]
@@ -123,8 +125,8 @@ def study(kind: str, seed: int, folder: Path) -> SamplingResult:
         tuple(cause.kind for cause in found),
         bool({cause.kind for cause in found} & CAUSES.get(kind, set())),
         found[0].fix if found else "",
-        judged.verdicts["training"].holds,
-        judged.verdicts["next"].holds,
+        judged.validation["training"].passed,
+        judged.validation["next"].passed,
         covered(judged.bands["next"]),
     )
 

@@ -26,14 +26,14 @@ def fitted(kind: str, seed: int, folder: Path) -> tuple[BandValidation, float]:
     put(bench(kind, (7, seed)).records, folder)
     source = np.random.default_rng((7, seed))
     judged = judge(problem_of(parse(CONFIG, "config"), folder), source)
-    return judged.verdicts["training"], covered(judged.bands["next"])
+    return judged.validation["training"], covered(judged.bands["next"])
 
 
 @pytest.mark.parametrize("kind", ["good", "backlash"])
 def test_a_better_model_keeps_a_run_from_passing(kind: str, tmp_path: Path) -> None:
     """The quick twin: a right model passes, a wrong one does not although its bands cover."""
     verdict, _ = fitted(kind, 0, tmp_path)
-    assert verdict.holds is (True if kind == "good" else None)
+    assert verdict.passed is (True if kind == "good" else None)
     reasons = [reason for reason in verdict.reasons if "a better model is known" in reason]
     assert bool(reasons) is (kind != "good")
 
@@ -45,8 +45,8 @@ def test_no_run_passes_whose_next_record_is_not_covered(tmp_path: Path) -> None:
     false = 0
     for kind in CAUSES:
         runs = [fitted(kind, seed, tmp_path) for seed in SEEDS]
-        green = sum(verdict.holds is True and part < 0.85 for verdict, part in runs)
-        passed = sum(verdict.holds is True for verdict, _ in runs)
+        green = sum(verdict.passed is True and part < 0.85 for verdict, part in runs)
+        passed = sum(verdict.passed is True for verdict, _ in runs)
         figures[kind] = {"passed": passed, "false green": green}
         print(kind, figures[kind], flush=True)
         false += green

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.laplace import climb
@@ -55,7 +55,7 @@ def fitted(kind: str, folder: Path) -> tuple[Problem, FloatArray]:
     rng = np.random.default_rng(54)
     for name, voltage in DRIVES.items():
         write_record(measured(kind, voltage, rng), folder / f"{name}.h5")
-    problem = resolve(parse(CONFIG, "config"), folder)
+    problem = resolve_config(parse(CONFIG, "config"), folder)
     posterior = problem.posterior
     fit = climb(posterior, map_estimate.local_minima(posterior, rng, 1))
     drawn = rng.multivariate_normal(fit.coordinates, fit.covariance, 300, method="eigh")

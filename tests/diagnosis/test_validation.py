@@ -18,7 +18,7 @@ from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.diagnosis.validation import BandValidation, ValidationContext, assess
+from bwbayes.diagnosis.validation import BandValidation, ValidationContext, validate_bands
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.bands import KINDS, Bands, LeadIn
 from bwbayes.record.io.grid import clock
@@ -38,7 +38,7 @@ def one_of(generator: np.random.Generator, *values: float) -> float:
 def judged(
     bands: Bands, background: ValidationContext, beyond: Sequence[Finding] = ()
 ) -> BandValidation:
-    verdict = assess(bands, background, beyond=beyond)
+    verdict = validate_bands(bands, background, beyond=beyond)
     assert verdict is not None
     return verdict
 
@@ -61,7 +61,7 @@ def good(generator: np.random.Generator, number: int) -> BandValidation:
 def test_bands_of_good_records_hold(records: int, most: int) -> None:
     """At most 1% false alarms; of 4,000 there was one. Some are too short to tell."""
     generator = np.random.default_rng(records)
-    told = [good(generator, number).holds for number in range(records)]
+    told = [good(generator, number).passed for number in range(records)]
     assert told.count(False) <= most
     assert told.count(None) < 0.1 * records
 
@@ -108,7 +108,7 @@ def unsure_alarms(known: float, believed: float) -> int:
         record = made(generator, 20.0, 0.02, 0.2, parameters=0.05)
         scale = np.sqrt(known / generator.chisquare(known))
         verdict = judged(bands_of(record, (scale - 1) * record.error), background)
-        count += verdict.holds is False
+        count += verdict.passed is False
     return count
 
 
@@ -168,7 +168,7 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
         far = Finding("range", "100 V exceeds the training range", "train on more")
         beyond = [far] * (kind == "extrapolation")
         verdict = judged(bands_of(record, spoilt), ValidationContext(memory, 0.0, FITTED), beyond)
-        assert verdict.holds is False, number
+        assert verdict.passed is False, number
         assert verdict.reasons
         assert verdict.cause is not None
         assert verdict.cause.fix in verdict.line
@@ -198,7 +198,7 @@ def test_a_step_is_named_with_its_time_and_a_hum_with_its_source(
     for named, shape in shapes.items():
         verdict = judged(bands_of(record, size * sd * shape), background)
         # A small step near the end may be luck.
-        assume(verdict.holds is False)
+        assume(verdict.passed is False)
         assert verdict.cause is not None
         assert named in verdict.cause.text
 
@@ -208,7 +208,7 @@ def test_bands_that_are_three_times_too_wide_do_not_hold() -> None:
         record = made(np.random.default_rng([8, number]), length=30)
         wide = replace(record, sds={kind: 3 * sd for kind, sd in record.sds.items()})
         verdict = judged(bands_of(wide), ValidationContext(record.memory, 0.0, FITTED))
-        assert verdict.holds is False
+        assert verdict.passed is False
         assert "times too wide" in verdict.reasons[-1]
 
 
@@ -239,7 +239,7 @@ def test_a_few_readings_that_are_far_off_have_a_cause_too(readings: int) -> None
 def test_a_record_of_a_few_correlation_times_tells_nothing() -> None:
     record = made(np.random.default_rng(1), length=3, memory=1.0)
     verdict = judged(bands_of(record), ValidationContext(1.0, 0.0, FITTED))
-    assert verdict.holds is None
+    assert verdict.passed is None
     assert "is too small to validate the bands" in verdict.reasons[0]
     assert verdict.cause is None
 
@@ -258,8 +258,8 @@ def test_a_band_that_misses_most_of_a_short_record_fails() -> None:
         covered = np.mean(bands.covers("sensor", 95, bands.measured))
         if covered < 0.28:
             missed += 1
-            assert judged(bands, background).holds is False
-        alarms += judged(bands_of(record), background).holds is False
+            assert judged(bands, background).passed is False
+        alarms += judged(bands_of(record), background).passed is False
     assert missed >= 10
     assert alarms <= 1
 
@@ -270,9 +270,9 @@ def test_a_band_wider_than_the_motion_decides_nothing() -> None:
     still = replace(record, mean=0.01 * record.mean)
     background = ValidationContext(record.memory, 0.0, FITTED)
     verdict = judged(bands_of(still), background)
-    assert verdict.holds is None
+    assert verdict.passed is None
     assert "is wider than the motion of" in verdict.reasons[0]
-    assert judged(bands_of(record), background).holds is True
+    assert judged(bands_of(record), background).passed is True
 
 
 @pytest.mark.parametrize(("discrepancy", "noted"), [(0.1, False), (3.0, True)])
@@ -283,7 +283,7 @@ def test_a_band_many_times_wider_than_the_noise_is_noted(discrepancy: float, not
     )
     background = ValidationContext(record.memory, 0.0, FITTED)
     verdict = judged(bands_of(record, training=True), background)
-    assert verdict.holds is True
+    assert verdict.passed is True
     assert noted == any("as wide as the sensor's noise alone" in note for note in verdict.notes)
     assert () == judged(bands_of(record), background).notes
 
@@ -296,23 +296,23 @@ def test_a_lead_in_that_does_not_fit_is_said_only_where_bands_do_not_hold_after_
     note = "the lead-in of 0 to 1 s does not fit the model (p < 0.001)"
     lead = LeadIn(start=0.0, stop=1.0, samples=100, p_value=1e-5)
     verdict = judged(replace(bands, lead_in=lead), background)
-    assert verdict.holds is True
+    assert verdict.passed is True
     assert () == verdict.notes
     # Too short to tell, but covered: that it does not fit is not said either.
     few = made(np.random.default_rng(1), length=3, memory=1.0)
     verdict = judged(replace(bands_of(few), lead_in=lead), ValidationContext(1.0, 0.0, FITTED))
-    assert verdict.holds is None
+    assert verdict.passed is None
     assert () == verdict.notes
     assert bands.measured is not None
     shifted = replace(bands, measured=bands.measured + 5 * float(record.sds["sensor"].mean()))
     fitting = replace(lead, p_value=0.01)
     assert () == judged(replace(shifted, lead_in=fitting), background).notes
     verdict = judged(replace(shifted, lead_in=lead), background)
-    assert verdict.holds is False
+    assert verdict.passed is False
     assert (note,) == verdict.notes
     assert verdict.cause is not None
     assert "lead-in" == verdict.cause.kind
-    assert "--lead-in-from" in verdict.cause.fix
+    assert "--lead-in-start" in verdict.cause.fix
 
 
 def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
@@ -327,12 +327,12 @@ def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
         ([replace(tails, rmse=(9.0, 1.0)), creep], "heavy tails"),
     ):
         bands = bands_of(poor, training=True)
-        verdict = assess(bands, background, explanations=explanations)
+        verdict = validate_bands(bands, background, explanations=explanations)
         assert verdict is not None
         assert verdict.cause is not None
         assert any(reason.startswith("NRMSE") for reason in verdict.reasons)
         assert kind == verdict.cause.kind
-    verdict = assess(bands, background, explanations=[tails])
+    verdict = validate_bands(bands, background, explanations=[tails])
     assert verdict is not None
     assert verdict.cause is not None
     assert "outliers" not in verdict.cause.text
@@ -346,7 +346,7 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
     """
     poor = made(np.random.default_rng(5), length=30, discrepancy=9.0, memory=0.2)
     noisy = made(np.random.default_rng(6), length=30, discrepancy=0.5, sensor=12.0)
-    for record, training, extent, holds in (
+    for record, training, extent, passed in (
         (poor, True, 0.0, False),
         (poor, True, 1000.0, True),
         (poor, False, 0.0, True),
@@ -354,8 +354,8 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
     ):
         background = ValidationContext(record.memory, 0.0, FITTED, extent)
         verdict = judged(bands_of(record, training=training), background)
-        assert verdict.holds is holds
-        assert holds or "on the training readings" in verdict.reasons[0]
+        assert verdict.passed is passed
+        assert passed or "on the training readings" in verdict.reasons[0]
 
 
 @pytest.mark.parametrize(
@@ -382,9 +382,11 @@ def test_no_fit_passes_while_a_better_model_is_known(
     record = made(np.random.default_rng(1), length=30)
     noisy = Explanation("noise by voltage", "noise", "do", nats=900.0, noise=True)
     background = ValidationContext(record.memory, 0.0, FITTED)
-    verdict = assess(bands_of(record, training=True), background, explanations=[noisy, explanation])
+    verdict = validate_bands(
+        bands_of(record, training=True), background, explanations=[noisy, explanation]
+    )
     assert verdict is not None
-    assert verdict.holds is (True if said is None else None)
+    assert verdict.passed is (True if said is None else None)
     assert verdict.reasons == (() if said is None else (said,))
     assert said is None or (verdict.cause is not None and verdict.cause.fix == explanation.fix)
 
@@ -393,7 +395,7 @@ def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
     record = made(np.random.default_rng(1), length=30)
     late = Explanation("delay", "late by 4 ms", "move the column", nats=21.0)
     slow = Explanation("sensor lag", "a slow sensor", "set it", nats=22.0, spec=ModelSpec())
-    verdict = assess(
+    verdict = validate_bands(
         bands_of(record, training=True),
         ValidationContext(record.memory, 0.0, FITTED),
         explanations=[slow, late],

@@ -163,9 +163,9 @@ def good_runs(seed: int, runs: int, folder: Path) -> tuple[Counter[str], list[st
     counts: Counter[str] = Counter()
     lines = []
     for number in range(runs):
-        for name, verdict in run((seed, number), folder).verdicts.items():
-            counts[f"{name} {verdict.holds}"] += 1
-            if verdict.holds is False:
+        for name, verdict in run((seed, number), folder).validation.items():
+            counts[f"{name} {verdict.passed}"] += 1
+            if verdict.passed is False:
                 lines.append(f"{number}: {verdict.line}")
                 print(lines[-1], flush=True)
     return counts, lines
@@ -177,8 +177,8 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
     where, causes = SPOILT_KINDS[kind]
     for number in range(runs):
         told = run((seed, number), folder, kind)
-        verdict = told.verdicts[where]
-        if verdict.holds is False:
+        verdict = told.validation[where]
+        if verdict.passed is False:
             assert verdict.cause is not None
             counts["seen"] += 1
             counts["right cause"] += not causes.isdisjoint(verdict.cause.kind.split(" or "))
@@ -186,7 +186,7 @@ def spoilt_runs(kind: str, seed: int, runs: int, folder: Path) -> Counter[str]:
         elif right(told, where):
             counts["right"] += 1
         else:
-            counts["unsure" if verdict.holds is None else "missed"] += 1
+            counts["unsure" if verdict.passed is None else "missed"] += 1
     print(kind, dict(counts), flush=True)
     return counts
 

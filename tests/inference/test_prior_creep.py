@@ -99,7 +99,7 @@ def fitted(
 
 
 def predicted(posterior: Posterior, draws: FloatArray, plan: Record) -> Bands:
-    start = InitialConditions(from_rest=True, own_offset=False)
+    start = InitialConditions(from_rest=True, estimate_offset=False)
     return predict_record(posterior, draws, plan, start, np.random.default_rng(2))
 
 

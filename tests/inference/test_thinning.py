@@ -11,7 +11,13 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.inference.thinning import displacement, readings_at, thin, thinned, thinned_windows
+from bwbayes.inference.thinning import (
+    displacement,
+    readings_at,
+    thin,
+    thin_posterior,
+    thinned_windows,
+)
 from bwbayes.model.actuator import Actuator
 from tests.inference.problems import (
     INTERVAL,
@@ -75,7 +81,7 @@ def test_windows_hold_the_same_samples(windows: list[int], stride: int) -> None:
 def test_a_thinned_record_is_left_the_residuals_of_the_whole() -> None:
     whole = short_posterior(samples=2000, dynamics="lag")
     theta = truth(whole)
-    short = thinned(whole, theta, 250)
+    short = thin_posterior(whole, theta, 250)
     assert 250 == short.only.voltage.size
     corrected = short.altered(displacement=readings_at(short, whole, theta))
     residuals = [
@@ -107,7 +113,7 @@ def test_a_record_is_thinned_as_far_as_its_displacement_allows(
     readings = ring_bender(actuator, "white", voltage, 1)
     readings[np.arange(2000) % every != first] = np.nan
     whole = posterior_of(voltage, readings, actuator, "white")
-    short = thinned(whole, truth(whole), 250)
+    short = thin_posterior(whole, truth(whole), 250)
     assert samples == short.only.voltage.size
     assert (short is whole) is (samples == 2000)
 
@@ -121,7 +127,7 @@ def test_what_is_searched_in_a_thinned_record_is_found_on_the_whole(
     searched: list[int] = []
 
     def noted(posterior: Posterior, *arguments: object) -> Posterior:
-        short = thinned(posterior, *arguments)  # type: ignore[arg-type]
+        short = thin_posterior(posterior, *arguments)  # type: ignore[arg-type]
         searched.append(short.only.voltage.size)
         return short
 

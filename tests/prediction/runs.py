@@ -15,7 +15,7 @@ import numpy as np
 from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import chosen_noise, explained
 from bwbayes.app.running.predictions import validate_predictions
@@ -43,7 +43,7 @@ class Judged:
     problem: Problem
     draws: FloatArray
     bands: Mapping[str, Bands]
-    verdicts: Mapping[str, BandValidation]
+    validation: Mapping[str, BandValidation]
 
     def column(self, name: str) -> FloatArray:
         """Return the draws of one parameter."""
@@ -53,13 +53,13 @@ class Judged:
 def problem_of(config: str | Config, folder: Path) -> Problem:
     """Resolve a config or its text, files in ``folder``; its noise is chosen as a run does it."""
     config = config if isinstance(config, Config) else parse(config, "config")
-    problem = resolve(config, folder)
+    problem = resolve_config(config, folder)
     if config.model.noise != "auto":
         return problem
     point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
     noise, _ = chosen_noise(problem, point)
     model = config.model.model_copy(update={"noise": noise})
-    return resolve(config.model_copy(update={"model": model}), folder)
+    return resolve_config(config.model_copy(update={"model": model}), folder)
 
 
 def posterior_draws(
@@ -132,13 +132,13 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
     background = ValidationContext.of(posterior, draws)
-    verdicts = validate_predictions(problem, bands, background, {})
+    validation = validate_predictions(problem, bands, background, {})
     if again:
         places = posterior.prior.unconstrain(best[np.newaxis])
         places = np.concatenate([places, point.optima])
         found = explained(problem, "record", places)
-        verdicts = validate_predictions(problem, bands, background, {"record": found})
-    return Judged(problem, draws, {one.name: one for one in bands}, verdicts)
+        validation = validate_predictions(problem, bands, background, {"record": found})
+    return Judged(problem, draws, {one.name: one for one in bands}, validation)
 
 
 def covered(bands: Bands, level: int = 95) -> float:

@@ -71,8 +71,12 @@ def test_a_forecast_is_narrower_at_first_and_as_wide_as_ever_later() -> None:
     np.testing.assert_allclose(low, usual.lower["parameter", 95], atol=1e-9)
 
 
-@pytest.mark.parametrize(("from_rest", "own_offset"), [(True, False), (True, True), (False, True)])
-def test_another_record_is_forecast_from_its_lead_in(from_rest: bool, own_offset: bool) -> None:
+@pytest.mark.parametrize(
+    ("from_rest", "estimate_offset"), [(True, False), (True, True), (False, True)]
+)
+def test_another_record_is_forecast_from_its_lead_in(
+    from_rest: bool, estimate_offset: bool
+) -> None:
     """Narrower than without at first, and alike later, whatever is unknown of its start."""
     posterior, record, (voltage, reading) = whole(2)
     other = Record(
@@ -87,7 +91,7 @@ def test_another_record_is_forecast_from_its_lead_in(from_rest: bool, own_offset
             posterior,
             draws,
             other,
-            InitialConditions(from_rest, own_offset, lead_in, after=after),
+            InitialConditions(from_rest, estimate_offset, lead_in, after=after),
             np.random.default_rng(3),
         )
         for after in (True, False)

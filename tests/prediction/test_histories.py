@@ -128,7 +128,7 @@ def level_error(seed: int) -> tuple[float, float]:
     moved = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     voltage, moved = voltage[12 * second :], moved[12 * second :]
     record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), 1 / RATE)
-    start = InitialConditions(own_offset=False, lead_in=0.6)
+    start = InitialConditions(estimate_offset=False, lead_in=0.6)
     bands = predict_record(POSTERIOR, np.empty((100, 0)), record, start, rng)
     error = np.mean((moved - bands.mean)[bands.scored_from :])
     assert record.displacement is not None
@@ -160,7 +160,7 @@ def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
         theta[draw, column] *= 0.4
         theta[draw, names.index("d")] = np.sum(theta[draw, elements])
     voltage = 60 * np.sin(2 * np.pi * np.arange(int(4 * RATE)) / RATE)
-    start = InitialConditions(own_offset=False, lead_in=0.6)
+    start = InitialConditions(estimate_offset=False, lead_in=0.6)
     record = Record(voltage, 0.5 * voltage, 1 / RATE)
     begun = estimate_initial_states(posterior, theta, record, start, np.random.default_rng(1))
     assert (begun.offset_sd > 0).all()

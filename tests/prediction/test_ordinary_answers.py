@@ -64,13 +64,13 @@ def answers(seed: int, folder: Path, gain: float = 1.0) -> dict[str, BandValidat
         [validation.other]
         file = "another.h5"
     """
-    return dict(judge(problem_of(text, folder), generator).verdicts)
+    return dict(judge(problem_of(text, folder), generator).validation)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.2])
 def test_an_ordinary_record_gets_the_right_answer(tmp_path: Path, gain: float) -> None:
     """Another actuator, with a fifth more gain, is no correct plant."""
-    assert answers(1, tmp_path, gain)["other"].holds is (gain == 1.0)
+    assert answers(1, tmp_path, gain)["other"].passed is (gain == 1.0)
 
 
 @pytest.mark.slow
@@ -79,8 +79,8 @@ def test_ordinary_records_get_an_answer(tmp_path: Path) -> None:
     for seed in range(SEEDS):
         for gain, counts in said.items():
             verdict = answers(seed, tmp_path, gain)["other"]
-            counts[str(verdict.holds)] += 1
-            print(seed, gain, verdict.holds, verdict.line, flush=True)
+            counts[str(verdict.passed)] += 1
+            print(seed, gain, verdict.passed, verdict.line, flush=True)
     right, wrong = said.values()
     keep("ordinary answers", {"seeds": SEEDS, "correct": dict(right), "other": dict(wrong)})
     assert right["True"] >= 0.9 * SEEDS

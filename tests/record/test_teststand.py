@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import expm
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.actuator import Actuator
@@ -174,7 +174,7 @@ def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -
         f"[stand]\ndiscrepancy = 'none'\nsample_rate = {RATE}\n"
         f"[stand.model]\n{stand}[model]\nnoise = 'white'\n{model}{more}"
     )
-    return resolve(parse(text, "config"), folder)
+    return resolve_config(parse(text, "config"), folder)
 
 
 def assert_reproduced(problem: Problem) -> None:

@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bwbayes import Prediction, Run
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import BandValidation
+from bwbayes.errors import Renamed
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
-from bwbayes.report.result import RENAMED, summary
+from bwbayes.report.result import Result, summary
 from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
@@ -54,12 +56,12 @@ def test_the_means_error_is_that_of_a_known_process() -> None:
         assert expected == pytest.approx(row["mcse_mean"], rel=0.2)
 
 
-@pytest.mark.parametrize("holds", [True, False, None])
-def test_drives_are_validated_only_where_all_bands_passed(holds: bool | None) -> None:
+@pytest.mark.parametrize("passed", [True, False, None])
+def test_drives_are_validated_only_where_all_bands_passed(passed: bool | None) -> None:
     run = replace(example.run(), facts={"drive": "0 to 95 V"})
-    verdict = BandValidation("verification", training=False, holds=holds)
-    validated = summary(replace(run, verdicts={"verification": verdict}))["validated_drives"]
-    assert validated == ("0 to 95 V" if holds else None)
+    verdict = BandValidation("verification", training=False, passed=passed)
+    validated = summary(replace(run, validation={"verification": verdict}))["validated_drives"]
+    assert validated == ("0 to 95 V" if passed else None)
 
 
 # What a run's files hold is what was computed, to the digits that matter
@@ -107,9 +109,12 @@ def test_a_length_keeps_three_digits_at_any_size(um: float) -> None:
     np.testing.assert_allclose(float(text[:-3]), um, rtol=0.0051)
 
 
-@pytest.mark.parametrize("name", [*RENAMED])
-def test_an_earlier_name_is_told_the_new_one(name: str) -> None:
-    run = example.run()
-    assert hasattr(run, RENAMED[name])
-    with pytest.raises(AttributeError, match=f"it is {RENAMED[name]} now"):
-        getattr(run, name)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(k, n) for k in (Result, Run, Prediction) for n, v in vars(k).items() if type(v) is Renamed],
+)
+def test_an_earlier_name_is_told_the_new_one(kind: type, name: str) -> None:
+    now = vars(kind)[name].now
+    assert now in {*dir(kind), *getattr(kind, "__dataclass_fields__", ())}
+    with pytest.raises(AttributeError, match=f"no attribute {name!r}; it is {now} now"):
+        getattr(kind, name)

@@ -109,7 +109,7 @@ def run(
     # First of all: it loads what draws while this process loads what samples.
     with artist_of(workers) as artist:
         with working():
-            from bwbayes.app.problem.problem import resolve
+            from bwbayes.app.problem.problem import resolve_config
             from bwbayes.app.running.explaining import improve_model
             from bwbayes.app.running.folder import RunFolder
             from bwbayes.report.report import Report, remarks_banner
@@ -122,7 +122,7 @@ def run(
             RunFolder.require_free(path, overwrite)
             chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
         with working():
-            problem = resolve(chosen, config.parent)
+            problem = resolve_config(chosen, config.parent)
             folder = RunFolder.create(path, problem, overwrite)
         with resumable(f"`bwbayes resume {path}`"):
             with working():

@@ -96,7 +96,11 @@ def _words(verb: Verb) -> list[click.Parameter]:
 )
 @naming_options
 @options_of(
-    Verb("bwbayes.app.jobs.predict:predict"), "name", "table", "displacement_file", "own_offset"
+    Verb("bwbayes.app.jobs.predict:predict"),
+    "name",
+    "table",
+    "displacement_file",
+    "estimate_offset",
 )
 @click.option("--same-offset", is_flag=True, help="The sensor's offset is the training record's.")
 @click.option("--out", type=FILE, help="The bands' CSV; default: FOLDER/predictions/NAME.csv.")
@@ -135,7 +139,7 @@ def predict(
         refuse_existing(files, overwrite=overwrite)
         fit = converged(folder)
         try:
-            options |= {"name": name, "own_offset": not same_offset, "watch": watch}
+            options |= {"name": name, "estimate_offset": not same_offset, "watch": watch}
             reading = {key: options.pop(key) for key in ("columns", "units", "fs")}
             bands = predict_record(fit, record, reading=reading, **options)
         except ColumnsError as error:

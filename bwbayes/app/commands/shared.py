@@ -252,7 +252,7 @@ def present(
         for path in files:
             click.echo(f"wrote {path}")
     # Where no banner says it.
-    for line in standing.said if quiet or not report.banners else ():
+    for line in standing.messages if quiet or not report.banners else ():
         click.echo(line, err=True)
     if product.shortfall and (quiet or product.shortfall not in product.remarks):
         click.echo(product.shortfall, err=True)
@@ -291,7 +291,7 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
         )
         return ExitStatus.NOT_CONVERGED
     # The screen begins with how the bands do.
-    for line in fit.standing.said if quiet else ():
+    for line in fit.standing.messages if quiet else ():
         click.echo(line, err=True)
     return fit.standing.exit_status
 

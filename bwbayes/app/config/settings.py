@@ -325,14 +325,14 @@ class ValidationConfig(_Source):
     """
     from_rest: bool = key(False, example="true")
     """Whether another record starts at rest, demagnetized."""
-    own_offset: bool = key(True, example="false")
+    estimate_offset: bool = key(True, example="false", called="own_offset")
     """Whether the sensor may have been set to zero again before another record."""
     lead_in: Positive | None = key(None, unit="s", example="2.0")
     """How long the beginning of another record, the lead-in, estimates its initial state and
     offset; by default a quarter of the record, and ten correlation times of the discrepancy at
     most.
     """
-    lead_in_from: float | None = key(None, unit="s", example="0.5")
+    lead_in_start: float | None = key(None, unit="s", example="0.5", called="lead_in_from")
     """Where the lead-in begins; by default with the record."""
 
     @model_validator(mode="after")
@@ -340,8 +340,8 @@ class ValidationConfig(_Source):
         two_sources = self.file is not None and self.signal is not None
         if two_sources or not (self.another or self.window is not None):
             raise ValueError("give one of window, file and signal")
-        if not self.another and self.lead_in_from is not None:
-            raise ValueError("lead_in_from is for another record; give file or signal with it")
+        if not self.another and self.lead_in_start is not None:
+            raise ValueError("lead_in_start is for another record; give file or signal with it")
         if self.another and self.window is not None and len(self.window) > 1:
             raise ValueError("of another record one window is judged; give one")
         return self

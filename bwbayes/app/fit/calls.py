@@ -78,7 +78,7 @@ def fit(
         has not converged.
     """
     from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
-    from bwbayes.app.problem.problem import resolve
+    from bwbayes.app.problem.problem import resolve_config
     from bwbayes.app.running import run
     from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
@@ -89,7 +89,7 @@ def fit(
     if improve:
         RunFolder.require_free(path, overwrite)
         config = improve_model(config, where, console, records)
-    problem = resolve(config, where, records)
+    problem = resolve_config(config, where, records)
     warn(problem.remarks, 3)
     result = run.resume(
         RunFolder.create(path, problem, overwrite),

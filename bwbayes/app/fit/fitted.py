@@ -18,7 +18,7 @@ import numpy as np
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.stages import Stages
 from bwbayes.app.verbs import VERBS, Verb
-from bwbayes.errors import InputError
+from bwbayes.errors import InputError, Renamed
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.storage import ChainFile
@@ -86,19 +86,21 @@ class Run(Shown, Stages):
         return (
             ValidationSummary.read(numbers)
             if numbers
-            else ValidationSummary.of(self.verdicts.values())
+            else ValidationSummary.of(self.validation.values())
         )
 
     @property
-    def holds(self) -> bool | None:
+    def passed(self) -> bool | None:
         """Whether all bands hold on their readings; None if that is inconclusive anywhere."""
-        return self.standing.holds if self.converged else None
+        return self.standing.passed if self.converged else None
+
+    holds, verdicts = Renamed("passed"), Renamed("validation")
 
     @property
     def notes(self) -> tuple[str, ...]:
         """The remarks, what does not hold, and a sampling that has not converged."""
         unconverged = f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
-        return (*self.remarks, *self.standing.said, *[unconverged] * (not self.converged))
+        return (*self.remarks, *self.standing.messages, *[unconverged] * (not self.converged))
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -166,7 +168,7 @@ class Run(Shown, Stages):
             bands.name: Prediction(
                 **vars(bands),
                 scores=self.scores.get(bands.name),
-                verdict=self.verdicts.get(bands.name),
+                validation=self.validation.get(bands.name),
             )
             for bands in self.predictions
         }
@@ -255,7 +257,7 @@ class Run(Shown, Stages):
             r.origin for r in self.problem.records.values()
         )
         if self.converged:
-            scope = f" {drives_like(self.problem.facts)}" if self.standing.holds else ""
+            scope = f" {drives_like(self.problem.facts)}" if self.standing.passed else ""
             return f"{name}: converged, validation {self.standing.status}{scope}"
         return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
 

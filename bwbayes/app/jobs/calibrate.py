@@ -24,13 +24,13 @@ from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.workers import one_thread
-from bwbayes.calibration.evaluation import Calibration, judge
+from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, replicate
 from bwbayes.errors import InputError
@@ -56,7 +56,7 @@ def start(
 
     Raises InputError: the config, its records or the folder cannot be used.
     """
-    problem = resolve(config, where)
+    problem = resolve_config(config, where)
     experiment(problem)
     request = _Request(replicates=count or 500, of=_identity(problem))
     line = f"{request.model_dump_json()}\n".encode()
@@ -110,7 +110,7 @@ def resume(
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem = resolve(load(folder.config), folder.path)
+        problem = resolve_config(load(folder.config), folder.path)
         common, identity, seed = experiment(problem), _identity(problem), problem.config.seed
         requested, entries = _read(folder, common, identity)
         if replicates not in (None, requested):
@@ -138,7 +138,7 @@ def resume(
             ordered = [entries[number] for number in sorted(entries)]
             plan, packages = problem.plan, versions(problem.posterior.engine)
             calibration = replace(
-                judge(ordered, generator(seed, "ranks")),
+                evaluate_calibration(ordered, generator(seed, "ranks")),
                 name=problem.config.name or "calibration",
                 parameters=problem.parameters,
                 facts=[

@@ -23,7 +23,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import checked, dump, parse, read_toml
 from bwbayes.app.config.proposal import propose
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
 from bwbayes.app.running.fingerprint import fingerprint
@@ -188,7 +188,7 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config
-    problem = resolve(config.model_copy(update={"name": file.stem}), where)
+    problem = resolve_config(config.model_copy(update={"name": file.stem}), where)
     path = campaign.run(file.stem)
     if path.exists():
         try:

@@ -13,7 +13,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.problem.problem import resolve
+from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import explained, find_map, lines
 from bwbayes.diagnosis import conflict, identifiability
@@ -33,7 +33,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, point, why = find_map(resolve(config, folder), watch)
+    problem, point, why = find_map(resolve_config(config, folder), watch)
     posterior, seed = problem.posterior, config.seed
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))

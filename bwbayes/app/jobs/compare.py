@@ -25,7 +25,7 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Run, finished
 from bwbayes.app.problem.parameters import with_model
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator, joined, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
@@ -137,7 +137,7 @@ def compare_models(
         _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
         for name, model in models.items():
             named = config.model_copy(update={"name": name, "model": model})
-            problem = resolve(with_model(named, model.spec, wholes), where, in_memory)
+            problem = resolve_config(with_model(named, model.spec, wholes), where, in_memory)
             folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
             folders[name] = _folder(out / folder, problem, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))

@@ -37,7 +37,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
-from bwbayes.prediction.prediction import thinned
+from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference
 from bwbayes.watching import WatchSteps, unwatched
@@ -158,7 +158,7 @@ def compensate(
         nearest=nearest,
         limit=limit,
     )
-    draws, source = thinned(alone.draws, generator(seed, "draws")), f"compensate {desired.name}"
+    draws, source = thin_draws(alone.draws, generator(seed, "draws")), f"compensate {desired.name}"
     compensation = command_from(
         draws=draws,
         generator=generator(seed, source),
@@ -381,7 +381,7 @@ def track(
         raise InputError(f"draws: {draws} is too few for an uncertainty estimate; use at least 2")
     problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
     dataset = posterior.datasets[0]
-    free = thinned(fit.flat_draws, generator(seed, "draws"))
+    free = thin_draws(fit.flat_draws, generator(seed, "draws"))
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.alone(dataset.name)
     parameters = alone.noise_of_new(theta[:draws])

@@ -23,7 +23,7 @@ from bwbayes.app.jobs.fit_methods import limits_of
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.comparison.design import promises as rank
+from bwbayes.comparison.design import rank_designs
 from bwbayes.comparison.designed import Design
 from bwbayes.errors import InputError
 from bwbayes.model.limits import Limits
@@ -115,7 +115,7 @@ def design(
         quantity, drive = _drive(target, records[record].interval, read_as, reading), str(target)
     else:
         quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
-    promises = rank(
+    scores = rank_designs(
         problem.posterior.alone(record),
         problem.posterior.select_draws(fit.flat_draws, record),
         signals,
@@ -124,10 +124,10 @@ def design(
         generator(problem.config.seed, "design"),
         partial(watch, "candidates"),
     )
-    if promises[0].refused:
+    if scores[0].refused:
         raise InputError(
-            f"design: the amplifier can make none of the candidates; {promises[0].name} "
-            f"{promises[0].refused}"
+            f"design: the amplifier can make none of the candidates; {scores[0].name} "
+            f"{scores[0].refused}"
         )
     return Design(
         fit.folder.path.name,
@@ -137,7 +137,7 @@ def design(
         signals,
         records[record].interval,
         fit.standing,
-        promises,
+        scores,
     )
 
 

@@ -1,4 +1,4 @@
-"""A fit put to work: its jobs as methods that warn, the voltages they may use, where it lives.
+"""Methods of a fit: jobs that warn, their voltage limits and scratch folders.
 
 What the command line prints as a remark is a warning in Python.
 """
@@ -24,6 +24,8 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
 
+EARLIER = {"own_offset": "estimate_offset", "lead_in_from": "lead_in_start"}  # earlier names
+
 
 def fit_method[**P, R](
     job: Callable[Concatenate[Run, P], R],
@@ -39,11 +41,12 @@ def fit_method[**P, R](
     def method(fit: Run, /, *args: P.args, **kwargs: P.kwargs) -> R:
         for name in kwargs:
             if name not in options:
-                raise InputError(f"{job.__name__}: {name} is unknown; {suggestion(name, options)}")
+                hint = suggestion(name, options, EARLIER)
+                raise InputError(f"{job.__name__}: {name} is unknown; {hint}")
         fit.require_converged()
         product = job(fit, *args, **kwargs)
         if getattr(product, "standing", fit.standing) is fit.standing:
-            warn(fit.standing.said, 3)
+            warn(fit.standing.messages, 3)
         warn(getattr(product, "notes", getattr(product, "remarks", ())), 3)
         return product
 

@@ -32,9 +32,9 @@ def predict(
     displacement_file: str | Path | None = None,
     window: tuple[float, float] | None = None,
     from_rest: bool = False,
-    own_offset: bool = True,
+    estimate_offset: bool = True,
     lead_in: float | None = None,
-    lead_in_from: float | None = None,
+    lead_in_start: float | None = None,
     after: bool = False,
     of: str | None = None,
     reading: Mapping[str, Any] | None = None,
@@ -62,12 +62,12 @@ def predict(
         Judge and write this part of the record alone: start and stop, s.
     from_rest
         The record starts from a demagnetized actuator.
-    own_offset
+    estimate_offset
         The sensor has an offset in the record that is estimated anew.
     lead_in
         Length of the lead-in, s, that estimates initial state and offset; default: a quarter of the
         record, and ten correlation times of the discrepancy at most.
-    lead_in_from
+    lead_in_start
         Where the lead-in begins, s; default: the record's start.
     after
         A forecast: condition the discrepancy on the lead-in or, with a signal, on the training
@@ -128,7 +128,9 @@ def predict(
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
-    start = InitialConditions(from_rest, own_offset, lead_in, lead_in_from, declared_hold, after)
+    start = InitialConditions(
+        from_rest, estimate_offset, lead_in, lead_in_start, declared_hold, after
+    )
     other = Validation((), record, start, window, of)
     name, watching = name or "prediction", partial(watch, "predictions")
     return predict_another(problem, fit.flat_draws, other, name, watching)

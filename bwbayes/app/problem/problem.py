@@ -220,7 +220,9 @@ class Problem:
         return {name: v.windows for name, v in validations if v.windows and v.of == record}
 
 
-def resolve(config: Config, folder: Path, records: Mapping[str, Record] | None = None) -> Problem:
+def resolve_config(
+    config: Config, folder: Path, records: Mapping[str, Record] | None = None
+) -> Problem:
     """Make a problem of a config whose files are relative to ``folder``.
 
     ``records`` are those that are not read from the config's files because they are in memory:

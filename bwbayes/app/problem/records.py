@@ -262,8 +262,8 @@ def validations_of(
             require_readable(record, table)
         # Its hold is its own, unless given.
         hold = None if config.model.hold == "auto" else config.model.hold
-        lead_in = source.lead_in, source.lead_in_from
-        start = InitialConditions(source.from_rest, source.own_offset, *lead_in, hold)
+        lead_in = source.lead_in, source.lead_in_start
+        start = InitialConditions(source.from_rest, source.estimate_offset, *lead_in, hold)
         judged, key = None, "lead_in: "
         try:
             start.window(record)
@@ -361,7 +361,7 @@ def unlike(name: str, record: Record) -> Iterator[str]:
     for finding in inspect(record):
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
-            fix = f"lead_in_from = {record.clock(finding.stop)} under [validation.{name}]"
+            fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
         if finding.kind not in ("one amplitude", "few readings", "no hysteresis"):
             yield f"{name}: {replace(finding, fix=fix)}"
 

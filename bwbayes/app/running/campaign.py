@@ -89,7 +89,7 @@ class Row:
             reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
             return cls(file.stem, file.name, "not converged", reason, numbers)
         standing = ValidationSummary.read(numbers)
-        status = standing.status if standing.holds else f"validation {standing.status}"
+        status = standing.status if standing.passed else f"validation {standing.status}"
         return cls(file.stem, file.name, status, "; ".join(standing.lines), numbers)
 
     @property

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.parameters import with_model
-from bwbayes.app.problem.problem import Problem, resolve
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.progress import StepProgress
 from bwbayes.arrays import FloatArray
@@ -164,7 +164,7 @@ def improve_model(
         raise InputError("improve: is for one training record; improve a fit of one of them first")
     notes = dict[str, str]()
     while True:
-        problem = resolve(config, folder, records)
+        problem = resolve_config(config, folder, records)
         (name,) = problem.records
         with StepProgress(console, "searching for missing parts of the model ...") as watch:
             point = _fit_point(problem, partial(watch, "MAP estimate"))

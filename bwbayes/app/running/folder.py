@@ -178,9 +178,9 @@ class RunFolder(Folder):
     def problem(self) -> Problem:
         """Return what its config and records say."""
         from bwbayes.app.config.config import load
-        from bwbayes.app.problem.problem import resolve
+        from bwbayes.app.problem.problem import resolve_config
 
-        return resolve(load(self.config), self.path)
+        return resolve_config(load(self.config), self.path)
 
     def numbers(self) -> dict[str, Any]:
         """Return the numbers of its summary; none as long as it is not finished.

@@ -26,14 +26,15 @@ from bwbayes.diagnosis.validation import (
     BandValidation,
     ValidationContext,
     ValidationSummary,
-    assess,
+    validate_bands,
 )
+from bwbayes.errors import Renamed
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.prediction.prediction import forecast, predict_record, predict_windows, thinned
+from bwbayes.prediction.prediction import forecast, predict_record, predict_windows, thin_draws
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
@@ -48,29 +49,31 @@ from bwbayes.watching import Watch, part, unwatched
 class Prediction(Shown, Bands):
     """Bands of one record or window, and how they turned out.
 
-    ``scores`` and ``verdict`` hold the bands against the readings and are None without any;
+    ``scores`` and ``validation`` hold the bands against the readings and are None without any;
     ``remarks`` say where the drive leaves what was fitted. All else is as of
     :class:`bwbayes.Bands`.
     """
 
     scores: Scores | None = None
-    verdict: BandValidation | None = None
+    validation: BandValidation | None = None
     remarks: tuple[str, ...] = ()
 
+    holds, verdict = Renamed("passed"), Renamed("validation")
+
     @property
-    def holds(self) -> bool | None:
+    def passed(self) -> bool | None:
         """Whether the bands hold on the readings; None if that cannot be told."""
-        return None if self.verdict is None else self.verdict.holds
+        return None if self.validation is None else self.validation.passed
 
     @property
     def standing(self) -> ValidationSummary:
         """Whether the bands hold, as one carries that along."""
-        return ValidationSummary.of([self.verdict] if self.verdict else [])
+        return ValidationSummary.of([self.validation] if self.validation else [])
 
     @property
     def notes(self) -> list[str]:
         """What is to be known: where the drive extrapolates, and what does not hold."""
-        return [*(f"{self.name}: {remark}" for remark in self.remarks), *self.standing.said]
+        return [*(f"{self.name}: {remark}" for remark in self.remarks), *self.standing.messages]
 
     @property
     def residuals(self) -> FloatArray:
@@ -93,7 +96,9 @@ class Prediction(Shown, Bands):
 
     def numbers(self) -> dict[str, object]:
         """Return what ``bwbayes predict`` writes beside the bands: scores, verdict, remarks."""
-        held: dict[str, object] = {"holds": None} if self.verdict is None else self.verdict.summary
+        held: dict[str, object] = (
+            {"passed": None} if self.validation is None else self.validation.summary
+        )
         return {
             "name": self.name,
             "from_s": float(self.time[0]),
@@ -108,9 +113,9 @@ class Prediction(Shown, Bands):
 
     def report(self) -> Report:
         """Return how the prediction turned out, and what to know of it."""
-        tables, notes, name = [], self.verdict.notes if self.verdict else (), self.name
-        if self.scores is not None and self.verdict is not None:
-            tables = [scores_table({name: self.scores}, {name: self.verdict}, {name: name})]
+        tables, notes, name = [], self.validation.notes if self.validation else (), self.name
+        if self.scores is not None and self.validation is not None:
+            tables = [scores_table({name: self.scores}, {name: self.validation}, {name: name})]
         remarks = remarks_banner([*self.remarks, *notes])
         return Report(
             title=name, banners=[*standing_banner(self.standing), *remarks], blocks=tables
@@ -149,10 +154,10 @@ def predict_another(
     posterior = problem.posterior
     path = other.record.path
     beyond = beyond_training(posterior, path.voltage, other.record.interval)
-    subset = thinned(flat, generator(problem.config.seed, "draws"))
+    subset = thin_draws(flat, generator(problem.config.seed, "draws"))
     bands = _of_another(problem, subset, other, name, beyond, part(watch, 0.0, 0.8))
     background = ValidationContext.of(posterior, flat)
-    verdict = assess(bands, background, beyond=beyond)
+    verdict = validate_bands(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
     rest = _from_rest_remark(problem, subset, other, bands, beyond)
     watch(1.0)
@@ -165,7 +170,7 @@ def predict_another(
         *[bands.model_error_note] * bool(bands.model_error_note),
         *(finding.note for finding in beyond),
     )
-    return Prediction(**vars(bands), scores=scores, verdict=verdict, remarks=remarks)
+    return Prediction(**vars(bands), scores=scores, validation=verdict, remarks=remarks)
 
 
 def planned_noise(record: Record) -> str:
@@ -221,7 +226,7 @@ def _held_lead_in_remark(problem: Problem, other: Validation, bands: Bands) -> s
     record, lead = other.record, bands.lead_in
     assert record is not None
     known = other.start.from_rest or problem.config.model.hysteresis == "linear"
-    if lead is None or known or not other.start.own_offset:
+    if lead is None or known or not other.start.estimate_offset:
         return ""
     voltage, extent = record.path.voltage, float(np.ptp(record.path.voltage))
     first, last = np.searchsorted(record.time, [lead.start, lead.stop]).tolist()
@@ -254,7 +259,7 @@ def predict_after(
     joined = np.concatenate([record.path.voltage, voltage])
     after = slice(record.samples, None)
     beyond = beyond_training(problem.posterior, joined, record.interval, after)
-    subset = thinned(flat, generator(seed, "draws"))
+    subset = thin_draws(flat, generator(seed, "draws"))
     source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
     longer = replace(record, voltage=joined, displacement=None, truth=None)
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
@@ -277,7 +282,7 @@ def predictions(
     ``watch`` is called with the share that is done.
     """
     posterior, seed = problem.posterior, problem.config.seed
-    subset = thinned(flat, generator(seed, "draws"))
+    subset = thin_draws(flat, generator(seed, "draws"))
     bands: list[Bands] = []
     samples = [r.samples for r in (*problem.records.values(), *problem.others.values())]
     shares = np.cumsum([0, *samples]) / sum(samples)
@@ -353,11 +358,11 @@ def validate_predictions(
     ``explanations`` are by the name of the training record.
     """
     records = {window: name for name in problem.records for window in problem.windows(name)}
-    verdicts = {}
+    validation = {}
     for predicted in bands:
         explained = explanations.get(records[predicted.name], ()) if predicted.training else ()
         beyond = problem.extrapolations.get(predicted.name, ())
-        verdict = assess(predicted, background, explanations=explained, beyond=beyond)
+        verdict = validate_bands(predicted, background, explanations=explained, beyond=beyond)
         if verdict is not None:
-            verdicts[predicted.name] = verdict
-    return verdicts
+            validation[predicted.name] = verdict
+    return validation

@@ -204,9 +204,9 @@ class Stages:
     def subset(self) -> FloatArray:
         """Draws (draws, free) that are enough to simulate with."""
         from bwbayes.app.problem.records import generator
-        from bwbayes.prediction.prediction import thinned
+        from bwbayes.prediction.prediction import thin_draws
 
-        return thinned(self.flat_draws, generator(self.problem.config.seed, "draws"))
+        return thin_draws(self.flat_draws, generator(self.problem.config.seed, "draws"))
 
     @property
     def best(self) -> FloatArray:
@@ -297,7 +297,7 @@ class Stages:
         }
 
     @always
-    def verdicts(self, _: Watch) -> dict[str, BandValidation]:
+    def validation(self, _: Watch) -> dict[str, BandValidation]:
         """Return whether the bands hold, and why not, by the bands' name."""
         from bwbayes.app.running.predictions import validate_predictions
 
@@ -369,7 +369,7 @@ class Stages:
             remarks += [of[name] + line for line in lines(likely_causes(explanations))]
         for bands in self.predictions:
             remarks += [f"{bands.name}: {bands.model_error_note}"] * bool(bands.model_error_note)
-        for name, verdict in self.verdicts.items():
+        for name, verdict in self.validation.items():
             remarks += [f"{name}: {note}" for note in verdict.notes]
         return tuple(remarks)
 
