@@ -21,6 +21,7 @@ from bwbayes.inference import mode_finding
 from bwbayes.inference.likelihood import Likelihood, batches
 from bwbayes.inference.mode_finding import NOISE_STEPS, Target
 from bwbayes.inference.posterior import Posterior
+from bwbayes.watching import Watch, unwatched
 
 
 def _same(series: FloatArray, _: FloatArray) -> FloatArray:
@@ -117,19 +118,23 @@ class LocalFit:
 
 
 def climb(
-    posterior: Posterior, places: FloatArray, effect: Effect = NONE, least: float = -np.inf
+    posterior: Posterior,
+    places: FloatArray,
+    effect: Effect = NONE,
+    least: float = -np.inf,
+    watch: Watch = unwatched,
 ) -> LocalFit:
     """Fit from the best of coordinates (places, free) of a posterior of one record nearby.
 
     Two rounds from each of them, with each of an effect's starts, side by side, tell which one
     leads. The climb ends where it gains so little that it would never reach a log density of
-    ``least``.
+    ``least``. ``watch`` is called with the share that is done.
     """
     target = _EffectTarget(posterior, effect)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
     # An effect has many starts, and few of them lead far.
     steps = NOISE_STEPS if effect is NONE else 2
-    state = mode_finding.climb(target, np.stack(starts), least, steps)
+    state = mode_finding.climb(target, np.stack(starts), least, steps, watch)
     covariance, log_determinant = target.covariance(state)
     return LocalFit(
         posterior,

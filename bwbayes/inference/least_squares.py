@@ -12,6 +12,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.linearization import value_and_jacobian
+from bwbayes.watching import Watch, unwatched, watched
 
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
@@ -68,10 +69,13 @@ class LeastSquares:
         """Sum of squares (models,)."""
         return np.sum(self.residuals(coordinates) ** 2, axis=1)
 
-    def optima(self, starts: FloatArray, least: float = 1e-8) -> FloatArray:
+    def optima(
+        self, starts: FloatArray, least: float = 1e-8, watch: Watch = unwatched
+    ) -> FloatArray:
         """Return the coordinates (starts, free) of the optima that starts (starts, free) lead to.
 
         The last step is one that takes less than the ``least`` part of the sum of squares away.
+        ``watch`` is called with the share of the most steps that is done.
 
         By Levenberg and Marquardt's steps, all starts side by side: to simulate a record for many
         models takes hardly longer than for one. Lengths are in spreads; the damping follows how
@@ -93,7 +97,7 @@ class LeastSquares:
         growth = np.full(len(starts), 2.0)
         moving = np.flatnonzero(np.isfinite(costs))
         unit, length = np.eye(slopes.shape[1]), self.spread[self.physical]
-        for _ in range(60):
+        for _ in watched(range(60), watch):
             if not moving.size:
                 break
             gradient = slopes[moving] @ residual[moving, :, np.newaxis]

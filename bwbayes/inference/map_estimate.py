@@ -21,7 +21,7 @@ from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.mode_finding import Mode, Target, refine
 from bwbayes.inference.thinning import thin_posterior
 from bwbayes.shown import brief
-from bwbayes.watching import Watch, part, unwatched, watched
+from bwbayes.watching import Watch, part, parts, unwatched, watched
 
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
@@ -146,11 +146,11 @@ def _places(
     if not np.isfinite(density).any():
         raise InputError("priors: no draw has a finite posterior density; check priors and record")
     optima = []
-    for steps in watched((False, True), watch):
+    for steps, of_steps in parts((False, True), watch):
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
         optima += _distinct_minima(
-            least_squares, least_squares.optima(draws[order[:starts]], least)
+            least_squares, least_squares.optima(draws[order[:starts]], least, of_steps)
         )
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]

@@ -17,6 +17,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.linearization import gradient_and_hessian, value_and_jacobian
 from bwbayes.inference.posterior import Posterior
+from bwbayes.watching import Watch, unwatched, watched
 
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
@@ -253,17 +254,22 @@ class Target:
 
 
 def climb(
-    target: Target, starts: FloatArray, least: float = -np.inf, many_steps: int = NOISE_STEPS
+    target: Target,
+    starts: FloatArray,
+    least: float = -np.inf,
+    many_steps: int = NOISE_STEPS,
+    watch: Watch = unwatched,
 ) -> Iterate:
     """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
 
     The one that leads after :data:`FIRST_ROUNDS` goes on alone, until it gains so little that it
     would never reach a log density of ``least``. A round has ``many_steps`` in the noise's
-    coordinates while there are several. Where no start is possible, that is the state.
+    coordinates while there are several. Where no start is possible, that is the state. ``watch``
+    is called with the share of the most rounds that is done.
     """
     begun = target.at(starts)
     states = [state for state in begun if np.isfinite(state.density)]
-    for number in range(1, ROUNDS + FIRST_ROUNDS + 1) if states else ():
+    for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch) if states else ():
         ahead = target.round(states, many_steps if len(states) > 1 else NOISE_STEPS)
         best = int(np.argmax([state.density for state in ahead]))
         gain = ahead[best].density - states[best].density

@@ -54,7 +54,7 @@ class Watched:
     @property
     def eta(self) -> float:
         """The seconds that the line says are left; infinite if it does not say."""
-        text = self.show.line("sampling").split("ETA ")[1].split()[0]
+        text = self.show.line("sampling").split("ETA ")[1].removeprefix("at most ").split()[0]
         minutes, _, seconds = text.partition(":")
         return np.inf if text == "unknown" else 60 * int(minutes) + int(seconds)
 
@@ -75,6 +75,19 @@ def test_the_eta_counts_down_between_checks_and_does_not_climb_at_them(watched: 
             seen.append(watched.eta)
     # 200 steps in 40 s; the end is at 800 steps.
     assert [120 - 10 * i for i in range(len(seen))] == seen
+
+
+def test_until_an_end_is_in_sight_the_eta_is_that_of_a_limit(watched: Watched) -> None:
+    """The burn-in's; then the budget's while draws disagree, or where the end is beyond it."""
+    plan = watched.show.plan
+    watched.block(10.0)
+    assert "burn-in 2% of at most 3000 steps   ETA at most 9:50" in watched.show.line("pilot")
+    for rhat, is_limit in ((1.3, True), (1.0, False)):
+        seconds = watched.check(100, 500.0, rhat)
+        assert is_limit is ("ETA at most" in watched.show.line("sampling"))
+        assert seconds == (0.2 * (plan.max_steps - 100) if is_limit else 0.2 * 300)
+    watched.check(100, 1.0)
+    assert "ETA at most" in watched.show.line("sampling")
 
 
 def test_each_step_after_the_sampling_counts_down_by_itself(
@@ -262,5 +275,6 @@ def test_a_map_estimate_tells_what_share_is_done(
     map_estimate.fit(short_posterior(samples=400), np.random.default_rng(1), shares.append)
     assert shares == sorted(shares)
     assert 1.0 == shares[-1]
-    # Not only when all is done.
+    # Not only when all is done, and from its first steps on.
     assert 4 <= len({share for share in shares if share < 1.0})
+    assert 4 <= len({share for share in shares if share < 0.5})

@@ -36,7 +36,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
 from bwbayes.record import Record
-from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
+from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 
 # Stages that a search adds at most if it has found the mechanism.
 MAX_STAGES = 3
@@ -93,8 +93,10 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     """
     default, posterior = "discrepancy", problem.posterior
     rough = {
-        name: climb(posterior.alone(name), posterior.select_draws(point.optima, name))
-        for name in watched([*problem.records], part(watch, 0.0, 1 / len(NOISES)))
+        name: climb(
+            posterior.alone(name), posterior.select_draws(point.optima, name), watch=of_record
+        )
+        for name, of_record in parts([*problem.records], part(watch, 0.0, 1 / len(NOISES)))
     }
     evidence = {default: sum(fit.log_evidence for fit in rough.values())}
     # Innovations less likely than this by chance may be explained by another noise.
@@ -103,15 +105,20 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     # That outliers spoil a record is an explanation, which has its own evidence.
     known = {*evidence, "student"}
     others = [n for n in NOISES if n not in known and (n == "white" or p < colored)]
-    for noise in watched(others, part(watch, 1 / len(NOISES), 1.0)):
+    for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
         other = problem.study.with_model(problem.study.spec.with_parts(noise=noise)).posterior
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
         fits = [
-            climb(other.alone(name), other.select_draws(places, name), least=fit.log_density)
-            for name, fit in rough.items()
+            climb(
+                other.alone(name),
+                other.select_draws(places, name),
+                least=fit.log_density,
+                watch=of_record,
+            )
+            for (name, fit), of_record in parts([*rough.items()], of_noise)
         ]
         # Not one that takes up the readings, of which it would tell nothing anew.
         if all(fit.follows for fit in fits):

@@ -93,6 +93,7 @@ class Progress(ProgressLine):
         self.steps = 0.0  # of all ensembles together, since this was made
         self.check: ConvergenceDiagnostics | None = None
         self.end: float | None = None  # when it will be done, by the check; of a monotonic clock
+        self.is_latest = False  # whether that is when its budget ends
 
     def __call__(self, phase: Phase, check: ConvergenceDiagnostics | None) -> None:
         """Take note of a finished block of one ensemble, or of a check."""
@@ -100,15 +101,17 @@ class Progress(ProgressLine):
             self.steps += self.plan.block / self.plan.ensembles
         else:
             self.check, self.end = check, None
-            # No end is in sight while the draws disagree, which more of them may or may not cure; a
-            # run that goes on is checked before its first step.
-            if self.steps and not check.disagreements() and check.lowest_ess > 0:
+            # No end but the budget's is in sight while the draws disagree, which more of them may
+            # or may not cure.
+            needed = np.inf
+            if not check.disagreements() and check.lowest_ess > 0:
                 needed = check.steps * self.plan.ess / check.lowest_ess
                 needed = max(needed, LENGTH * float(np.max(check.autocorrelation)))
+            self.is_latest = not needed < self.plan.max_steps
+            if self.steps:  # a run that goes on is checked before its first step
                 remaining = max(min(needed, self.plan.max_steps) - check.steps, 0)
                 now = time.monotonic()
-                if np.isfinite(needed):
-                    self.end = now + remaining * (now - self.started_at) / self.steps
+                self.end = now + remaining * (now - self.started_at) / self.steps
         self.show(self.line(phase), printed=check is not None)
 
     def line(self, phase: Phase) -> str:
@@ -116,10 +119,17 @@ class Progress(ProgressLine):
         elapsed = max(time.monotonic() - self.started_at, 1e-9)
         rate = self.steps * self.plan.ensembles * self.plan.walkers / elapsed
         if self.check is None:
-            return f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   burn-in"
+            most = self.plan.max_pilot_steps
+            share = min(self.steps / most, 1.0)
+            remaining = _minutes(elapsed * (1 - share) / share) if share else "unknown"
+            return (
+                f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   "
+                f"burn-in {share:.0%} of at most {most} steps   ETA at most {remaining}"
+            )
         check = self.check
         # It counts down to the end that was forecast at the last check.
         remaining = "unknown" if self.end is None else _minutes(self.end - time.monotonic())
+        remaining = f"{'at most ' * self.is_latest}{remaining}"
         cover = "no mixture" if check.pareto_k is None else f"Pareto k {check.pareto_k:.2f}"
         return (
             f"sampling  {check.steps:6d} steps   {rate:6.0f} evaluations/s   "
