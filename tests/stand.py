@@ -73,4 +73,4 @@ class Stand:
         step = 1 / self.rate / self.memory
         displacement += self.discrepancy * process(voltage.size, step, generator)
         displacement += self.sensor * generator.standard_normal(voltage.size)
-        return Record(voltage[cut:], displacement[cut:], 1 / self.rate, origin="stand")
+        return Record(voltage[cut:], displacement[cut:], interval=1 / self.rate, origin="stand")

@@ -149,7 +149,7 @@ def typical(
     )
     reading = clean + slow + sensor
     cut = time.size - round(duration / interval)
-    return Record(voltage[cut:], reading[cut:], interval)
+    return Record(voltage[cut:], reading[cut:], interval=interval)
 
 
 def typical_experiment(variant: Variant, folder: Path) -> CalibrationSetup:

@@ -25,6 +25,7 @@ from bwbayes.inference.noise import (
     DiscrepancyNoise,
 )
 from bwbayes.inference.state_space import Noise
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
 from bwbayes.model.operator import Span
 from bwbayes.model.spec import Extent, ModelSpec
@@ -89,7 +90,7 @@ def test_a_stage_of_ones_own_is_in_the_chain(
     theta = np.array([[*values.values()]] * 2)
     voltage = 50 * np.sin(np.arange(400) / 30)
     displacement = made.displacement(theta, voltage, from_rest=True)
-    compiled = walk(made, theta, voltage, from_rest=True)(voltage.size)
+    compiled = walk(made, theta, Inputs(voltage, interval=1e-3), from_rest=True)(voltage.size)
     np.testing.assert_allclose(compiled, displacement, rtol=0, atol=1e-10)
     hard = replace(made, stages=made.stages[:1])
     before = hard.displacement(np.delete(theta, -2, axis=1), voltage, from_rest=True) - 1.0

@@ -202,7 +202,9 @@ def cut(record: Record, number: int, transient: float = 0.0) -> Record:
     assert record.displacement is not None
     time = np.arange(part.stop - part.start) * record.interval
     reading = record.displacement[part] + transient * np.exp(-time / 0.018)
-    return Record(record.voltage[part], reading, record.interval, origin="cut from the file")
+    return Record(
+        record.voltage[part], reading, interval=record.interval, origin="cut from the file"
+    )
 
 
 # Mean coverage of the 95% sensor band, largest NRMSE, mean width in um.

@@ -184,7 +184,7 @@ def record_of(kind: str) -> bwbayes.Record:
     theta = np.array([[*TRUTH[kind].values(), 1.0]])
     clean = actuator.displacement(theta, voltage, from_rest=True)[0]
     noise = 0.3 * np.random.default_rng(3).standard_normal(time.size)
-    return bwbayes.Record(voltage, clean + noise, 0.02)
+    return bwbayes.Record(voltage, clean + noise, interval=0.02)
 
 
 def config(folder: Path, kind: str) -> Config:

@@ -66,7 +66,10 @@ def reference(
         folder = tmp_path_factory.mktemp("thinned")
         assert config.records["record"].start is not None
         thinned = Record(
-            case.voltage, case.displacement, case.interval, config.records["record"].start
+            case.voltage,
+            case.displacement,
+            interval=case.interval,
+            start=config.records["record"].start,
         )
         write_record(thinned, folder / "thinned.h5")
         source = RecordConfig(file="thinned.h5", train=config.records["record"].train)

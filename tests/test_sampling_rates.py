@@ -83,7 +83,7 @@ def records(seed: int) -> tuple[Record, Record]:
         kept = np.exp(-1 / RATE / lag)
         moved = scipy.signal.lfilter([1 - kept], [1.0, -kept], moved)
         reading = moved + SENSOR * rng.standard_normal(voltage.size)
-        made.append(Record(voltage, reading, 1 / RATE))
+        made.append(Record(voltage, reading, interval=1 / RATE))
     return made[0], made[1]
 
 
@@ -195,7 +195,7 @@ def test_bands_where_the_discrepancy_is_the_models(kind: str, time: float, tmp_p
             voltage = 0.9 ** len(made) * drive(rng)
             added = noise.draw(theta, voltage.size, rng)
             reading = actuator.displacement(model, voltage)[0] + np.sum(added, axis=0)
-            made.append(Record(voltage, reading, 1 / RATE))
+            made.append(Record(voltage, reading, interval=1 / RATE))
         answers.append(answer(made[0], made[1], 25, "auto", tmp_path))
     chosen, covers = Counter(one.noise for one in answers), coverage(answers)
     width = float(np.mean([one.width for one in answers]))

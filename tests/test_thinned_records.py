@@ -81,7 +81,9 @@ def measured(lag: float, seed: int, rate: float = RATE, seconds: float = 3.5) ->
 
 def thinned(record: Record, every: int) -> Record:
     assert record.displacement is not None
-    return Record(record.voltage[::every], record.displacement[::every], every * record.interval)
+    return Record(
+        record.voltage[::every], record.displacement[::every], interval=every * record.interval
+    )
 
 
 class Middle(NamedTuple):

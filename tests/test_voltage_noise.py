@@ -64,7 +64,7 @@ def records(kind: str, rate: float, seed: int) -> tuple[Record, Record]:
         voltage = np.concatenate([np.linspace(0, driven[0], round(rate / 2)), driven])
         reading = actuator.displacement(model, voltage)[0]
         reading = reading + SENSOR * rng.standard_normal(voltage.size)
-        made.append(Record(voltage, reading, 1 / rate))
+        made.append(Record(voltage, reading, interval=1 / rate))
     return made[0], made[1]
 
 

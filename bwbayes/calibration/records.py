@@ -90,7 +90,7 @@ class OtherRecord:
         """
         planned = replace(self.record, displacement=None, truth=None)
         start_states = estimate_initial_states(posterior, theta, planned, self.start, generator)
-        model = start_states.displacement(planned.voltage)[0]
+        model = start_states.displacement(planned.inputs)[0]
         if self.start.estimate_offset and self.record.displacement is not None:
             model = model + posterior.only.extent * generator.standard_normal()
         noise, parameters = posterior.only.noise, posterior.only.table.noise(theta)

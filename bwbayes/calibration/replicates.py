@@ -243,11 +243,16 @@ def _simulated(
         sd = likelihood.start_sd(record_theta)
         model = likelihood.actuator.advance(
             dataset.table.actuator(record_theta),
-            dataset.voltage,
+            dataset.inputs,
             initial_transient=sd * generator.standard_normal(sd.shape),
             from_rest=dataset.from_rest,
         )[0][0]
-        record = Record(dataset.voltage, fitted.displacement, dataset.actuator.interval)
+        record = Record(
+            dataset.voltage,
+            fitted.displacement,
+            interval=dataset.inputs.interval,
+            covariates=dataset.inputs.covariates,
+        )
         noise = dataset.table.noise(record_theta)
         simulated[dataset.name] = Simulated.of(record, model, dataset.noise, noise, generator)
     return column, simulated

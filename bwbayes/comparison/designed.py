@@ -126,7 +126,7 @@ class Design(Product, Sequence[DesignScore]):
     def records(self) -> dict[str, Record]:
         """Return the best signal as a record that a signal generator can play."""
         best = self.signals[self.best.name]
-        return {"best": Record(best, None, self.interval, voltage_is="command")}
+        return {"best": Record(best, None, interval=self.interval, voltage_is="command")}
 
     def numbers(self) -> dict[str, object]:
         """Return what ``design.json`` holds."""

@@ -89,7 +89,7 @@ class _Plan:
                 for name in ("model", "initial_transient", "offset_sd")
             }
             subset = replace(states, histories=histories, **fields)
-            yield rows, subset.displacement(voltage)
+            yield rows, subset.displacement(self.record(voltage).inputs)
 
     def expected(self, voltage: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
         """Return the expected rms error to the smoothed reference, um, and the weighted mean."""

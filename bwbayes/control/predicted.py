@@ -362,7 +362,7 @@ def planned(voltage: FloatArray, reference: Reference, hold: Hold, origin: str) 
     return Record(
         voltage,
         None,
-        reference.interval,
+        interval=reference.interval,
         voltage_is="command" if hold == "zero" else "output",
         origin=origin,
     )

@@ -146,7 +146,7 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
     kept = np.full(record.displacement.size, np.nan)
     for window in record.training:
         kept[window] = record.displacement[window]
-    late, _ = find_delay(Record(record.voltage, kept, scene.interval), limit)
+    late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
     rows = round(late / scene.interval)
     if abs(late) < scale or not rows:
         return

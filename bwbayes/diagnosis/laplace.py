@@ -53,7 +53,9 @@ class Effect:
         groups = [np.flatnonzero(which.ravel() == number) for number in range(len(distinct))]
         together = [np.arange(len(model))] if self.drive is _same else groups
         for rows in together:
-            driven = self.drive(voltage, sizes[rows[0]])
+            driven = replace(
+                likelihood.inputs[: voltage.size], voltage=self.drive(voltage, sizes[rows[0]])
+            )
             for batch in batches(rows.size, voltage.size):
                 moved[rows[batch]] = likelihood.simulate(model[rows[batch]], driven)
         for rows in groups if self.read is not _same else ():

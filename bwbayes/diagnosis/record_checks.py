@@ -44,7 +44,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     --------
     >>> time = np.arange(0, 6, 0.01)
     >>> voltage = 100 * np.exp(-0.2 * time) * np.sin(2 * np.pi * time)
-    >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, 0.01))]
+    >>> [finding.kind for finding in inspect(Record(voltage, -0.6 * voltage, interval=0.01))]
     ['reversed sign']
     """
     sudden, stuck = list[Finding](), list[Finding]()

@@ -24,6 +24,7 @@ from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from bwbayes.shown import brief
 
 
@@ -83,8 +84,8 @@ class Likelihood:
 
     Parameters
     ----------
-    voltage
-        (samples,), V, from the record's first sample on.
+    inputs
+        From the record's first sample on.
     readings
         What was read of the displacement, and when.
     actuator, noise
@@ -103,7 +104,7 @@ class Likelihood:
 
     __repr__ = brief
 
-    voltage: FloatArray
+    inputs: Inputs
     readings: Readings
     actuator: Actuator
     noise: Noise
@@ -116,6 +117,16 @@ class Likelihood:
     def table(self) -> ParameterTable:
         """The parameters in the order of θ's columns."""
         return ParameterTable(self.actuator, self.noise)
+
+    @property
+    def voltage(self) -> FloatArray:
+        """The voltage (samples,), V."""
+        return self.inputs.voltage
+
+    @cached_property
+    def inputs_read(self) -> Inputs:
+        """The inputs up to the last reading."""
+        return self.inputs[: self.readings.samples]
 
     @cached_property
     def values(self) -> FloatArray:
@@ -237,19 +248,19 @@ class Likelihood:
         return int(self.offset_sd > 0) + (0 if self.from_rest else self.actuator.unknowns)
 
     def simulate(
-        self, model: FloatArray, voltage: FloatArray, initial_transient: FloatArray | None = None
+        self, model: FloatArray, inputs: Inputs, initial_transient: FloatArray | None = None
     ) -> FloatArray:
-        """Displacement (models, samples), um, along a voltage (samples,), V.
+        """Displacement (models, samples), um, along inputs.
 
         ``model`` is (models, parameters of the actuator); ``initial_transient`` (models, unknowns),
         um, is how far dynamics and creep are from rest at the first sample.
         """
-        return self.walk(model, voltage, initial_transient)(voltage.size)
+        return self.walk(model, inputs, initial_transient)(inputs.samples)
 
     def walk(
-        self, model: FloatArray, voltage: FloatArray, initial_transient: FloatArray | None = None
+        self, model: FloatArray, inputs: Inputs, initial_transient: FloatArray | None = None
     ) -> Callable[[int], FloatArray]:
-        """Put models to a voltage's first sample; what is returned walks them on to a sample.
+        """Put models to the inputs' first sample; what is returned walks them on to a sample.
 
         Called with growing numbers of samples, it returns the displacement (models, samples), um,
         from where they are. The others are as in :meth:`simulate`.
@@ -258,12 +269,12 @@ class Likelihood:
             # Here, because it is slow to load.
             from bwbayes.inference.compiled.walk import walk  # noqa: PLC0415
 
-            return walk(self.actuator, model, voltage, initial_transient, from_rest=self.from_rest)
+            return walk(self.actuator, model, inputs, initial_transient, from_rest=self.from_rest)
         state, now = None, 0
 
         def onwards(last: int) -> FloatArray:
             nonlocal state, now
-            piece, now = voltage[now:last], last
+            piece, now = inputs[now:last], last
             moved, state = self.actuator.advance(
                 model, piece, state, initial_transient, from_rest=self.from_rest
             )
@@ -303,7 +314,7 @@ class Likelihood:
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:
-                moved = self.simulate(model, self.voltage[: readings.samples])[:, readings.where]
+                moved = self.simulate(model, self.inputs_read)[:, readings.where]
             else:
                 moved = displacement[batch]
             residual = (readings.values - moved)[:, np.newaxis]

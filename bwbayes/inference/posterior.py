@@ -27,6 +27,7 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import Span
 from bwbayes.shown import brief
 
@@ -37,8 +38,8 @@ class Dataset:
 
     Parameters
     ----------
-    voltage
-        (samples,), V, from the record's first sample on.
+    inputs
+        From the record's first sample on.
     displacement
         (samples,), um; nan where a reading is missing.
     training
@@ -60,7 +61,7 @@ class Dataset:
 
     __repr__ = brief
 
-    voltage: FloatArray
+    inputs: Inputs
     displacement: FloatArray
     training: tuple[slice, ...]
     actuator: Actuator
@@ -77,6 +78,11 @@ class Dataset:
     def table(self) -> ParameterTable:
         """The parameters of this record alone."""
         return ParameterTable(self.actuator, self.noise)
+
+    @property
+    def voltage(self) -> FloatArray:
+        """The voltage (samples,), V."""
+        return self.inputs.voltage
 
     @cached_property
     def readings(self) -> Readings:
@@ -104,7 +110,7 @@ class Dataset:
     def likelihood(self, engine: Engine) -> Likelihood:
         """Return the likelihood of the record."""
         return Likelihood(
-            self.voltage,
+            self.inputs,
             self.readings,
             self.actuator.within(self.voltage),
             self.noise,
@@ -235,11 +241,11 @@ class Posterior:
         likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
         model = dataset.table.actuator(theta)
         initial_transient = likelihood.start(theta).mean if likelihood.unknowns else None
-        voltage = dataset.voltage[: dataset.training[-1].stop]
+        inputs = dataset.inputs[: dataset.training[-1].stop]
 
-        for batch in batches(len(theta), voltage.size):
+        for batch in batches(len(theta), inputs.samples):
             moving = None if initial_transient is None else initial_transient[batch]
-            yield likelihood.simulate(model[batch], voltage, moving)[:, rows]
+            yield likelihood.simulate(model[batch], inputs, moving)[:, rows]
 
     @cached_property
     def _columns(self) -> tuple[slice, ...]:
@@ -259,10 +265,9 @@ class Posterior:
         for dataset, likelihood, columns in of_records:
             readings = likelihood.readings
             model = likelihood.table.actuator(self.table.of(theta, dataset.name))
-            voltage = dataset.voltage[: readings.samples]
-            for batch in batches(possible.size, voltage.size):
+            for batch in batches(possible.size, readings.samples):
                 models = possible[batch]
-                moved = likelihood.simulate(model[models], voltage)
+                moved = likelihood.simulate(model[models], likelihood.inputs_read)
                 result[models, columns] = moved[:, readings.where]
         return result
 
@@ -296,8 +301,10 @@ class Posterior:
 
         return self.only.noise.for_new_readings(self.only.table.noise(theta), missed)
 
-    def altered(self, **fields: Any) -> Posterior:
-        """Return a posterior of one record with other fields of its dataset."""
+    def altered(self, *, voltage: FloatArray | None = None, **fields: Any) -> Posterior:
+        """Return a posterior of one record with another voltage, or other fields of its dataset."""
+        if voltage is not None:
+            fields["inputs"] = replace(self.only.inputs, voltage=voltage)
         return replace(self, datasets=(replace(self.only, **fields),))
 
     def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:

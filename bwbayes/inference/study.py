@@ -31,7 +31,6 @@ from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.gain import PolynomialGain
-from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
 from bwbayes.model.spec import Extent, ModelSpec
@@ -190,7 +189,7 @@ class Study:
         """
         datasets = [
             Dataset(
-                training.record.path.voltage,
+                training.record.inputs,
                 training.displacement,
                 training.windows,
                 actuator_for(self.spec, training.record, self.extent),
@@ -309,8 +308,7 @@ def extent_of(records: Collection[Record]) -> Extent:
 
 def actuator_for(spec: ModelSpec, record: Record, extent: Extent) -> Actuator:
     """Put the actuator of a model together for a record, which is held if it is a command."""
-    hold: Hold = "zero" if record.voltage_is == "command" else "first"
-    return spec.actuator(record.interval, hold, extent)
+    return spec.actuator(record.interval, record.hold, extent)
 
 
 def declarations_of(spec: ModelSpec, extent: Extent) -> tuple[Declaration, ...]:

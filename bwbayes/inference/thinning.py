@@ -56,18 +56,18 @@ def thin(dataset: Dataset, stride: int) -> Dataset:
     """
     if stride == 1:
         return dataset
+    voltage = _with_reversals(dataset.voltage, stride)
+    inputs = replace(dataset.inputs[::stride], voltage=voltage, voltage_is="output")
     actuator = replace(
-        dataset.actuator.within(dataset.voltage),
-        hold="first",
-        interval=stride * dataset.actuator.interval,
+        dataset.actuator.within(dataset.voltage), hold=inputs.hold, interval=inputs.interval
     )
     return replace(
         dataset,
-        voltage=_with_reversals(dataset.voltage, stride),
+        inputs=inputs,
         displacement=dataset.displacement[::stride],
         training=thinned_windows(dataset.training, stride),
         actuator=actuator,
-        noise=dataset.noise.at(actuator.interval),
+        noise=dataset.noise.at(inputs.interval),
     )
 
 
@@ -86,7 +86,7 @@ def readings_at(short: Posterior, whole: Posterior, theta: FloatArray) -> FloatA
 
 def stride_of(short: Posterior, whole: Posterior) -> int:
     """Return the samples of a whole record for each of a thinned one."""
-    return round(short.only.actuator.interval / whole.only.actuator.interval)
+    return round(short.only.inputs.interval / whole.only.inputs.interval)
 
 
 def thinned_windows(windows: Iterable[slice], stride: int) -> tuple[slice, ...]:
@@ -107,4 +107,4 @@ def _with_reversals(voltage: FloatArray, stride: int) -> FloatArray:
 def displacement(posterior: Posterior, dataset: Dataset, theta: FloatArray) -> FloatArray:
     """Displacement (models, samples), um, from rest at θ (models, parameters) of a record."""
     likelihood = dataset.likelihood(posterior.engine)
-    return likelihood.simulate(likelihood.table.actuator(theta), dataset.voltage)
+    return likelihood.simulate(likelihood.table.actuator(theta), dataset.inputs)

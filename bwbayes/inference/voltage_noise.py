@@ -45,7 +45,10 @@ def path_covariance(
     here, steps = gradient(posterior), []
     for _ in watched(range(COPIES), watch):
         datasets = tuple(
-            replace(dataset, voltage=paths[dataset.name].redrawn(generator))
+            replace(
+                dataset,
+                inputs=replace(dataset.inputs, voltage=paths[dataset.name].redrawn(generator)),
+            )
             for dataset in posterior.datasets
         )
         change = gradient(replace(posterior, datasets=datasets)) - here

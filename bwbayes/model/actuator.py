@@ -26,6 +26,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Declaration, Values, check, normal
 from bwbayes.model.filters import Filter
 from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -136,16 +137,16 @@ class Actuator:
         return self.filter.unknowns(self.hold) + (len(self.creep.times) if self.creep else 0)
 
     def displacement(
-        self, theta: ArrayLike, voltage: ArrayLike, *, from_rest: bool = False
+        self, theta: ArrayLike, inputs: Inputs | ArrayLike, *, from_rest: bool = False
     ) -> FloatArray:
-        """Displacement of every model along one voltage.
+        """Displacement of every model along the same inputs.
 
         Parameters
         ----------
         theta
             (models, parameters), the columns and their units as in :attr:`declarations`.
-        voltage
-            (samples,), V.
+        inputs
+            At the actuator's interval; or the voltage (samples,), V, alone.
         from_rest
             The voltage came from zero, where the actuator was at rest.
 
@@ -160,12 +161,12 @@ class Actuator:
             θ of a wrong shape or outside the model's domain: not finite, or what a part refuses.
             The text names the parameter.
         """
-        return self.advance(theta, voltage, from_rest=from_rest)[0]
+        return self.advance(theta, inputs, from_rest=from_rest)[0]
 
     def advance(
         self,
         theta: ArrayLike,
-        voltage: ArrayLike,
+        inputs: Inputs | ArrayLike,
         state: State | None = None,
         initial_transient: FloatArray | None = None,
         *,
@@ -184,7 +185,10 @@ class Actuator:
             raise InputError(
                 f"theta: has shape {models.shape}; its columns are {', '.join(self.parameters)}"
             )
-        path = np.asarray(voltage, dtype=np.float64)
+        if not isinstance(inputs, Inputs):
+            voltage = np.asarray(inputs, dtype=np.float64)
+            inputs = Inputs(voltage, interval=self.interval)
+        path = inputs.voltage
         if path.ndim != 1 or path.size == 0:
             raise InputError(f"voltage: has shape {path.shape}; give a non-empty row of samples")
         if not np.isfinite(path).all():
@@ -192,10 +196,10 @@ class Actuator:
         column = self.columns(models)
         self.check(column)
         if state is None:
-            inputs = self.begin_inputs(column, path, from_rest=from_rest)
+            before = self.begin_inputs(column, path, from_rest=from_rest)
         else:
-            inputs = state.inputs
-        driven, inputs = self.pass_inputs(column, path, inputs)
+            before = state.inputs
+        driven, before = self.pass_inputs(column, path, before)
         if state is None:
             memory = self.begin(column, driven, from_rest=from_rest, span=self.range_of(path))
         else:
@@ -208,7 +212,7 @@ class Actuator:
             outputs = state.outputs
         result, outputs = pass_stages(self.outputs, column, result, outputs, self.timing)
         result += column["offset"][:, np.newaxis]
-        return result, State(hysteresis, equilibrium, filtered, inputs, outputs)
+        return result, State(hysteresis, equilibrium, filtered, before, outputs)
 
     def _follow(
         self,

@@ -20,6 +20,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
@@ -132,18 +133,18 @@ class InitialStates:
     scored_from: int = 0
     discrepancy: DiscrepancyState | None = None
 
-    def displacement(self, voltage: FloatArray) -> FloatArray:
-        """Displacement (draws, samples) along a voltage, um."""
-        return next(self.pieces(voltage, voltage.size))
+    def displacement(self, inputs: Inputs) -> FloatArray:
+        """Displacement (draws, samples) along inputs, um."""
+        return next(self.pieces(inputs, inputs.samples))
 
-    def pieces(self, voltage: FloatArray, size: int) -> Iterator[FloatArray]:
-        """Yield displacements (draws, samples) along a voltage, um, so many samples at a time."""
+    def pieces(self, inputs: Inputs, size: int) -> Iterator[FloatArray]:
+        """Yield displacements (draws, samples) along inputs, um, so many samples at a time."""
         walks = [
-            (rows, likelihood.walk(self.model[rows], voltage, self.initial_transient[rows]))
+            (rows, likelihood.walk(self.model[rows], inputs, self.initial_transient[rows]))
             for likelihood, rows in self.histories.groups
         ]
-        for first in range(0, voltage.size, size):
-            last = min(first + size, voltage.size)
+        for first in range(0, inputs.samples, size):
+            last = min(first + size, inputs.samples)
             parts = [(rows, walk(last)) for rows, walk in walks]
             if len(parts) == 1:
                 yield parts[0][1]
@@ -172,8 +173,8 @@ def estimate_initial_states(
         A lead-in that does not fit into the record.
     """
     training = posterior.only
-    hold = start.hold or ("zero" if record.voltage_is == "command" else "first")
-    (low, high), voltage = training.span, record.path.voltage
+    hold, inputs = start.hold or record.hold, record.inputs
+    (low, high), voltage = training.span, inputs.voltage
     span = Span(min(float(np.min(voltage)), low), max(float(np.max(voltage)), high))
     actuator = replace(training.actuator, interval=record.interval, hold=hold, span=span)
     memory = training.noise.correlation_time(training.table.noise(theta))
@@ -184,7 +185,7 @@ def estimate_initial_states(
         assert record.displacement is not None
         readings = Readings.of(record.displacement, [window])
     whole = Likelihood(
-        voltage,
+        inputs,
         readings,
         actuator,
         training.noise,
@@ -278,8 +279,10 @@ def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
     history leaves there more than the one before, root-mean-square, of a ``model`` (1, parameters).
     """
     first = likelihoods[0]
-    voltage = first.voltage[: first.readings.samples]
-    paths = [history.simulate(model, voltage)[0, first.readings.rows] for history in likelihoods]
+    paths = [
+        history.simulate(model, first.inputs_read)[0, first.readings.rows]
+        for history in likelihoods
+    ]
     return float(np.sqrt(np.mean(np.diff(np.mean(paths, axis=1)) ** 2)) / 2)
 
 
@@ -301,7 +304,7 @@ def continue_discrepancy(
         model[:, column] += start.offset_sd * scipy.special.ndtri(uniform(generator, len(model)))
     matched = replace(start, model=model, offset_sd=np.zeros(len(model)))
     rows = likelihood.readings.rows
-    simulated = matched.displacement(likelihood.voltage[: likelihood.readings.samples])[:, rows]
+    simulated = matched.displacement(likelihood.inputs_read)[:, rows]
     filtered = filter_discrepancy(likelihood, theta, simulated, part(watch, 0.2, 1.0))
     return replace(matched, discrepancy=filtered)
 
@@ -345,7 +348,7 @@ def _unseen(
     start = InitialStates(histories, model, initial_transient, np.zeros(draws))
     if settled:
         offset = first.actuator.parameters.index("offset")
-        model[:, offset] -= start.displacement(first.voltage[:1])[:, 0]
+        model[:, offset] -= start.displacement(first.inputs[:1])[:, 0]
     return start
 
 

@@ -24,6 +24,7 @@ from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
 from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.inputs import Inputs
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import (
@@ -135,8 +136,7 @@ def forecast(
     planned = np.asarray(voltage, dtype=np.float64)
     if planned.ndim != 1 or planned.size == 0 or not np.isfinite(planned).all():
         raise InputError(f"{name}: voltage of shape {planned.shape}; give one finite row, in V")
-    joined = np.concatenate([record.path.voltage, planned])
-    longer = replace(record, voltage=joined, displacement=None, truth=None)
+    longer = continued(record, planned)
     after = slice(record.samples, longer.samples)
     theta = posterior.prior.theta(draws)
     start_states = training_initial_states(posterior, theta, generator)
@@ -145,6 +145,24 @@ def forecast(
     )
     predicting = part(watch, STATES_SHARE, 1.0)
     return _bands(name, posterior, theta, start_states, longer, after, predicting)
+
+
+def continued(record: Record, voltage: FloatArray) -> Record:
+    """Return a record as it goes on into a planned voltage (samples,), V, without readings.
+
+    Raises
+    ------
+    InputError
+        The record has covariates: what follows would need them too.
+    """
+    followed = record.inputs.followed_by(Inputs(voltage, interval=record.interval))
+    return replace(
+        record,
+        voltage=followed.voltage,
+        covariates=followed.covariates,
+        displacement=None,
+        truth=None,
+    )
 
 
 def predict_record(
@@ -245,7 +263,7 @@ def _bands(
 
     begin, threads = 0, 2  # that summarize pieces, while this one simulates the next
     with ThreadPoolExecutor(threads) as executor:
-        for simulated in start.pieces(record.path.voltage[: window.stop], PIECE):
+        for simulated in start.pieces(record.inputs[: window.stop], PIECE):
             first, end = max(begin, window.start), begin + simulated.shape[1]
             more(min(first, end) - begin)
             begin = end

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -20,8 +20,9 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
+from bwbayes.model.inputs import Inputs, VoltageIs, require_voltage_is
 from bwbayes.record.io.columns import Naming, select
-from bwbayes.record.io.fields import VoltageIs, record_fields, require_voltage_is
+from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.grid import clock
 from bwbayes.record.io.series import Source, array_source, frame_source
 from bwbayes.record.io.units import QUANTITIES
@@ -33,8 +34,8 @@ Window = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
-    """Voltage and displacement on the uniform time grid ``start + interval * arange(samples)``.
+class Record(Inputs):
+    """Inputs and displacement on the uniform time grid ``start + interval * arange(samples)``.
 
     Parameters
     ----------
@@ -48,6 +49,8 @@ class Record:
     voltage_is : "command" or "output"
         What the voltage column is: the command that a DAC holds until the next sample, or the
         amplifier's output, which is continuous.
+    covariates : dict of arrays (samples,)
+        What else was measured at every sample and may act on the actuator, by name.
     origin : str
         Where the record comes from: a file's name or free text. Line breaks and other characters
         that do not print become blanks.
@@ -72,11 +75,8 @@ class Record:
 
     __repr__ = brief
 
-    voltage: FloatArray
     displacement: FloatArray | None
-    interval: float
-    start: float = 0.0
-    voltage_is: VoltageIs = "output"
+    _: KW_ONLY
     origin: str = ""
     truth: FloatArray | None = None
     time_offset: float = 0.0
@@ -87,6 +87,8 @@ class Record:
             values = getattr(self, name)
             if values is not None:
                 object.__setattr__(self, name, _frozen(name, values, samples))
+        covariates = {n: _frozen(n, values, samples) for n, values in self.covariates.items()}
+        object.__setattr__(self, "covariates", covariates)
         if not (math.isfinite(self.interval) and self.interval > 0):
             raise InputError(f"interval: {self.interval} s is not a positive time; give it in s")
         if not math.isfinite(self.start):
@@ -197,11 +199,6 @@ class Record:
         table = select(source, naming, needed)
         return cls(**record_fields(table, require_voltage_is(voltage_is), need_displacement))
 
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return self.voltage.size
-
     @cached_property
     def path(self) -> VoltagePath:
         """The voltage that drives a model: the measured one without its noise.
@@ -212,15 +209,15 @@ class Record:
             return VoltagePath(self.voltage)
         return estimate_path(self.voltage)
 
-    @property
-    def time(self) -> FloatArray:
-        """Times of the samples, (samples,), s."""
-        return self.start + self.interval * np.arange(self.samples, dtype=np.float64)
-
-    @property
-    def duration(self) -> float:
-        """Length of the record in s: samples times interval, the last one's included."""
-        return self.samples * self.interval
+    @cached_property
+    def inputs(self) -> Inputs:
+        """What drives a model: the voltage without its noise, on a clock that starts with it."""
+        return Inputs(
+            self.path.voltage,
+            interval=self.interval,
+            voltage_is=self.voltage_is,
+            covariates=self.covariates,
+        )
 
     @property
     def has_reading(self) -> BoolArray:
@@ -258,12 +255,15 @@ class Record:
 
     @property
     def sha256(self) -> str:
-        """Hex digest of the data: voltage, displacement, interval and start, not the origin."""
+        """Hex digest of the data: all inputs, displacement, interval and start, not the origin."""
         digest = hashlib.sha256(f"{self.samples} {self.displacement is not None}\n".encode())
         digest.update(np.array([self.interval, self.start], dtype="<f8").tobytes())
         digest.update(self.voltage.astype("<f8").tobytes())
         if self.displacement is not None:
             digest.update(self.displacement.astype("<f8").tobytes())
+        for name, values in sorted(self.covariates.items()):
+            digest.update(f"{name}\n".encode())
+            digest.update(values.astype("<f8").tobytes())
         return digest.hexdigest()
 
     def window_slice(self, start: float, stop: float) -> slice:
@@ -309,7 +309,7 @@ class Record:
 
     def window(self, start: float, stop: float) -> Record:
         """Return the record of the samples with start <= time < stop (s), see `window_slice`."""
-        return self._part(self.window_slice(start, stop))
+        return self[self.window_slice(start, stop)]
 
     def upto(self, stop: float, first_reading: float | None = None) -> Record:
         """Return the record before `stop`, without the readings before `first_reading` (both s).
@@ -318,7 +318,7 @@ class Record:
         the history that the hysteresis remembers.
         """
         end = self.window_slice(self.start if first_reading is None else first_reading, stop)
-        record = self._part(slice(0, end.stop))
+        record = self[: end.stop]
         return record if first_reading is None else record.without(slice(0, end.start))
 
     def without(self, left_out: slice | BoolArray | IntArray) -> Record:
@@ -363,14 +363,13 @@ class Record:
         left_out[readings] = False
         return self.without(left_out)
 
-    def _part(self, samples: slice) -> Record:
-        return replace(
-            self,
-            voltage=self.voltage[samples],
-            displacement=None if self.displacement is None else self.displacement[samples],
-            truth=None if self.truth is None else self.truth[samples],
-            start=self.start + self.interval * samples.start,
-        )
+    def each_series(self, change: Callable[..., FloatArray], *others: Inputs) -> dict[str, Any]:
+        """Return what a change makes of every series, and of the same one of others, by field."""
+        series = super().each_series(change, *others)
+        for name in ("displacement", "truth"):
+            values = [getattr(record, name, None) for record in (self, *others)]
+            series[name] = None if any(v is None for v in values) else change(*values)
+        return series
 
     def _offsets(self, times: Sequence[float]) -> FloatArray:
         """Return the samples from the start to times, s, cut off where they are outside anyway."""

@@ -98,7 +98,7 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
     head = RECORD if table == "record" else f"{RECORD}[{table}]\n"
     alone, listed = (parse(f"{head}{key} = {v}\n", "") for v in (f'"{text}"', f'["{text}"]'))
     assert alone == listed
-    record = Record(np.arange(20.0), np.arange(20.0), 0.1)
+    record = Record(np.arange(20.0), np.arange(20.0), interval=0.1)
     by_keyword, by_list = (config_of(record, {key: value})[0] for value in (text, [text]))
     assert by_keyword == by_list
 

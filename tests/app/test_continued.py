@@ -33,7 +33,7 @@ def whole(seed: int = 1) -> Record:
     displacement = 0.6 * voltage + 3 + np.cumsum(0.1 * source.normal(size=SAMPLES))
     displacement += 0.2 * source.normal(size=SAMPLES)
     displacement[[40, 200]] = np.nan
-    return Record(voltage, displacement, INTERVAL)
+    return Record(voltage, displacement, interval=INTERVAL)
 
 
 def parts(record: Record, *cuts: int, own_clock: bool = False) -> list[Record]:

@@ -101,7 +101,7 @@ CONFIG = '[record]\nfile = "record.h5"\ntrain = [[0.0, 4.0]]\nfrom_rest = true\n
 
 def thinned(record: Record) -> Record:
     assert record.displacement is not None
-    return Record(record.voltage[::25], record.displacement[::25], 25 * record.interval)
+    return Record(record.voltage[::25], record.displacement[::25], interval=25 * record.interval)
 
 
 def plain(sensor: float, rough: float) -> Record:
@@ -151,7 +151,7 @@ def saturating() -> Record:
         keep = np.exp(-0.02 / lag)
         crept += scipy.signal.lfilter([0.03 * (1 - keep)], [1, -keep], moved)
     noise = 0.05 * np.random.default_rng(1).standard_normal(time.size)
-    return Record(voltage, moved + crept + noise, 0.02)
+    return Record(voltage, moved + crept + noise, interval=0.02)
 
 
 def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> None:

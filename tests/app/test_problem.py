@@ -40,7 +40,7 @@ def refused(text: str, folder: Path) -> str:
 def record() -> Record:
     """Make up a record."""
     voltage, displacement = np.random.default_rng(1).uniform(-1, 1, size=(2, 400))
-    return Record(80 * voltage, 50 * displacement + 7, 0.01, voltage_is="command")
+    return Record(80 * voltage, 50 * displacement + 7, interval=0.01, voltage_is="command")
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def test_a_model_without_hysteresis_needs_no_loops(tmp_path: Path) -> None:
     """So the fix of this finding removes it."""
     voltage = 50 * np.sin(np.arange(4000) / 50)
     error = np.random.default_rng(1).normal(0, 0.005, voltage.size)
-    write_record(Record(voltage, 0.1 * voltage + error, 1e-3), tmp_path / "record.h5")
+    write_record(Record(voltage, 0.1 * voltage + error, interval=1e-3), tmp_path / "record.h5")
     text = '[record]\nfile = "record.h5"\n'
     kinds = [finding.kind for finding in of(text, tmp_path).findings["record"]]
     assert ["one amplitude", "no hysteresis"] == kinds

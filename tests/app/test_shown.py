@@ -42,7 +42,7 @@ def objects(fit: bw.Run, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
         bw.InputError("a"),
         bw.InputWarning("a"),
         bw.NotConvergedError("a"),
-        *bw.inspect(bw.Record(voltage, -voltage, 0.02)),
+        *bw.inspect(bw.Record(voltage, -voltage, interval=0.02)),
         fit.predict(record, lead_in=0.2),
         *fit.predictions,
         bw.Campaign(CampaignFolder(folder), rows, many),

@@ -164,7 +164,7 @@ def test_a_run_loads_no_code_while_it_reads(tmp_path: Path) -> None:
         if listening[0] and event.startswith((*watched, "os.system", "os.exec", "ctypes.dlopen")):
             events.append(event)
 
-    record = Record(np.arange(40.0), np.arange(40.0) ** 2, 0.01)
+    record = Record(np.arange(40.0), np.arange(40.0) ** 2, interval=0.01)
     paths = [tmp_path / name for name in ("record.csv", "record.h5", "record.mat")]
     for path in paths:
         write_record(record, path)
@@ -227,7 +227,7 @@ def page(text: str, converged: bool) -> str:
         for p in example.PARAMETERS
     ]
     run: Result = example.run(converged, parameters=tuple(odd))
-    origin = Record(np.arange(20.0), None, 1.0, origin=text).origin
+    origin = Record(np.arange(20.0), None, interval=1.0, origin=text).origin
     run = dataclasses.replace(
         run, name=text, remarks=(text,), facts={"record": origin, "drive": text, "config": text}
     )

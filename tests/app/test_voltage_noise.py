@@ -34,7 +34,7 @@ def noisy_record(seed: int, **options: object) -> Record:
     clean = 90 * drive("decaying sine", 500.0, rng)
     measured = clean + 0.18 * rng.standard_normal(clean.size)
     reading = 0.1 * clean + 0.01 * rng.standard_normal(clean.size)
-    return Record(measured, reading, 0.002, **options)  # type: ignore[arg-type]
+    return Record(measured, reading, interval=0.002, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture

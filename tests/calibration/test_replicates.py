@@ -97,7 +97,7 @@ def another(**changes: object) -> OtherRecord:
     """Return a sine of another rate; the last reading is missing, and a tenth is the lead-in."""
     voltage = 60 * np.sin(2 * np.pi * np.arange(200) / 100 + 1)
     reading = np.where(np.arange(200) < 199, 0.0, np.nan)
-    other = OtherRecord(Record(voltage, reading, 0.005), InitialConditions(lead_in=0.1))
+    other = OtherRecord(Record(voltage, reading, interval=0.005), InitialConditions(lead_in=0.1))
     return replace(other, **changes)  # type: ignore[arg-type]
 
 

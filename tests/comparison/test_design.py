@@ -90,7 +90,8 @@ def test_large_loops_are_told_from_small_ones_and_four_from_one(
 def both(posterior: Posterior, voltage: FloatArray, reading: FloatArray) -> Posterior:
     """Return the posterior of the first record and a new one."""
     first, whole = replace(posterior.only, name="first"), (slice(0, voltage.size),)
-    second = replace(first, name="new", voltage=voltage, displacement=reading, training=whole)
+    inputs = replace(first.inputs, voltage=voltage)
+    second = replace(first, name="new", inputs=inputs, displacement=reading, training=whole)
     table = replace(first.table, records=("first", "new"))
     known = {parameter.name: parameter for parameter in posterior.prior.parameters}
     parameters = [replace(known[d.name], name=n, record=r) for n, d, r in table.layout]

@@ -108,7 +108,10 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     assert isinstance(config.record, RecordConfig)
     start = config.record.start
     assert start is not None
-    write_record(Record(case.voltage, case.displacement, case.interval, start), tmp_path / "t.h5")
+    write_record(
+        Record(case.voltage, case.displacement, interval=case.interval, start=start),
+        tmp_path / "t.h5",
+    )
     source = RecordConfig(file="t.h5", train=config.record.train)
     problem = resolve_config(config.model_copy(update={"record": source}), tmp_path)
     made = estimated(problem.posterior, problem.plan, generator(1, "evidence"))

@@ -108,7 +108,7 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
     """RMSE on a fresh record, um, by model: of the mean, or at the MAP estimate if screened."""
     assert fresh.displacement is not None
     # Without its readings, which would be validated.
-    planned = Record(fresh.voltage, None, fresh.interval)
+    planned = Record(fresh.voltage, None, interval=fresh.interval)
     made = {}
     for candidate in comparison.candidates:
         run = RunFolder.open(folder / re.sub(r"[^\w.-]+", "-", candidate.name).strip("-."))
@@ -164,7 +164,7 @@ def test_a_record_without_hysteresis_is_said_to_have_none(tmp_path: Path) -> Non
     record, _ = plant("linear", 1)
     names = ["bouc-wen + white", "linear + white"]
     assert record.displacement is not None
-    fewer = Record(record.voltage[::3], record.displacement[::3], 3 * INTERVAL)
+    fewer = Record(record.voltage[::3], record.displacement[::3], interval=3 * INTERVAL)
     comparison = compared(fewer, names, tmp_path / "runs", walkers=24, steps=500)
     assert comparison.recommended == "linear + white"
     assert any("no hysteresis" in line for line in comparison.lines)

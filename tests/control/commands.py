@@ -77,7 +77,7 @@ def measured_voltage(rate: float, seed: int = 1) -> Problem:
         "ess": 500,
         "seed": seed,
     }
-    config, records = config_of(Record(voltage, reading, 1 / rate), keys)
+    config, records = config_of(Record(voltage, reading, interval=1 / rate), keys)
     return resolve_config(config, Path(), records)
 
 

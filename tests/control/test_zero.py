@@ -129,6 +129,6 @@ def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> 
     with pytest.raises(InputError, match=r"20 to 100 V leaves out zero volts.*include it"):
         compensate(of.posterior, flat, asked, np.random.default_rng(1), limits=Limits(20.0, 100.0))
     voltage = 60 + 40 * np.sin(4 * np.pi * TIME)
-    record = Record(voltage, 0.5 * voltage + np.sin(TIME), INTERVAL)
+    record = Record(voltage, 0.5 * voltage + np.sin(TIME), interval=INTERVAL)
     config, records = config_of(record, {})
     assert limits_of(resolve_config(config, Path(), records), None, 0.0) == (0.0, 100.0)

@@ -233,7 +233,9 @@ def plant(kind: str, seed: tuple[int, int], seconds: float = 10.0) -> Record:
     moved = moved_by(kind, part, at_actuator(kind, fine, rng), size, rng, fine.size)[::FINE]
     voltage, time = fine[::FINE], np.arange(moved.size) / RATE
     readings = moved + part.offset + added(kind, moved, size, time, rng)
-    return Record(voltage, readings + noise(kind, part, voltage, rng), 1 / RATE, origin=kind)
+    return Record(
+        voltage, readings + noise(kind, part, voltage, rng), interval=1 / RATE, origin=kind
+    )
 
 
 @dataclass(frozen=True)
@@ -281,6 +283,6 @@ def bench(kind: str, seed: tuple[int, int], cured: str = "", seconds: float = 10
         fault = "good" if source is later and kind in ("transient", "drift", "step") else kind
         readings = clean + part.offset + added(fault, clean, size, time, source)
         readings += noise(kind, part, voltage, source)
-        records.append(Record(voltage, readings, 1 / RATE, origin=kind))
+        records.append(Record(voltage, readings, interval=1 / RATE, origin=kind))
         voltages.append(driven[::FINE][rows])
     return Bench((records[0], records[1]), (voltages[0], voltages[1]))

@@ -11,6 +11,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from tests.inference.problems import INTERVAL, decaying_sine, ring_bender
 from tests.inference.test_joint import joint
 from tests.measured import keep
@@ -27,7 +28,8 @@ def pair(seed: int, gain: float = 1.0, noise: float = 0.0) -> Posterior:
             reading = gain * reading + noise * np.random.default_rng(seed).standard_normal(400)
         model = noise_model("discrepancy", INTERVAL)
         windows = (slice(0, 400),)
-        one = Dataset(voltage, reading, windows, actuator, model, name=f"r{number}", from_rest=True)
+        inputs = Inputs(voltage, interval=INTERVAL)
+        one = Dataset(inputs, reading, windows, actuator, model, name=f"r{number}", from_rest=True)
         datasets.append(one)
     return joint(*datasets)
 

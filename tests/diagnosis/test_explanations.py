@@ -137,7 +137,7 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     count = round(late / 0.8 * RATE)
     rows = slice(max(-count, 0), readings.size - max(count, 0))
     other = slice(rows.start + count, rows.stop + count)
-    record = Record(fine[::FINE][other], readings[rows], 1 / RATE)
+    record = Record(fine[::FINE][other], readings[rows], interval=1 / RATE)
     write_record(record, tmp_path / "record.h5")
     problem = problem_of('[record]\nfile = "record.h5"\n', tmp_path)
     rng = np.random.default_rng(1)

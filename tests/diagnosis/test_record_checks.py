@@ -29,7 +29,7 @@ def findings_of(kind: str, record: Record) -> list[Finding]:
 
 
 def findings(kind: str, voltage: FloatArray, displacement: FloatArray) -> list[Finding]:
-    return findings_of(kind, Record(voltage, displacement, 1e-3))
+    return findings_of(kind, Record(voltage, displacement, interval=1e-3))
 
 
 SINE = np.sin(np.linspace(0.0, 12 * np.pi, 3000))
@@ -46,7 +46,7 @@ def test_a_displacement_cut_off_at_its_limit_is_clipping(
     assert abs(cut[[first, first + 4, last]]).tolist() == [0.8, 0.8, 0.8]
     assert abs(cut[[first - 1, last + 1]]).max() < 0.8
     value = float(finding.fix.removeprefix("missing = [").removesuffix("] under [record]"))
-    rest = Record(SINE, cut, 1e-3).without_values([value])
+    rest = Record(SINE, cut, interval=1e-3).without_values([value])
     assert cut.size - np.sum(np.isclose(cut, value)) == rest.readings
     assert [] == findings_of("clipping", rest)
 
@@ -160,7 +160,9 @@ def test_a_late_column_is_named_with_its_delay(
     rows = (late, early) if column == "voltage" else (early, late)
     (finding,) = [
         finding
-        for finding in inspect(Record(unit * voltage[rows[0]], readings[rows[1]], 1 / rate))
+        for finding in inspect(
+            Record(unit * voltage[rows[0]], readings[rows[1]], interval=1 / rate)
+        )
         if finding.kind not in ("one amplitude", "unlikely units")
     ]
     assert finding.kind == f"late {column}"
@@ -179,7 +181,9 @@ def without_memory(seed: int, loop: float = 0.0) -> Record:
     curve, state = behind + random.uniform(-0.3, 0.3) * behind**2, 0.0
     play = [state := min(max(state, u - 0.1), u + 0.1) for u in behind.tolist()]
     error = random.normal(0, 10 ** random.uniform(-4, -2.7), samples.size)
-    return Record(voltage, 10 * ((1 - 5 * loop) * curve + 5 * loop * np.array(play) + error), 1e-3)
+    return Record(
+        voltage, 10 * ((1 - 5 * loop) * curve + 5 * loop * np.array(play) + error), interval=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -225,7 +229,7 @@ def test_the_windows_of_a_fix_hold_the_samples_that_they_name(
     """In the digits that are printed, with a sample more on either side at most."""
     values = SINE + 0.01 * np.random.default_rng(1).standard_normal(SINE.size)
     values[first : first + length] = values[first]
-    record = Record(SINE, values, 1 / rate, start=start)
+    record = Record(SINE, values, interval=1 / rate, start=start)
     (fix,) = [found.fix for found in inspect(record) if "exclude" in found.fix]
     windows = literal_eval(fix.partition("= ")[2].removesuffix(" under [record]"))
     left_out = record.readings - record.exclude(windows).readings
@@ -254,7 +258,7 @@ def test_a_jump_of_the_offset_is_named_with_its_time_and_its_shorter_side_left_o
     jump = sign * size * float(np.ptp(readings))
     for row, step in zip(rows, (jump, -jump), strict=False):
         readings[row:] += step
-    record = Record(voltage, readings, 0.005)
+    record = Record(voltage, readings, interval=0.005)
     (finding,) = inspect(record)
     assert "jump" == finding.kind
     named = [float(text) for text in re.findall(r"um at ([\d.]+) s", finding.text)]
@@ -280,7 +284,7 @@ def test_an_amplifier_at_its_limits_is_no_transient(kind: str) -> None:
             slow = limited(voltage, rate * RATE * FINE * float(np.diff(voltage).max()))
             readings = hysteresis(drawn(np.random.default_rng(0)), slow)
             readings += 0.02 * np.random.default_rng(1).standard_normal(time.size)
-            records.append(Record(voltage, readings, 0.002))
+            records.append(Record(voltage, readings, interval=0.002))
     assert not [r for r in records if findings_of("switch-on transient", r)]
 
 
@@ -310,7 +314,7 @@ def test_the_initial_loading_of_a_single_swing_is_no_transient(
     part = drawn(rng)
     driven = (plays if of_plays else hysteresis)(part, voltage)
     readings = driven + part.offset + part.sensor * rng.standard_normal(voltage.size)
-    assert [] == findings_of("switch-on transient", Record(voltage, readings, 1 / rate))
+    assert [] == findings_of("switch-on transient", Record(voltage, readings, interval=1 / rate))
 
 
 def crept(seed: int, drift: float) -> Record:
@@ -334,7 +338,7 @@ def crept(seed: int, drift: float) -> Record:
     readings, size = driven[rows], float(np.ptp(driven))
     readings = readings + drift * size * np.linspace(0, 1, readings.size)
     readings += 0.002 * size * rng.standard_normal(readings.size)
-    return Record(voltage[rows], readings, 1 / RATE)
+    return Record(voltage[rows], readings, interval=1 / RATE)
 
 
 def test_creep_is_no_drift_and_a_drift_beside_it_is_found() -> None:
@@ -347,7 +351,7 @@ def test_creep_is_no_drift_and_a_drift_beside_it_is_found() -> None:
 
 def test_a_planned_voltage_is_looked_at_too() -> None:
     steady = 5e4 * np.sin(np.arange(3000) / 30)
-    kinds = [finding.kind for finding in inspect(Record(steady, None, 1e-3))]
+    kinds = [finding.kind for finding in inspect(Record(steady, None, interval=1e-3))]
     assert ["unlikely units", "one amplitude"] == kinds
 
 

@@ -15,6 +15,7 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import Hold
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
@@ -99,7 +100,8 @@ def posterior_of(
     parameters = parameters_of(ParameterTable(actuator, model).declarations, known, fixed, priors)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
-    one = Dataset(voltage, displacement, windows, actuator, model, from_rest)
+    inputs = Inputs(voltage, interval=actuator.interval)
+    one = Dataset(inputs, displacement, windows, actuator, model, from_rest)
     return Posterior((one,), prior)
 
 

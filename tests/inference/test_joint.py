@@ -21,6 +21,7 @@ from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
 
 ENGINES = get_args(Engine)
@@ -38,7 +39,8 @@ def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Dat
     displacement = offset + ring_bender(actuator, noise, voltage, samples)
     windows = (slice(0, samples // 2), slice(samples // 2 + 10, samples))
     model = noise_model(noise, interval)
-    return Dataset(voltage, displacement, windows, actuator, model, from_rest, name)
+    inputs = Inputs(voltage, interval=interval)
+    return Dataset(inputs, displacement, windows, actuator, model, from_rest, name)
 
 
 def joint(
@@ -102,7 +104,8 @@ def test_halves_with_a_discrepancy_are_the_whole() -> None:
     windows = slice(0, 900), slice(1100, 2000)
 
     def half(name: str, *training: slice) -> Dataset:
-        return Dataset(voltage, reading, training, actuator, noise, True, name)
+        inputs = Inputs(voltage, interval=INTERVAL)
+        return Dataset(inputs, reading, training, actuator, noise, True, name)
 
     one = joint(half("whole", *windows))
     halves = [half(f"half-{i}", window) for i, window in enumerate(windows)]

@@ -128,7 +128,10 @@ def test_a_hold_is_covered_that_was_not_before(
     """The quick twin of the study: a plant of 1.9% a decade, 100 s after a record of 16 s."""
     posterior, draws, strength, _, source = fit
     _, voltage, interval = list(plans())[1]
-    plan, truth = Record(voltage, None, interval), plant(voltage, interval, strength, source)
+    plan, truth = (
+        Record(voltage, None, interval=interval),
+        plant(voltage, interval, strength, source),
+    )
     assert coverage(predicted(posterior, draws, plan), truth) < 0.2
     assert coverage(extended(posterior, draws, plan), truth) > 0.7
 
@@ -137,7 +140,7 @@ def test_an_ordinary_plan_keeps_its_band(
     fit: tuple[Posterior, FloatArray, float, float, np.random.Generator],
 ) -> None:
     posterior, draws, _, frequency, _ = fit
-    plan = Record(sine(frequency, 70.0), None, INTERVAL)
+    plan = Record(sine(frequency, 70.0), None, interval=INTERVAL)
     before, after = predicted(posterior, draws, plan), extended(posterior, draws, plan)
     assert width(after) == pytest.approx(width(before), rel=0.05)
     assert np.sqrt(np.mean((after.mean - before.mean) ** 2)) < 0.1 * width(before)
@@ -166,10 +169,10 @@ def test_slow_plans_are_covered_over_forty_plants() -> None:
         posterior, draws, strength, frequency, source = fitted(seed)
         for name, voltage, interval in plans():
             truth = plant(voltage, interval, strength, source)
-            bands = extended(posterior, draws, Record(voltage, None, interval))
+            bands = extended(posterior, draws, Record(voltage, None, interval=interval))
             covered.setdefault(name, []).append(coverage(bands, truth))
             print(seed, name, f"{strength:.4f} {frequency:.1f} Hz", covered[name][-1], flush=True)
-        plan = Record(sine(frequency, 70.0), None, INTERVAL)
+        plan = Record(sine(frequency, 70.0), None, interval=INTERVAL)
         wider.append(
             width(extended(posterior, draws, plan)) / width(predicted(posterior, draws, plan))
         )

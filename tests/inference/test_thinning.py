@@ -19,6 +19,7 @@ from bwbayes.inference.thinning import (
     thinned_windows,
 )
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from tests.inference.problems import (
     INTERVAL,
     decaying_sine,
@@ -32,7 +33,8 @@ from tests.inference.problems import (
 def record_of(voltage: FloatArray) -> Dataset:
     """Return a record of which only the voltage matters."""
     actuator, noise = Actuator("none", "first", INTERVAL), noise_model("white", INTERVAL)
-    return Dataset(voltage, np.zeros(voltage.size), (slice(0, voltage.size),), actuator, noise)
+    inputs = Inputs(voltage, interval=INTERVAL)
+    return Dataset(inputs, np.zeros(voltage.size), (slice(0, voltage.size),), actuator, noise)
 
 
 @given(

@@ -28,6 +28,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
 from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Operator, Span
@@ -175,7 +176,8 @@ def test_chains_agree_in_both_engines_and_in_pieces(
     second, _ = made.advance(models, voltage[cut:], state)
     size = np.ptp(whole)
     np.testing.assert_allclose(np.hstack([first, second]), whole, rtol=0, atol=1e-11 * size)
-    onwards = walk(made, models, voltage, from_rest=from_rest)
+    inputs = Inputs(voltage, interval=made.interval)
+    onwards = walk(made, models, inputs, from_rest=from_rest)
     pieces = np.hstack([onwards(cut), onwards(voltage.size)])
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-11 * size)
     alone = made.displacement(models[1:2], voltage, from_rest=from_rest)
@@ -263,7 +265,7 @@ def test_both_engines_give_the_same_log_density(
     densities = []
     for engine in ("numpy", "numba"):
         likelihood = Likelihood(
-            voltage,
+            Inputs(voltage, interval=made.interval),
             Readings.of(readings, [slice(20, 580)]),
             made,
             DiscrepancyNoise(),

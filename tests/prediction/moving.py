@@ -105,7 +105,7 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
     truth = displacement + case.discrepancy * process(displacement.size, step, generator)
     truth = truth + generator.normal(0, 30)
     reading = truth + TRUE["sensor_sd"] * generator.standard_normal(truth.size)
-    return Record(voltage[cut:], reading, 1 / RATE, truth=truth, origin="cut")
+    return Record(voltage[cut:], reading, interval=1 / RATE, truth=truth, origin="cut")
 
 
 def predicted(case: Case, posterior: Posterior, record: Record, seed: int) -> Bands:

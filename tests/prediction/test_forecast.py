@@ -39,7 +39,7 @@ def whole(seed: int) -> tuple[Posterior, Record, FloatArray]:
     noise = DiscrepancyNoise(INTERVAL)
     parts = noise.draw(one.table.noise(theta), voltage.size, np.random.default_rng([5, seed]))
     reading = clean + sum(parts)
-    first = Record(voltage[:LEAD], reading[:LEAD], INTERVAL)
+    first = Record(voltage[:LEAD], reading[:LEAD], interval=INTERVAL)
     posterior = posterior.altered(voltage=voltage[:LEAD], displacement=reading[:LEAD])
     return posterior, first, np.stack([voltage[LEAD:], reading[LEAD:]])
 
@@ -82,7 +82,7 @@ def test_another_record_is_forecast_from_its_lead_in(
     other = Record(
         np.concatenate([record.voltage, voltage]),
         np.concatenate([record.displacement, reading]),
-        INTERVAL,
+        interval=INTERVAL,
     )
     draws = np.repeat(free_truth(posterior), 200, axis=0)
     lead_in = LEAD * INTERVAL
@@ -139,7 +139,7 @@ def replicate(seed: int) -> Replicate:
     one = usual.only
     clean = one.actuator.displacement(one.table.actuator(theta), voltage, from_rest=True)[0]
     reading = clean + sum(one.noise.draw(one.table.noise(theta), voltage.size, source))
-    record = Record(voltage[:LEAD], reading[:LEAD], INTERVAL)
+    record = Record(voltage[:LEAD], reading[:LEAD], interval=INTERVAL)
     posterior = usual.altered(voltage=voltage[:LEAD], displacement=reading[:LEAD])
     _, draws = posterior_draws(posterior, source)
     return Replicate(posterior, draws, record, voltage[LEAD:], reading[LEAD:])

@@ -32,7 +32,9 @@ def record_after(reach: float) -> Record:
     theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
     displacement = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
-    return Record(95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, 1 / RATE)
+    return Record(
+        95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, interval=1 / RATE
+    )
 
 
 @pytest.mark.parametrize("reach", [30.0, 60.0])
@@ -65,8 +67,8 @@ def test_every_draw_is_simulated_with_its_own_history() -> None:
     begun = estimate_initial_states(
         POSTERIOR, DRAWS, planned, InitialConditions(), np.random.default_rng(3)
     )
-    whole = begun.displacement(planned.voltage)
-    pieces = np.hstack([*begun.pieces(planned.voltage, 77)])
+    whole = begun.displacement(planned.inputs)
+    pieces = np.hstack([*begun.pieces(planned.inputs, 77)])
     np.testing.assert_allclose(pieces, whole, atol=1e-9)
     for row in (0, 7, 39):
         actuator = begun.histories.likelihoods[begun.histories.which[row]].actuator
@@ -127,7 +129,7 @@ def level_error(seed: int) -> tuple[float, float]:
     theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
     moved = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
     voltage, moved = voltage[12 * second :], moved[12 * second :]
-    record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), 1 / RATE)
+    record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), interval=1 / RATE)
     start = InitialConditions(estimate_offset=False, lead_in=0.6)
     bands = predict_record(POSTERIOR, np.empty((100, 0)), record, start, rng)
     error = np.mean((moved - bands.mean)[bands.scored_from :])
@@ -161,6 +163,6 @@ def test_draws_at_the_edge_of_the_domain_have_a_start() -> None:
         theta[draw, names.index("d")] = np.sum(theta[draw, elements])
     voltage = 60 * np.sin(2 * np.pi * np.arange(int(4 * RATE)) / RATE)
     start = InitialConditions(estimate_offset=False, lead_in=0.6)
-    record = Record(voltage, 0.5 * voltage, 1 / RATE)
+    record = Record(voltage, 0.5 * voltage, interval=1 / RATE)
     begun = estimate_initial_states(posterior, theta, record, start, np.random.default_rng(1))
     assert (begun.offset_sd > 0).all()

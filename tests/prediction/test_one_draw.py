@@ -57,7 +57,7 @@ def another(posterior: Posterior, interval: float) -> Record:
     voltage = decaying_sine(round(4.0 / interval), amplitude=80.0)
     reading = simulated(posterior, voltage, interval) + 12.0
     reading += SENSOR * np.random.default_rng(1).standard_t(3, voltage.size)
-    return Record(voltage, reading, interval)
+    return Record(voltage, reading, interval=interval)
 
 
 def sds(bands: Bands, kind: Kind) -> FloatArray:
@@ -98,7 +98,7 @@ def test_readings_are_judged_by_the_sensors_distribution(
     posterior: Posterior, draw: FloatArray
 ) -> None:
     """Its sd is the root of both squares; the discrepancy's alone is less than a third of it."""
-    record = Record(posterior.only.voltage, posterior.only.displacement + 0.5, INTERVAL)
+    record = Record(posterior.only.voltage, posterior.only.displacement + 0.5, interval=INTERVAL)
     bands = predict_windows(
         posterior, draw, record, {"all": slice(0, record.samples)}, np.random.default_rng(2)
     )[0]
@@ -164,7 +164,7 @@ def test_an_unknown_state_is_one_that_leads_to_the_first_voltage(
     # Half have come from as far as any drive goes, half are what drives of any amplitude leave.
     left = float(sign * np.max(sign * running) + np.mean(running)) / 2
     assert 0.9 * top < sign * left < top
-    held = Record(np.full(60, sign * 100.0), None, INTERVAL)
+    held = Record(np.full(60, sign * 100.0), None, interval=INTERVAL)
     bands = predict_record(
         posterior, np.repeat(draw, 400, axis=0), held, InitialConditions(), np.random.default_rng(5)
     )

@@ -103,7 +103,7 @@ def test_a_gain_counts_from_the_displacement_before_the_step() -> None:
 @pytest.mark.parametrize("name", ["step10", "step50", "step100"])
 def test_the_papers_steps_are_recognized(name: str) -> None:
     _, voltage = signal(name).sample(100)
-    step = step_of(Record(voltage, None, INTERVAL))
+    step = step_of(Record(voltage, None, interval=INTERVAL))
     assert step is not None
     assert float(name.removeprefix("step")) == step.height
     assert 10.0 == pytest.approx(step.held)
@@ -122,12 +122,12 @@ def test_the_papers_steps_are_recognized(name: str) -> None:
 )
 def test_what_is_no_step_from_zero_is_left_alone(voltage: FloatArray) -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
-    assert {} == measure_steps(of, draws, {"other": Record(voltage, None, INTERVAL)})
+    assert {} == measure_steps(of, draws, {"other": Record(voltage, None, interval=INTERVAL)})
 
 
 @pytest.mark.parametrize("voltage", [np.zeros((2, 2)), np.array([]), np.array([1.0, np.nan])])
 def test_a_forecast_needs_a_voltage(voltage: FloatArray) -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
-    record = Record(of.only.voltage, of.only.displacement, INTERVAL)
+    record = Record(of.only.voltage, of.only.displacement, interval=INTERVAL)
     with pytest.raises(InputError, match="give one finite row"):
         forecast(of, draws, record, voltage, np.random.default_rng(1))

@@ -193,7 +193,7 @@ def _unrelated(record: Record, g: Generator) -> Record:
 def _written_often(record: Record, g: Generator) -> Record:
     times = int(g.integers(2, 6))
     voltage, values = np.repeat(record.voltage, times), np.repeat(_readings(record), times)
-    return Record(voltage, values, record.interval / times)
+    return Record(voltage, values, interval=record.interval / times)
 
 
 def _rounded(values: FloatArray, levels: int, g: Generator) -> FloatArray:
@@ -217,8 +217,8 @@ def _late(record: Record, g: Generator, least: float, column: str) -> Record:
     count = max(round(2 * float(g.uniform(least, 0.25)) * float(np.median(np.diff(turns)))), 1)
     late, other = slice(None, -count), slice(count, None)
     if column == "voltage":
-        return Record(record.voltage[late], _readings(record)[other], record.interval)
-    return Record(record.voltage[other], _readings(record)[late], record.interval)
+        return Record(record.voltage[late], _readings(record)[other], interval=record.interval)
+    return Record(record.voltage[other], _readings(record)[late], interval=record.interval)
 
 
 def _by_itself(record: Record, g: Generator) -> Record:

@@ -114,12 +114,12 @@ def test_a_version_5_file_is_read_as_scipy_wrote_it(tmp_path: Path, compressed: 
 @pytest.mark.parametrize("name", ["none/record.csv", "none/record.h5", "none/record.mat", "a.xls"])
 def test_a_place_that_cannot_be_written_to_is_an_input_error(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=name):
-        write_record(Record(np.arange(20.0), None, 1.0), tmp_path / name)
+        write_record(Record(np.arange(20.0), None, interval=1.0), tmp_path / name)
 
 
 def test_a_version_7_3_file_bears_the_header_that_matlab_looks_for(tmp_path: Path) -> None:
     path = tmp_path / "record.mat"
-    write_record(Record(VOLTAGE, DISPLACEMENT, 1.0), path, mat_version="7.3")
+    write_record(Record(VOLTAGE, DISPLACEMENT, interval=1.0), path, mat_version="7.3")
     assert (2, 0) == scipy.io.matlab.matfile_version(path)
     with h5py.File(path) as file:
         assert 512 == file.userblock_size
@@ -269,7 +269,7 @@ def test_a_file_cannot_have_another_file_opened(
 def test_a_list_is_no_note(tmp_path: Path) -> None:
     """Damaged text of variable length may look like one, and reading that ends the process."""
     path = tmp_path / "a.h5"
-    write_record(Record(np.arange(20.0), np.arange(20.0), 0.1, origin="a bench"), path)
+    write_record(Record(np.arange(20.0), np.arange(20.0), interval=0.1, origin="a bench"), path)
     with h5py.File(path, "a") as file:
         del file.attrs["origin"]
         texts = np.array([np.arange(3, dtype="u1"), None], dtype=object)[:1]
@@ -480,7 +480,7 @@ def test_an_attribute_that_may_scale_the_numbers_is_said_not_to(
     tmp_path: Path, name: str, factor: float
 ) -> None:
     """Unless it changes nothing, whatever is meant by it; the numbers stay as they are."""
-    write_record(Record(VOLTAGE, DISPLACEMENT, 1.0), tmp_path / "a.h5")
+    write_record(Record(VOLTAGE, DISPLACEMENT, interval=1.0), tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5", "a") as file:
         file["voltage_V"].attrs[name] = factor
     with warnings.catch_warnings(record=True) as caught:

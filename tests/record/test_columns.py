@@ -443,7 +443,7 @@ def test_a_number_far_from_all_readings_that_is_repeated_is_a_missing_one(
 
 def test_nothing_is_said_of_a_record_in_memory_that_stays_as_it_is() -> None:
     displacement = np.where(np.arange(200) % 50 == 7, -9999.0, DISPLACEMENT)
-    require_readable(Record(VOLTAGE, displacement, 0.01), "record")
+    require_readable(Record(VOLTAGE, displacement, interval=0.01), "record")
 
 
 def test_a_number_that_may_be_a_reading_stays_one() -> None:

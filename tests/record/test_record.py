@@ -13,7 +13,7 @@ from bwbayes.record import Record
 
 def ramp(samples: int = 100, interval: float = 0.01, start: float = 0.0) -> Record:
     voltage = np.arange(samples, dtype=np.float64)
-    return Record(voltage, 2 * voltage, interval, start, truth=3 * voltage)
+    return Record(voltage, 2 * voltage, interval=interval, start=start, truth=3 * voltage)
 
 
 def test_masked_readings_are_missing() -> None:
@@ -27,7 +27,7 @@ def test_masked_readings_are_missing() -> None:
 
 def test_arrays_are_copies_that_cannot_be_written_to() -> None:
     voltage = np.arange(3.0)
-    record = Record(voltage, None, 1.0)
+    record = Record(voltage, None, interval=1.0)
     voltage[0] = 7.0
     assert record.voltage[0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
@@ -36,14 +36,14 @@ def test_arrays_are_copies_that_cannot_be_written_to() -> None:
 
 def test_sha256_names_the_data_and_not_the_origin() -> None:
     record = ramp()
-    same = Record(record.voltage, record.displacement, 0.01, origin="elsewhere")
+    same = Record(record.voltage, record.displacement, interval=0.01, origin="elsewhere")
     assert record.sha256 == same.sha256
     others = [
-        Record(record.voltage + 1, record.displacement, 0.01),
-        Record(record.voltage, record.voltage, 0.01),
-        Record(record.voltage, None, 0.01),
-        Record(record.voltage, record.displacement, 0.02),
-        Record(record.voltage, record.displacement, 0.01, start=1.0),
+        Record(record.voltage + 1, record.displacement, interval=0.01),
+        Record(record.voltage, record.voltage, interval=0.01),
+        Record(record.voltage, None, interval=0.01),
+        Record(record.voltage, record.displacement, interval=0.02),
+        Record(record.voltage, record.displacement, interval=0.01, start=1.0),
     ]
     assert len({record.sha256, *(other.sha256 for other in others)}) == 6
 
@@ -117,15 +117,17 @@ def test_exclude_takes_every_sample_that_it_touches(
 def test_a_record_needs_one_reading_and_all_missing_ones_are_alike() -> None:
     voltage = np.arange(3.0)
     with pytest.raises(InputError, match="displacement: holds no reading"):
-        Record(voltage, np.full(3, np.nan), 1.0)
+        Record(voltage, np.full(3, np.nan), interval=1.0)
     other_nan = np.array([0x7FF8000000000001], dtype=np.uint64).view(np.float64)[0]
-    one, other = (Record(voltage, np.array([1.0, x, 2.0]), 1.0) for x in (np.nan, -other_nan))
+    one, other = (
+        Record(voltage, np.array([1.0, x, 2.0]), interval=1.0) for x in (np.nan, -other_nan)
+    )
     assert one.sha256 == other.sha256
     assert [True, False, True] == one.has_reading.tolist()
     with pytest.raises(InputError, match="displacement: inf at sample 1"):
-        Record(voltage, np.array([np.nan, np.inf, 2.0]), 1.0)
+        Record(voltage, np.array([np.nan, np.inf, 2.0]), interval=1.0)
     with pytest.raises(InputError, match="voltage: nan at sample 1"):
-        Record(np.array([1.0, np.nan, 2.0]), voltage, 1.0)
+        Record(np.array([1.0, np.nan, 2.0]), voltage, interval=1.0)
 
 
 @pytest.mark.parametrize("factor", [0, -1, 1.5])

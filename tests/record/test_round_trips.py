@@ -68,10 +68,10 @@ def test_a_record_survives_any_way_through_the_formats(
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_plans_gaps_and_parts_of_long_records_survive(tmp_path: Path, suffix: str) -> None:
     """Times far from zero carry the rounding of the whole record, and must be uniform still."""
-    plan = Record(np.arange(20.0), None, 0.1, origin="a plan", voltage_is="command")
+    plan = Record(np.arange(20.0), None, interval=0.1, origin="a plan", voltage_is="command")
     assert_same(plan, through(plan, tmp_path, suffix))
     voltage = np.sin(0.37 * np.arange(50_000))
-    whole = Record(voltage, 2 * voltage, 1e-3 / 3, start=-5.0, truth=voltage)
+    whole = Record(voltage, 2 * voltage, interval=1e-3 / 3, start=-5.0, truth=voltage)
     cut = replace(whole.window(5.0, 7.0).decimate(7).exclude([(5.0, 5.1)]), origin="a part")
     assert_same(cut, through(cut, tmp_path, suffix))
 

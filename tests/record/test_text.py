@@ -588,7 +588,9 @@ def test_times_rounded_in_print_are_uniform(tmp_path: Path, rate: float, decimal
 def test_the_truth_beside_a_text_is_that_of_its_record(tmp_path: Path) -> None:
     path = tmp_path / "record.csv"
     record = read(tmp_path, GOOD)
-    write_record(Record(record.voltage, record.displacement, 0.1, truth=record.voltage), path)
+    write_record(
+        Record(record.voltage, record.displacement, interval=0.1, truth=record.voltage), path
+    )
     assert read_record(path).truth is not None
     write_record(record, path)
     assert read_record(path).truth is None

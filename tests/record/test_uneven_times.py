@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.model.inputs import VoltageIs
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming, select
-from bwbayes.record.io.fields import VoltageIs, record_fields
+from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.series import array_source
 
 

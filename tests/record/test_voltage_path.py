@@ -160,12 +160,12 @@ def test_what_cannot_be_repaired_says_so() -> None:
 
 def test_commands_and_planned_voltages_have_no_noise() -> None:
     measured = noisy(drive("sine", 1000.0, np.random.default_rng(0)), 2e-3, 0)
-    record = Record(measured, measured, 1e-3)
+    record = Record(measured, measured, interval=1e-3)
     assert record.path.remark
     np.testing.assert_array_equal(record.voltage, measured)
     for exact in (
-        Record(measured, measured, 1e-3, voltage_is="command"),
-        Record(measured, None, 1e-3),
+        Record(measured, measured, interval=1e-3, voltage_is="command"),
+        Record(measured, None, interval=1e-3),
     ):
         np.testing.assert_array_equal(exact.path.voltage, measured)
         assert not exact.path.remark

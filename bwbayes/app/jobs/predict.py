@@ -114,7 +114,7 @@ def predict(
         if after:
             watching = partial(watch, "predictions")
             return predict_after(problem, fit.flat_draws, voltage, name, of, watching)
-        record = Record(voltage, None, interval, origin=f"{signal} signal")
+        record = Record(voltage, None, interval=interval, origin=f"{signal} signal")
     elif not isinstance(record, Record | str | Path):
         raise InputError(
             f"predict: {type(record).__name__} is no record; give a file, or "

@@ -83,7 +83,7 @@ def training_records(
             signals[name] = source.signal
             rate = config.stand.sample_rate
             command = sampled_waveform(source.signal).sample(rate)[1]
-            planned = Record(command, None, 1 / rate, voltage_is="command")
+            planned = Record(command, None, interval=1 / rate, voltage_is="command")
             records[name] = planned if source.stop is None else planned.upto(source.stop)
     stand = None
     if signals:
@@ -193,12 +193,8 @@ def _appended(config: Config, before: str, name: str, records: dict[str, Record]
             if window is not None and not held_out.another:
                 window = [[edge + shift for edge in edges] for edges in window]
             validation[key] = held_out.model_copy(update={"of": before, "window": window})
-    series: dict[str, Any] = {}
-    for kind in ("voltage", "displacement", "truth"):
-        values = getattr(first, kind), getattr(other, kind)
-        series[kind] = None if any(v is None for v in values) else np.concatenate(values)
     origin = f"{first.origin}, then {other.origin}"
-    records[before] = replace(first, **series, origin=origin)
+    records[before] = replace(first.followed_by(other), origin=origin)
     return config.model_copy(update={"record": tables, "validation": validation})
 
 

@@ -34,7 +34,13 @@ from bwbayes.inference.prior_creep import add_prior_creep
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
-from bwbayes.prediction.prediction import forecast, predict_record, predict_windows, thin_draws
+from bwbayes.prediction.prediction import (
+    continued,
+    forecast,
+    predict_record,
+    predict_windows,
+    thin_draws,
+)
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
@@ -256,12 +262,11 @@ def predict_after(
     """
     watch(0.0)
     seed, record = problem.config.seed, problem.records[of]
-    joined = np.concatenate([record.path.voltage, voltage])
-    after = slice(record.samples, None)
-    beyond = beyond_training(problem.posterior, joined, record.interval, after)
+    longer, after = continued(record, voltage), slice(record.samples, None)
+    beyond = beyond_training(problem.posterior, longer.voltage, record.interval, after)
     subset = thin_draws(flat, generator(seed, "draws"))
-    source = generator(seed, f"forecast {Record(voltage, None, record.interval).sha256}")
-    longer = replace(record, voltage=joined, displacement=None, truth=None)
+    planned = Record(voltage, None, interval=record.interval)
+    source = generator(seed, f"forecast {planned.sha256}")
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
     bands = forecast(alone, own_draws, record, voltage, source, name, watch)
     remarks = [finding.note for finding in beyond]

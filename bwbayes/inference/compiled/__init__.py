@@ -39,7 +39,7 @@ def warm_up(posterior: Posterior) -> None:
     prior, likelihood = posterior.prior, posterior.likelihoods[0]
     center, _ = prior.constrain(np.zeros((1, prior.dimensions)))
     theta = posterior.table.of(prior.theta(center), posterior.datasets[0].name)
-    likelihood.simulate(likelihood.table.actuator(theta), likelihood.voltage[:2])
+    likelihood.simulate(likelihood.table.actuator(theta), likelihood.inputs[:2])
     series = np.zeros((1, 1, likelihood.readings.rows.size))
     likelihood.whiten(likelihood.table.noise(theta), series)
 
@@ -52,7 +52,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
     if noise.states > LANE_STATES:
         return likelihood.products_of_series(theta, np.empty((0, likelihood.readings.rows.size)))
-    voltage = likelihood.voltage[: likelihood.readings.samples]
+    voltage = likelihood.inputs_read.voltage
     offset = int(likelihood.offset_sd > 0)
     free = likelihood.unknowns - offset
     column = likelihood.table.columns(theta)
@@ -179,7 +179,7 @@ def _staged(
     if actuator.stages:
         theta = np.stack([column[name] for name in actuator.parameters], axis=1)
         for batch in batches(len(theta), voltage.size):
-            yield batch, given(likelihood.simulate(theta[batch], voltage))
+            yield batch, given(likelihood.simulate(theta[batch], likelihood.inputs_read))
         return
     operator, others = actuator.hysteresis, np.arange(column["offset"].size)
     memory = actuator.begin(column, voltage, from_rest=from_rest)

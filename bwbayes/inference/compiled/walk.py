@@ -22,6 +22,7 @@ from bwbayes.inference.compiled.passes import advance_stage, drive_of_own
 from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator, each_model
 from bwbayes.model.declaration import Values
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.stage import pass_stages
@@ -30,27 +31,25 @@ from bwbayes.model.stage import pass_stages
 def walk(
     actuator: Actuator,
     theta: FloatArray,
-    voltage: FloatArray,
+    inputs: Inputs,
     initial_transient: FloatArray | None = None,
     *,
     from_rest: bool = False,
 ) -> Callable[[int], FloatArray]:
-    """Put models to a voltage's first sample; what is returned walks them on to a sample.
+    """Put models to the inputs' first sample; what is returned walks them on to a sample.
 
     Called with growing numbers of samples, it returns the displacement (models, samples), um, from
     where they are. Parameters and errors are those of
-    :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the ``voltage`` (samples,) is known
-    up to the end.
+    :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the inputs are known up to the end.
     """
     column = actuator.columns(theta)
     actuator.check(column)
     if not actuator.stages:
-        return _walk_core(actuator, column, voltage, initial_transient, from_rest)
+        return _walk_core(actuator, column, inputs.voltage, initial_transient, from_rest)
     # The offset comes last.
     inner = replace(actuator, stages=actuator.inputs)
-    core = _walk_core(
-        inner, column | {"offset": np.zeros(len(theta))}, voltage, initial_transient, from_rest
-    )
+    without_offset = column | {"offset": np.zeros(len(theta))}
+    core = _walk_core(inner, without_offset, inputs.voltage, initial_transient, from_rest)
     memories: tuple[FloatArray, ...] | None = None
 
     def onwards(last: int) -> FloatArray:

@@ -11,29 +11,19 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning, path_text
+from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.io.clocks import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
 from bwbayes.record.io.series import Clock
 
-VoltageIs = Literal["command", "output"]
-"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
-
 _MINIMUM_SAMPLES = 10
-
-
-def require_voltage_is(text: str) -> VoltageIs:
-    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
-    for kind in get_args(VoltageIs):
-        if text == kind:
-            return kind  # type: ignore[no-any-return]
-    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
 
 
 def record_fields(

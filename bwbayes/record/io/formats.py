@@ -23,8 +23,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning, refuse_unwritable
+from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.io.columns import ColumnTable, Naming, select
-from bwbayes.record.io.fields import VoltageIs, record_fields, reference_fields, require_voltage_is
+from bwbayes.record.io.fields import record_fields, reference_fields
 from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat

@@ -1,0 +1,126 @@
+"""What drives an actuator: the voltage, sample by sample, and what was recorded beside it.
+
+A part of the model may see more than the voltage: the time, or a covariate, which is a further
+column of the record (a temperature, a load). :class:`Inputs` hold all of them on one time grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.errors import InputError
+from bwbayes.model.linear import Hold
+from bwbayes.shown import brief
+
+VoltageIs = Literal["command", "output"]
+"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
+
+
+def require_voltage_is(text: str) -> VoltageIs:
+    """Return `text` if it says what a voltage column is, else raise an `InputError`."""
+    for kind in get_args(VoltageIs):
+        if text == kind:
+            return kind  # type: ignore[no-any-return]
+    raise InputError(f"voltage_is: {text!r} is unknown; write 'command' or 'output'")
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Inputs of an actuator on the uniform time grid ``start + interval * arange(samples)``.
+
+    Parameters
+    ----------
+    voltage
+        (samples,), V.
+    interval
+        Sampling interval, s.
+    start
+        Time of the first sample, s.
+    voltage_is
+        What the voltage is: ``"command"``, which is held until the next sample, or ``"output"``,
+        which goes straight to it.
+    covariates
+        Further columns (samples,) by name.
+    """
+
+    __repr__ = brief
+
+    voltage: FloatArray
+    _: KW_ONLY
+    interval: float
+    start: float = 0.0
+    voltage_is: VoltageIs = "output"
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.voltage.size
+
+    @property
+    def time(self) -> FloatArray:
+        """Times of the samples, (samples,), s."""
+        return self.start + self.interval * np.arange(self.samples, dtype=np.float64)
+
+    @property
+    def duration(self) -> float:
+        """Length in s: samples times interval, the last one's included."""
+        return self.samples * self.interval
+
+    @property
+    def hold(self) -> Hold:
+        """What the voltage does between samples."""
+        return "zero" if self.voltage_is == "command" else "first"
+
+    def __getitem__(self, samples: slice) -> Self:
+        """Return some of the samples, on the same clock."""
+        first, _, step = samples.indices(self.samples)
+        return replace(
+            self,
+            **self.each_series(lambda values: values[samples]),
+            interval=self.interval * step,
+            start=self.start + self.interval * first,
+        )
+
+    def followed_by(self, other: Inputs) -> Self:
+        """Return these samples and then those of others, which are as far apart.
+
+        Raises
+        ------
+        InputError
+            The others lack a covariate.
+        """
+        return replace(self, **self.each_series(lambda *parts: np.concatenate(parts), other))
+
+    def each_series(self, change: Callable[..., FloatArray], *others: Inputs) -> dict[str, Any]:
+        """Return what a change makes of every series, and of the same one of others, by field."""
+        covariates = {
+            name: change(values, *(other.column(name) for other in others))
+            for name, values in self.covariates.items()
+        }
+        voltage = change(self.voltage, *(other.voltage for other in others))
+        return {"voltage": voltage, "covariates": covariates}
+
+    def column(self, name: str) -> FloatArray:
+        """Return what a part of the model sees, (samples,): time, voltage or a covariate.
+
+        Raises
+        ------
+        InputError
+            There is no such covariate.
+        """
+        if name == "time":
+            return self.time
+        if name == "voltage":
+            return self.voltage
+        if name in self.covariates:
+            return self.covariates[name]
+        raise InputError(
+            f"{name}: the model needs it at every sample, and this voltage comes without; give a "
+            f"record with this column, and name it in covariates"
+        )
