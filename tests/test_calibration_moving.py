@@ -124,7 +124,7 @@ OPTIONS = {
     "bouc-wen-asymmetric": 'terms = ["b3", "b5", "b6"]\n',
 }
 PARTS = {name: f'hysteresis = "{name}"\n{OPTIONS.get(name, "")}' for name in HYSTERESIS}
-PARTS |= {"gain": 'gain = ["quadratic", "cubic"]\n', "creep": "creep = true\n"}
+PARTS |= {"gain": 'nonlinearity = ["quadratic", "cubic"]\n', "creep": "creep = true\n"}
 
 # More walkers than usual: of 13 parameters, 32 would barely span the space.
 STUDIED = {f"calibration, {name}": variant for name, variant in VARIANTS.items()} | {

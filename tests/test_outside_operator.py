@@ -55,8 +55,8 @@ class TanhLoop(RemembersExtrema):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """Slopes d and α, um/V, u_s, V, and the start."""
-        slope = positive("d", "um/V", "d", "slope", lambda ranges: 1.4 * ranges.gain)
-        held = positive("alpha", "um/V", "a", "slope held back", lambda ranges: 0.4 * ranges.gain)
+        slope = positive("d", "um/V", "d", "slope", lambda ranges: 1.4 * ranges.slope)
+        held = positive("alpha", "um/V", "a", "slope held back", lambda ranges: 0.4 * ranges.slope)
         return slope, held, WIDTH, INITIAL
 
     def numbers(self, column: Values) -> FloatArray:

@@ -204,7 +204,7 @@ def compensate(
     if command == "expected":
         span = actuator.span
         assert span is not None
-        slopes = actuator.hysteresis.gain(actuator.columns(states.model), span)
+        slopes = actuator.hysteresis.typical_slope(actuator.columns(states.model), span)
         weights = np.broadcast_to(slopes, len(draws)) / np.sum(np.broadcast_to(slopes, len(draws)))
         smallest, mean = plan.expected(voltage, weights)
         aim = target

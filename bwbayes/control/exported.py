@@ -114,11 +114,11 @@ class Exported(Product):
         actuator = self.model.actuator
         means = {name: float(values[0]) for name, values in self.model.column.items()}
         linear = self.linear
-        gain: dict[str, float] | None = None
-        if actuator.gain is not None and actuator.gain.reference.half > 0:
+        nonlinearity: dict[str, float] | None = None
+        if actuator.nonlinearity is not None and actuator.nonlinearity.reference.half > 0:
             terms = {f"{n}_um": means.get(n, 0.0) for n in ("quadratic", "cubic")}
-            reference = actuator.gain.reference
-            gain = {"middle_V": reference.middle, "half_V": reference.half, **terms}
+            reference = actuator.nonlinearity.reference
+            nonlinearity = {"middle_V": reference.middle, "half_V": reference.half, **terms}
         return {
             "name": self.name,
             "bwbayes": version("bwbayes"),
@@ -130,7 +130,7 @@ class Exported(Product):
             "without_inverse": self.without_inverse,
             "parts": {
                 "hysteresis": self._called,
-                "gain": list(actuator.gain.terms) if actuator.gain else [],
+                "nonlinearity": list(actuator.nonlinearity.terms) if actuator.nonlinearity else [],
                 "dynamics": actuator.dynamics,
                 "creep_times_s": list(actuator.creep.times) if actuator.creep else [],
                 "stages": [stage.name for stage in actuator.stages],
@@ -148,7 +148,7 @@ class Exported(Product):
                 name: {"value": value, "unit": unit}
                 for name, (value, unit) in self.model.step.coefficients().items()
             },
-            "gain": gain,
+            "nonlinearity": nonlinearity,
             "creep_growth_per_V": float(self.model.curve[4, 0]),
             "zero": {
                 "value": float(self.model.zero[0]),
@@ -193,7 +193,9 @@ class Exported(Product):
         model, actuator, step = self.model, self.model.actuator, self.model.step
         remembered = step.demagnetized()[0].tolist()
         parts = [f"hysteresis {self._called}", f"dynamics {actuator.dynamics}"]
-        parts += ["polynomial gain"] * bool(actuator.gain) + ["creep"] * bool(actuator.creep)
+        parts += ["static nonlinearity"] * bool(actuator.nonlinearity) + ["creep"] * bool(
+            actuator.creep
+        )
         parts += [stage.name for stage in actuator.stages]
         tables = {"parameters": step.parameters[0], "curve": model.curve[:, 0]}
         tables["taps"] = model.taps[:, :, 0]

@@ -6,11 +6,12 @@ with a voltage for each model, and are printed as they are. What follows the hys
 and is given as a system of ``scipy.signal`` too.
 
 These functions take the model in arrays: ``move`` and ``parameters`` of the hysteresis' step;
-``curve``, the coefficients of 1, u, u² and u³ that the gain adds, and κ/U, by which the creep's
-drive w (1 + κ |u| / U) grows; and ``taps`` of each section, b₀, b₁, b₂, a₁, a₂ and the gain, then b
-of the sample that a voltage acts on first, and how its two states carry over to that sample. A
-state is ``memory``, the ``initial`` drive of each section, um, and two ``filters`` of each. Stages
-before and behind all that (:mod:`bwbayes.model.stage`) bring functions of the same kind.
+``curve``, the coefficients of 1, u, u² and u³ that the nonlinearity adds, and κ/U, by which the
+creep's drive w (1 + κ |u| / U) grows; and ``taps`` of each section, b₀, b₁, b₂, a₁, a₂ and the
+gain, then b of the sample that a voltage acts on first, and how its two states carry over to that
+sample. A state is ``memory``, the ``initial`` drive of each section, um, and two ``filters`` of
+each. Stages before and behind all that (:mod:`bwbayes.model.stage`) bring functions of the same
+kind.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ NEWTON_ROUNDS, BISECTION_ROUNDS = 40, 60
 
 
 def drive(move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any) -> Any:
-    """Return hysteresis and gain at a voltage, um, and their slope, um/V."""
+    """Return hysteresis and nonlinearity at a voltage, um, and their slope, um/V."""
     w, slope = move(parameters, memory, voltage, after)
     w = w + curve[0] + voltage * (curve[1] + voltage * (curve[2] + voltage * curve[3]))
     return w, slope + curve[1] + voltage * (2.0 * curve[2] + voltage * 3.0 * curve[3])
@@ -51,7 +52,7 @@ def drive(move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, aft
 def settle(
     move: Any, parameters: Any, curve: Any, memory: Any, voltage: Any, after: Any, settled: Any
 ) -> Any:
-    """Return hysteresis and gain at a first voltage, um, where dynamics and creep are at rest."""
+    """Return hysteresis and nonlinearity, um, at a first voltage with all else at rest."""
     w, _ = drive(move, parameters, curve, memory, voltage, after)
     for i in range(len(settled)):
         settled[i] = select(i > 0, w * (1.0 + curve[4] * np.abs(voltage)), w)
@@ -214,11 +215,11 @@ class SampledModel:
 
     @cached_property
     def curve(self) -> FloatArray:
-        """What gain and growing creep add, (5, models): um/Vᵏ for k from 0 to 3, then κ/U, 1/V."""
-        gain, creep = self.actuator.gain, self.actuator.creep
+        """Polynomial of the nonlinearity, um/Vᵏ for k from 0 to 3, then κ/U, 1/V; (5, models)."""
+        nonlinearity, creep = self.actuator.nonlinearity, self.actuator.creep
         curve = np.zeros((5, self.models))
-        if gain is not None:
-            curve[:4] = gain.powers(self.column)
+        if nonlinearity is not None:
+            curve[:4] = nonlinearity.powers(self.column)
         if creep is not None and creep.growing:
             curve[4] = self.column["creep_growth"] * creep.size(np.array(1.0))
         return curve
@@ -366,8 +367,8 @@ class SampledModel:
     def linear(self) -> Any:
         """What follows the hysteresis of the first model, a discrete ``scipy.signal.StateSpace``.
 
-        With the drive w in um, from hysteresis and gain, and x the displacement in um, both as
-        differences from rest,
+        With the drive w in um, from hysteresis and nonlinearity, and x the displacement in um, both
+        as differences from rest,
 
             z[t+1] = A z[t] + B w[t],   x[t] = C z[t] + D w[t],
 

@@ -30,8 +30,8 @@ from bwbayes.model.spec import ModelSpec
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
-    gain = scene.posterior.only.actuator.gain
-    present = set(gain.terms) if gain else set()
+    nonlinearity = scene.posterior.only.actuator.nonlinearity
+    present = set(nonlinearity.terms) if nonlinearity else set()
     for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
             yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", terms)

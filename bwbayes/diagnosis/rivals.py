@@ -38,12 +38,12 @@ def families(spec: ModelSpec) -> Iterator[ModelSpec]:
     """Yield models of other families than a model: one for each."""
     asymmetric = ("saturation", "sensor-curve")
     base = spec.with_parts(
-        gain=(),
+        nonlinearity=(),
         creep=False,
         creep_growth=False,
         stages=tuple(name for name in spec.stages if name not in asymmetric),
     )
-    curved = base.with_parts(gain=("quadratic", "cubic"))
+    curved = base.with_parts(nonlinearity=("quadratic", "cubic"))
     operators = {"bouc-wen", "duhem", "plays"} - {spec.hysteresis}
     for rival in (
         curved,

@@ -229,7 +229,7 @@ class Likelihood:
     def start_sd(self, theta: FloatArray) -> FloatArray:
         """Prior sd (models, unknowns) of the unknown start, um."""
         column = self.actuator.columns(self.table.actuator(theta))
-        gain = self.actuator.hysteresis.gain(column, self.actuator.range_of(self.voltage))
+        gain = self.actuator.hysteresis.typical_slope(column, self.actuator.range_of(self.voltage))
         sd = np.repeat((gain * self.half_range)[:, np.newaxis], self.unknowns, axis=1)
         if (creep := self.actuator.creep) is not None and not self.from_rest:
             sd[:, -len(creep.times) :] *= creep.reach(column)

@@ -30,7 +30,7 @@ from bwbayes.model.actuator import OFFSET, Actuator
 from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
 from bwbayes.model.spec import Extent, ModelSpec
@@ -328,7 +328,7 @@ def every_declaration() -> Iterator[Declaration]:
     for stage in STAGES.values():
         yield from stage().parameters
     creep = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
-    yield from (*PolynomialGain().parameters, *creep.parameters, OFFSET)
+    yield from (*PolynomialNonlinearity().parameters, *creep.parameters, OFFSET)
 
 
 def require_known(

@@ -1,7 +1,7 @@
 """The actuator: voltage in, displacement out, for a batch of parameter vectors at once.
 
 It is put together from parts. A hysteresis operator makes the drive w of the voltage's path, to
-which a polynomial gain may add; linear dynamics follow the drive (equations (6) to (8) of the
+which a static nonlinearity may add; linear dynamics follow the drive (equations (6) to (8) of the
 paper), creep may add to what they do, and the sensor adds its offset. Further stages may stand
 before all that and behind it (:mod:`bwbayes.model.stage`). An
 :class:`Actuator` says which parts there are, what the voltage does between samples, and how long
@@ -25,9 +25,9 @@ from bwbayes.errors import InputError
 from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Declaration, Values, check, normal
 from bwbayes.model.filters import Filter
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import Hold, Sections
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, made
@@ -80,7 +80,7 @@ class Actuator:
         Sampling interval, s, above zero.
     hysteresis
         The operator that makes the drive.
-    gain
+    nonlinearity
         What is added to the drive without a memory.
     creep
         What is added to the displacement with a long one.
@@ -102,7 +102,7 @@ class Actuator:
     hold: Hold = "first"
     interval: float = 1e-3
     hysteresis: Operator = field(default_factory=BoucWen)
-    gain: PolynomialGain | None = None
+    nonlinearity: PolynomialNonlinearity | None = None
     creep: Creep | None = None
     span: Span | None = None
     stages: tuple[Stage, ...] = ()
@@ -123,7 +123,7 @@ class Actuator:
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
-        parts = (self.hysteresis, self.gain, self.filter, self.creep, *self.stages)
+        parts = (self.hysteresis, self.nonlinearity, self.filter, self.creep, *self.stages)
         return (*(d for part in parts if part is not None for d in part.parameters), OFFSET)
 
     @cached_property
@@ -325,7 +325,7 @@ class Actuator:
         return pass_stages(self.inputs, column, every, memories, self.timing, advance)
 
     def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
-        """Return what hysteresis and gain make of a path, V, (models, samples), um.
+        """Return what hysteresis and nonlinearity make of a path, V, (models, samples), um.
 
         The path is (samples,), or (models, samples) if each model has its own; beside the drive
         comes the operator's memory after it, in the second case one for each model.
@@ -338,8 +338,8 @@ class Actuator:
             drives, memories = zip(*parts, strict=True)
             return np.concatenate(drives), memories
         drive, after = self.hysteresis.advance(column, path, memory)
-        if self.gain is not None:
-            drive += self.gain.displacement(column, path)
+        if self.nonlinearity is not None:
+            drive += self.nonlinearity.displacement(column, path)
         return drive, after
 
     def columns(self, theta: FloatArray) -> dict[str, FloatArray]:
@@ -378,7 +378,7 @@ class Actuator:
         """Raise an InputError where a model is outside of the domain of a part."""
         self.hysteresis.check(column)
         self.filter.check(column)
-        for part in (self.gain, self.creep):
+        for part in (self.nonlinearity, self.creep):
             check(part.parameters if part else (), column, ("creep_growth",))
         for stage in self.stages:
             stage.check(column)

@@ -49,7 +49,7 @@ class Ranges:
     rounding: float = 0.0
 
     @property
-    def gain(self) -> float:
+    def slope(self) -> float:
         """Y/U, um/V."""
         return self.displacement / self.voltage
 
@@ -61,7 +61,7 @@ class Ranges:
     @property
     def reach(self) -> float:
         """What the voltage's distance from zero may add to offset and hysteresis, um."""
-        return self.displacement + self.gain * abs(self.bias)
+        return self.displacement + self.slope * abs(self.bias)
 
 
 @dataclass(frozen=True)

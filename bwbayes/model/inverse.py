@@ -121,7 +121,7 @@ class _Single:
     def slope(self) -> float:
         """A typical dw/du, um/V."""
         span = self.actuator.span or UNIT
-        return abs(float(np.ravel(self.actuator.hysteresis.gain(self.column, span))[0]))
+        return abs(float(np.ravel(self.actuator.hysteresis.typical_slope(self.column, span))[0]))
 
     def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
         """Return the voltage (samples,) for a displacement."""
@@ -187,7 +187,7 @@ class _Single:
                 break  # which does not come back
         raise InputError(
             f"reference: creep of {sum(strengths):.3g} of the drive cannot be undone; check the "
-            "model's creep and gain"
+            "model's creep and nonlinearity"
         )
 
     def _static(self, drive: FloatArray, within: Limits) -> FloatArray:

@@ -108,7 +108,7 @@ class Operator(ABC):
         return (span,)
 
     @abstractmethod
-    def gain(self, column: Values, span: Span) -> FloatArray:
+    def typical_slope(self, column: Values, span: Span) -> FloatArray:
         """Return a typical slope dw/du (models,), um/V: the scale of an unknown start."""
 
     def step(self, column: Values) -> HysteresisStep:  # noqa: ARG002  # it has none

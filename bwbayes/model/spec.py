@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, Self
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep, creep_times
-from bwbayes.model.gain import TERMS, PolynomialGain
 from bwbayes.model.linear import Hold
+from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, choose, made
 from bwbayes.model.stage import Side, Stage
@@ -43,7 +43,7 @@ class ModelSpec:
     ----------
     hysteresis
         The operator.
-    gain
+    nonlinearity
         Terms of the static nonlinearity.
     creep
         Whether there is creep, or the times of its lags, s.
@@ -62,7 +62,7 @@ class ModelSpec:
     """
 
     hysteresis: str = "bouc-wen"
-    gain: tuple[str, ...] = ()
+    nonlinearity: tuple[str, ...] = ()
     creep: bool | tuple[float, ...] = False
     creep_growth: bool = False
     dynamics: str = "lag"
@@ -98,7 +98,7 @@ class ModelSpec:
             hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
             interval,
             made("model.hysteresis", self.hysteresis, HYSTERESIS, self.options, Operator),
-            PolynomialGain(self.gain, extent.span) if self.gain else None,
+            PolynomialNonlinearity(self.nonlinearity, extent.span) if self.nonlinearity else None,
             creep,
             extent.span,
             tuple(made("model.stages", name, STAGES, {}, Stage) for name in self._in_order),
@@ -108,7 +108,12 @@ class ModelSpec:
     def chain(self) -> tuple[str, ...]:
         """Names of all stages that the model has, in the order of the signal's way."""
         further = {name: self._side_of(name) for name in self._in_order}
-        core = (self.hysteresis, *self.gain, self.dynamics, *(("creep",) if self.creep else ()))
+        core = (
+            self.hysteresis,
+            *self.nonlinearity,
+            self.dynamics,
+            *(("creep",) if self.creep else ()),
+        )
         inputs = [name for name, side in further.items() if side == "input"]
         outputs = [name for name, side in further.items() if side == "output"]
         return (*inputs, *core, *outputs)
@@ -128,8 +133,8 @@ class ModelSpec:
         if name in DYNAMICS:
             return self.with_parts(dynamics=name)
         if name in TERMS:
-            terms = tuple(term for term in TERMS if term in (*self.gain, name))
-            return self.with_parts(gain=terms)
+            terms = tuple(term for term in TERMS if term in (*self.nonlinearity, name))
+            return self.with_parts(nonlinearity=terms)
         if name == "creep":
             return self if self.creep else self.with_parts(creep=True)
         choose("model.stages", name, STAGES)
@@ -143,8 +148,10 @@ class ModelSpec:
         InputError
             The model has no such stage, or cannot do without.
         """
-        if name in self.gain:
-            return self.with_parts(gain=tuple(term for term in self.gain if term != name))
+        if name in self.nonlinearity:
+            return self.with_parts(
+                nonlinearity=tuple(term for term in self.nonlinearity if term != name)
+            )
         if name == "creep" and self.creep:
             return self.with_parts(creep=False, creep_growth=False)
         if name == self.dynamics and name != "none":
@@ -199,8 +206,8 @@ class ModelSpec:
     def __str__(self) -> str:
         """Return which parts there are, in a line."""
         parts = [self.hysteresis]
-        if self.gain:
-            parts.append(f"{' and '.join(self.gain)} gain")
+        if self.nonlinearity:
+            parts.append(f"{' and '.join(self.nonlinearity)} nonlinearity")
         if self.creep:
             parts.append("creep that grows with the voltage" if self.creep_growth else "creep")
         parts += self.stages

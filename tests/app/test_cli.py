@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.gain import TERMS
+from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.record import Record, read_record, write_record

@@ -81,6 +81,19 @@ def test_hints_are_near_in_meaning_or_all_keys(text: str, hint: str) -> None:
     assert hint in refused(text)
 
 
+@pytest.mark.parametrize(
+    ("table", "earlier", "now"),  # earlier names
+    [
+        ("model", "gain", "nonlinearity"),  # earlier name
+        ("validation.a", "own_offset", "estimate_offset"),  # earlier name
+        ("validation.a", "lead_in_from", "lead_in_start"),  # earlier name
+    ],
+)
+def test_an_earlier_key_is_told_the_new_one(table: str, earlier: str, now: str) -> None:
+    told = refused(f"{RECORD}[{table}]\n{earlier} = 1.0")
+    assert f"{table}.{earlier}: unknown key; did you mean {now}?" in told
+
+
 def test_no_error_shows_the_name_of_a_class() -> None:
     """Nor a word of the checker's own, for wrong values at every place of a config."""
     for key in ("record", "stand", "model", "sampling", "parameters", "validation", "truth"):
@@ -91,7 +104,11 @@ def test_no_error_shows_the_name_of_a_class() -> None:
 
 @pytest.mark.parametrize(
     ("table", "key", "text"),
-    [("model", "gain", "quadratic"), ("model", "terms", "b3"), ("record", "remarks", "noted")],
+    [
+        ("model", "nonlinearity", "quadratic"),
+        ("model", "terms", "b3"),
+        ("record", "remarks", "noted"),
+    ],
 )
 def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
     """In a config and as a keyword."""
@@ -193,7 +210,7 @@ def test_the_runs_that_come_with_the_package_can_be_read(path: Path) -> None:
 
 # Models in a line are what a config would say of them, and what cannot be read is one line
 
-BASE = ModelConfig(gain=["cubic"], creep=True, dynamics="none", hold="first", passive=False)
+BASE = ModelConfig(nonlinearity=["cubic"], creep=True, dynamics="none", hold="first", passive=False)
 
 
 def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
@@ -207,7 +224,7 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
     first, second, third = models.values()
     assert first == ModelConfig(dynamics="none", hold="first")
     assert (second.hysteresis, second.thresholds) == ("maxwell-slip", 4)
-    assert second.gain == ["quadratic", "cubic"]
+    assert second.nonlinearity == ["quadratic", "cubic"]
     assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")
 
 

@@ -43,7 +43,7 @@ def config_of(kind: str, folder: Path) -> Config:
 
 def test_a_quadratic_gain_is_added(tmp_path: Path) -> None:
     improved = improve_model(config_of("quadratic", tmp_path), tmp_path, QUIET)
-    assert "quadratic" in improved.model.gain
+    assert "quadratic" in improved.model.nonlinearity
     (note,) = improved.records["record"].remarks or [""]
     assert re.match(r"model improved: quadratic.* nats, RMSE .* um\)$", note)
 
@@ -64,9 +64,9 @@ def test_a_quadratic_gain_is_added_and_the_run_says_what_it_is_worth() -> None:
         )
     (note,) = [str(w.message) for w in caught if "model improved" in str(w.message)]
     assert re.match(
-        r"model improved: quadratic.* nats, RMSE .* um, held out .* um\); set gain", note
+        r"model improved: quadratic.* nats, RMSE .* um, held out .* um\); set nonlinearity", note
     )
-    assert "quadratic" in fit.problem.config.model.gain
+    assert "quadratic" in fit.problem.config.model.nonlinearity
     assert fit.validation["rest"].passed is not False
 
 

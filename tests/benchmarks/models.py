@@ -15,7 +15,7 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
@@ -102,12 +102,12 @@ def threads(posterior: Posterior, rounds: int, calls: int = 25) -> Table:
 
 
 # Hysteresis, dynamics, gain and creep of models that are read backwards.
-INVERTED: dict[str, tuple[Operator, str, PolynomialGain | None, Creep | None]] = {
+INVERTED: dict[str, tuple[Operator, str, PolynomialNonlinearity | None, Creep | None]] = {
     "bouc-wen": (BoucWen(), "none", None, None),
     "bouc-wen, lag": (BoucWen(), "lag", None, None),
     "bouc-wen, second-order": (BoucWen(), "second-order", None, None),
     "bouc-wen, lag, creep": (BoucWen(), "lag", None, cases.CREEP),
-    "bouc-wen, lag, gain": (BoucWen(), "lag", cases.GAIN, None),
+    "bouc-wen, lag, nonlinearity": (BoucWen(), "lag", cases.NONLINEARITY, None),
     "plays, lag": (Plays(10), "lag", None, None),
     "maxwell-slip, lag": (MaxwellSlip(10), "lag", None, None),
     "asymmetric bouc-wen, lag": (BoucWenAsymmetric(), "lag", None, None),
@@ -130,8 +130,8 @@ def inversion(rounds: int) -> Table:
     """
     voltage = signal("identification").sample(1000.0)[1][:SAMPLES]
     rows: list[dict[str, Cell]] = []
-    for name, (hysteresis, dynamics, gain, creep) in INVERTED.items():
-        actuator = Actuator(dynamics, "first", 1e-3, hysteresis, gain, creep, cases.SPAN)
+    for name, (hysteresis, dynamics, nonlinearity, creep) in INVERTED.items():
+        actuator = Actuator(dynamics, "first", 1e-3, hysteresis, nonlinearity, creep, cases.SPAN)
         theta = cases.theta(actuator, DRAWS, name)
         simulate = partial(actuator.displacement, theta, voltage, from_rest=True)
         invert = partial(_read_backwards, SampledModel.of(actuator, theta), simulate().mean(axis=0))

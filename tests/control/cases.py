@@ -9,8 +9,8 @@ from bwbayes.control.loop import LoopNoise
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -23,7 +23,7 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 SPAN = Span(-100.0, 100.0)
 HOLDS: tuple[Hold, ...] = ("first", "zero")
 
-GAIN = PolynomialGain(("quadratic", "cubic"), SPAN)
+NONLINEARITY = PolynomialNonlinearity(("quadratic", "cubic"), SPAN)
 CREEP = Creep((0.1, 1.0, 10.0), False, SPAN)
 GROWING = Creep((0.1, 1.0), True, SPAN)
 
@@ -32,16 +32,16 @@ ACTUATORS = {
     "bouc-wen": (BoucWen(), "none", None, None),
     "bouc-wen not passive": (BoucWen(passive=False), "lag", None, None),
     "bouc-wen, second-order": (BoucWen(), "second-order", None, None),
-    "bouc-wen, lag, gain": (BoucWen(), "lag", GAIN, None),
-    "bouc-wen with all": (BoucWen(), "second-order", GAIN, GROWING),
+    "bouc-wen, lag, nonlinearity": (BoucWen(), "lag", NONLINEARITY, None),
+    "bouc-wen with all": (BoucWen(), "second-order", NONLINEARITY, GROWING),
     "backlash-like, lag, creep": (BacklashLike(), "lag", None, CREEP),
-    "plays, lag, gain": (Plays(6), "lag", GAIN, None),
+    "plays, lag, nonlinearity": (Plays(6), "lag", NONLINEARITY, None),
     "bouc-wen, n = 1.7, lag": (BoucWen(), "lag", None, None),
-    "bouc-wen, n = 1.05 and gamma < 0": (BoucWen(), "none", GAIN, None),
+    "bouc-wen, n = 1.05 and gamma < 0": (BoucWen(), "none", NONLINEARITY, None),
     "bouc-wen-asymmetric, lag": (BoucWenAsymmetric(), "lag", None, None),
     "duhem, lag": (Duhem(odd=False), "lag", None, None),
     "linear, second-order, creep": (NoHysteresis(), "second-order", None, CREEP),
-    "maxwell-slip with all": (MaxwellSlip((5.0, 20.0, 70.0)), "lag", GAIN, GROWING),
+    "maxwell-slip with all": (MaxwellSlip((5.0, 20.0, 70.0)), "lag", NONLINEARITY, GROWING),
 }
 
 # Near Table 1 of the paper.
@@ -66,8 +66,8 @@ OTHERS = {
 
 def actuator(name: str, hold: Hold = "first", interval: float = 1e-3) -> Actuator:
     """Return an actuator."""
-    hysteresis, dynamics, gain, creep = ACTUATORS[name]
-    return Actuator(dynamics, hold, interval, hysteresis, gain, creep, SPAN)
+    hysteresis, dynamics, nonlinearity, creep = ACTUATORS[name]
+    return Actuator(dynamics, hold, interval, hysteresis, nonlinearity, creep, SPAN)
 
 
 def theta(made: Actuator, models: int = 1, name: str = "") -> FloatArray:

@@ -64,7 +64,7 @@ def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
     assert 5.0 == pytest.approx(compiled.run("forward", 0.0, command)[-1], abs=1e-12)
 
 
-@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, gain"])
+@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, nonlinearity"])
 @every_hold
 def test_a_value_that_cannot_be_used_holds_the_last_voltage(
     name: str, hold: Hold, tmp_path: Path
@@ -129,8 +129,8 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     column = actuator.columns(theta)
     memory = actuator.begin(column, voltage, from_rest=True)
     w = actuator.hysteresis.advance(column, voltage, memory)[0]
-    if actuator.gain is not None:
-        w = w + actuator.gain.displacement(column, voltage)
+    if actuator.nonlinearity is not None:
+        w = w + actuator.nonlinearity.displacement(column, voltage)
     inputs = [w[0]]
     if actuator.creep is not None and actuator.creep.growing:
         inputs.append(actuator.creep.drive(column, w, voltage)[0])
@@ -142,7 +142,7 @@ def test_the_linear_part_is_the_recursion(name: str, hold: Hold) -> None:
     np.testing.assert_allclose(moved, expected - expected[0], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, gain"])
+@pytest.mark.parametrize("name", ["bouc-wen with all", "plays, lag, nonlinearity"])
 def test_the_numbers_have_units_and_are_those_of_the_model(name: str) -> None:
     made = of(name, "first")
     numbers = json.loads(json.dumps(made.numbers(), allow_nan=False))

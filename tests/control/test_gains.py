@@ -16,7 +16,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from tests.control import cases
 
-QUICK = {"bouc-wen", "bouc-wen, second-order", "plays, lag, gain"}
+QUICK = {"bouc-wen", "bouc-wen, second-order", "plays, lag, nonlinearity"}
 every_actuator = pytest.mark.parametrize(
     "name",
     [

@@ -66,7 +66,7 @@ def slowly(
     return rms, largest
 
 
-@pytest.mark.parametrize("name", ["bouc-wen, second-order", "plays, lag, gain"])
+@pytest.mark.parametrize("name", ["bouc-wen, second-order", "plays, lag, nonlinearity"])
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_the_loop_is_the_slow_one(name: str, delay: int) -> None:
     actuator, theta, rows = of(name, 2, 6)

@@ -27,8 +27,8 @@ def test_slopes_lie_within_their_bounds(name: str) -> None:
     column = actuator.columns(theta)
     memory = actuator.begin(column, path, from_rest=True)
     w = actuator.hysteresis.advance(column, path, memory)[0]
-    if actuator.gain is not None:
-        w = w + actuator.gain.displacement(column, path)
+    if actuator.nonlinearity is not None:
+        w = w + actuator.nonlinearity.displacement(column, path)
     moves = np.diff(path) != 0
     slopes = np.diff(w)[:, moves] / np.diff(path)[moves]
     assert (slopes >= least[:, np.newaxis] - 1e-9).all()

@@ -45,7 +45,7 @@ def problem(**keys: Any) -> Problem:
 
 def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -> None:
     """With a gain about another voltage, and creep; what C makes counts from zero volts as well."""
-    of = problem(gain=["quadratic"], creep=[0.1, 1.0])
+    of = problem(nonlinearity=["quadratic"], creep=[0.1, 1.0])
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
     asked = shaped("sine", INTERVAL, 10.0, 2.0, middle=15.0)
     command = compensated(of, asked, flat, from_rest=True).voltage

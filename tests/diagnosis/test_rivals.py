@@ -109,8 +109,10 @@ def test_right_model_keeps_its_bands(tmp_path: Path) -> None:
     [
         ModelSpec(),
         ModelSpec("duhem", creep=True, creep_growth=True),
-        ModelSpec(gain=("quadratic", "cubic"), stages=("backlash",)),
-        ModelSpec("plays", gain=("cubic",), stages=("backlash", "saturation", "sensor-curve")),
+        ModelSpec(nonlinearity=("quadratic", "cubic"), stages=("backlash",)),
+        ModelSpec(
+            "plays", nonlinearity=("cubic",), stages=("backlash", "saturation", "sensor-curve")
+        ),
     ],
 )
 def test_there_is_one_rival_of_each_family(spec: ModelSpec) -> None:

@@ -88,7 +88,7 @@ def moving(
     """Cut a record out of a running drive, with readings missing at random."""
     actuator = Actuator(dynamics, hold, INTERVAL, **(parts or {}))
     voltage = decaying_sine(300)[100:]
-    plain = replace(actuator, gain=None, creep=None)
+    plain = replace(actuator, nonlinearity=None, creep=None)
     displacement = ring_bender(plain, noise, voltage, 3) + 5 * np.exp(-np.arange(200) / 3)
     lost = np.random.default_rng(4).uniform(size=200) < missing
     displacement[lost | (np.arange(200) % stride != 0)] = np.nan

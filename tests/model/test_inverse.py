@@ -14,10 +14,10 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inverse import inverse
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, made
 from bwbayes.record.teststand import RingBender
@@ -105,7 +105,9 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
     theta = of.only.table.actuator(drawn_from(of, 1 if integrated or parts else 4))
     if parts:
         creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
-        actuator = replace(actuator, gain=PolynomialGain(reference=SPAN), creep=creep)
+        actuator = replace(
+            actuator, nonlinearity=PolynomialNonlinearity(reference=SPAN), creep=creep
+        )
         names = of.likelihood.actuator.parameters
         theta = theta[:, [i for i, n in enumerate(names) if n in actuator.parameters]]
     calm(actuator, theta)
@@ -155,9 +157,9 @@ def test_along_any_path(name: str, turns: list[tuple[float, int]], from_rest: bo
 @pytest.mark.parametrize("parts", [True, False])
 def test_dynamics_gain_and_creep_are_undone(hold: Hold, dynamics: str, parts: bool) -> None:
     """With a held voltage as with straight lines, for a reference that begins at rest."""
-    gain = PolynomialGain(reference=SPAN) if parts else None
+    nonlinearity = PolynomialNonlinearity(reference=SPAN) if parts else None
     creep = Creep((0.1, 1.0), growing=True, reference=SPAN) if parts else None
-    actuator = Actuator(dynamics, hold, 1e-3, gain=gain, creep=creep, span=SPAN)
+    actuator = Actuator(dynamics, hold, 1e-3, nonlinearity=nonlinearity, creep=creep, span=SPAN)
     assert_returned(actuator, theta_of(actuator), smooth())
 
 

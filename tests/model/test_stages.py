@@ -27,10 +27,10 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
 from bwbayes.model.linear import Hold
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.duhem import Duhem
@@ -167,7 +167,10 @@ def test_chains_agree_in_both_engines_and_in_pieces(
 ) -> None:
     parts = {}
     if rich:
-        parts = {"gain": PolynomialGain(reference=SPAN), "creep": Creep((0.1, 1.0), True, SPAN)}
+        parts = {
+            "nonlinearity": PolynomialNonlinearity(reference=SPAN),
+            "creep": Creep((0.1, 1.0), True, SPAN),
+        }
     made, voltage = actuator(*names, hold=hold, operator=operator, **parts), drive(400, seed)
     models = theta(made)
     whole = made.displacement(models, voltage, from_rest=from_rest)

@@ -10,7 +10,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
 from bwbayes.prediction.loops import Estimate
 from bwbayes.prediction.prediction import forecast
@@ -93,8 +93,10 @@ def test_creep_is_the_sum_of_its_lags() -> None:
 
 
 def test_a_gain_counts_from_the_displacement_before_the_step() -> None:
-    gain = PolynomialGain(("quadratic",), Span(-20.0, 100.0))
-    of, draws = problem(Actuator("lag", "first", INTERVAL, gain=gain), quadratic=3.0)
+    nonlinearity = PolynomialNonlinearity(("quadratic",), Span(-20.0, 100.0))
+    of, draws = problem(
+        Actuator("lag", "first", INTERVAL, nonlinearity=nonlinearity), quadratic=3.0
+    )
     settled = measured(of, draws, Step(50.0, 5.0))["level_um"]
     added = 3.0 * ((50 - 40) ** 2 - 40**2) / 60**2
     assert level(50.0) + added == pytest.approx(settled.mean)

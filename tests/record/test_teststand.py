@@ -160,10 +160,10 @@ EVERY = {name: f"hysteresis = '{name}'\n" for name in HYSTERESIS} | {
     "plays at given thresholds": "hysteresis = 'plays'\nthresholds = [5.0, 20.0]\n",
     "no dynamics": "hysteresis = 'prandtl-ishlinskii'\ndynamics = 'none'\n",
     "second order": "hysteresis = 'prandtl-ishlinskii'\ndynamics = 'second-order'\n",
-    "gain": "gain = ['quadratic', 'cubic']\n",
+    "gain": "nonlinearity = ['quadratic', 'cubic']\n",
     "creep": "creep = true\n",
     "creep that grows": "creep = [0.5, 5.0]\ncreep_growth = true\n",
-    "all": "hysteresis = 'preisach'\ngain = ['quadratic']\ncreep = [2.0]\n",
+    "all": "hysteresis = 'preisach'\nnonlinearity = ['quadratic']\ncreep = [2.0]\n",
 }
 
 
@@ -240,7 +240,7 @@ def test_every_operator_is_an_actuator_of_the_ring_benders_size(name: str) -> No
         ("creep_growth = true\n", "", "stand.model.creep_growth: there is no creep"),
         ("", "bete = 0.1\n", "test stand: bete: its actuator has no such parameter; .*beta"),
         ("", "alpha = -1.0\n", "test stand: alpha: -1 "),
-        ("gain = ['square']\n", "", "stand.gain: 'square' is unknown"),
+        ("nonlinearity = ['square']\n", "", "stand.nonlinearity: 'square' is unknown"),
     ],
 )
 def test_what_the_stand_cannot_be_is_said_in_one_line(

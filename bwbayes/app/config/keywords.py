@@ -6,8 +6,9 @@ same words. ``parameters`` and ``validation`` are tables, as in a config.
 
 ``bouc-wen; bouc-wen + quadratic; maxwell-slip(thresholds=4) + creep`` are three models: of each the
 first word is the hysteresis operator, with its options in brackets; what follows after plus signs
-are terms of the gain, ``creep``, linear dynamics and noise, by the names that a config gives them.
-What is not said stays as the config has it, but for gain and creep, which are left out.
+are terms of the nonlinearity, ``creep``, linear dynamics and noise, by the names that a config
+gives them. What is not said stays as the config has it, but for nonlinearity and creep, which are
+left out.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from bwbayes.app.config.keys import one_line, synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.gain import TERMS
+from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES
 from bwbayes.record.record import Record
 
@@ -167,7 +168,7 @@ def _changes(name: str) -> dict[str, Any]:
     if operator not in HYSTERESIS and ":" not in operator:
         raise InputError(f"models: {operator!r} is unknown; {suggestion(operator, HYSTERESIS)}")
     changes: dict[str, Any] = dict.fromkeys(OPTIONS)
-    changes |= {"hysteresis": operator, "gain": [], "creep": False, "creep_growth": False}
+    changes |= {"hysteresis": operator, "nonlinearity": [], "creep": False, "creep_growth": False}
     changes["stages"] = []
     try:
         stated = tomllib.loads(f"options = {{ {options} }}")["options"]
@@ -181,7 +182,7 @@ def _changes(name: str) -> dict[str, Any]:
     changes |= stated
     for word in (term.strip() for term in others):
         if word in TERMS:
-            changes["gain"] = [*changes["gain"], word]
+            changes["nonlinearity"] = [*changes["nonlinearity"], word]
         elif word == "creep":
             changes["creep"] = True
         elif word in STAGES:

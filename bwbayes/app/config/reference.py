@@ -22,7 +22,7 @@ from bwbayes.inference.noise import NOISES
 from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
-from bwbayes.model.gain import TERMS, PolynomialGain
+from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES, made
 from bwbayes.record.true_values import RING_BENDER
 from bwbayes.record.waveforms import signal_names
@@ -32,7 +32,7 @@ Maker = Callable[..., Any]
 # The kinds of parts by the key that chooses them, in the order of the signal's way.
 PARTS: Mapping[str, Mapping[str, Maker]] = {
     "hysteresis": HYSTERESIS,
-    "gain": {name: partial(PolynomialGain, (name,)) for name in TERMS},
+    "nonlinearity": {name: partial(PolynomialNonlinearity, (name,)) for name in TERMS},
     "creep": {"creep": partial(Creep, (0.1, 1.0, 10.0), growing=True)},
     "dynamics": DYNAMICS,
     "stages": STAGES,
@@ -42,7 +42,7 @@ PARTS: Mapping[str, Mapping[str, Maker]] = {
 # What a text in a config may be, by its key's name, besides a choice of its own.
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "hysteresis": (*HYSTERESIS, "or module:Class"),
-    "gain": tuple(TERMS),
+    "nonlinearity": tuple(TERMS),
     "dynamics": (*DYNAMICS, "or module:Class"),
     "stages": (*STAGES, "or module:Class"),
     "noise": ("auto", *NOISES, "or module:Class"),

@@ -173,10 +173,8 @@ class ActuatorConfig(ConfigTable):
 
     hysteresis: str = key("bouc-wen", example='"prandtl-ishlinskii"')
     """The hysteresis operator."""
-    gain: Texts = key([], example='["quadratic", "cubic"]')
-    """Terms of the voltage without memory, about the middle of its range: the asymmetry of measured
-    loops.
-    """
+    nonlinearity: Texts = key([], example='["quadratic", "cubic"]', called="gain")
+    """Static nonlinearity: terms about the middle of the voltage's range, for asymmetric loops."""
     creep: bool | list[float] = key(False, example="true")
     """Slow growth after a step: true for a lag per decade of time, or the lags' times in s."""
     creep_growth: bool = key(False, example="true")
@@ -202,7 +200,7 @@ class ActuatorConfig(ConfigTable):
         options = {name: _frozen(getattr(self, name)) for name in OPTIONS}
         return ModelSpec(
             self.hysteresis,
-            tuple(self.gain),
+            tuple(self.nonlinearity),
             _frozen(self.creep),
             self.creep_growth,
             self.dynamics,

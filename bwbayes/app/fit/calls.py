@@ -126,9 +126,9 @@ def compare(
         What :func:`fit` takes: a record, its file, or a list or dict of several records; the file
         of a config; or two or more fits and folders of runs.
     models
-        Models to fit to a record, as on the command line: an operator, then gain, creep, dynamics
-        and noise after plus signs; in one text with semicolons between them, or in a list. By
-        default seven usual ones.
+        Models to fit to a record, as on the command line: an operator, then nonlinearity, creep,
+        dynamics and noise after plus signs; in one text with semicolons between them, or in a list.
+        By default seven usual ones.
     folder
         Where page, table and numbers go, and the runs of the models: after an interruption those
         that are there go on. By default nothing is left but the comparison.

@@ -63,7 +63,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     sums = np.empty((lanes.SUMS, len(theta)))
     record, sections = (voltage, likelihood.values, gaps), actuator.sections(column)
     # What further stages leave is simulated beforehand, and only follows here.
-    core = replace(actuator, gain=None, stages=()) if actuator.stages else actuator
+    core = replace(actuator, nonlinearity=None, stages=()) if actuator.stages else actuator
     together, make = shared(core, voltage), simulated if actuator.stages else physics
     for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))

@@ -6,7 +6,7 @@ several models a step and nothing larger than a cache is written. A few dozen sa
 three stages:
 
     drive         the hysteresis (:mod:`bwbayes.inference.compiled.stages`)
-    displacement  gain, linear dynamics, creep (:mod:`bwbayes.inference.compiled.motion`)
+    displacement  nonlinearity, linear dynamics, creep (:mod:`bwbayes.inference.compiled.motion`)
     innovations   the noise's filter (:mod:`bwbayes.inference.compiled.filter`)
 
 The state of all models is one flat array (:mod:`bwbayes.inference.compiled.lanes`).
@@ -213,7 +213,7 @@ def sums(
         The stage that makes the drive, what models are in it (groups, lanes times rows), and what
         it knows of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     curve, lags, growth
-        What gain and creep know, as in :mod:`bwbayes.inference.compiled.motion`.
+        What nonlinearity and creep know, as in :mod:`bwbayes.inference.compiled.motion`.
     """
     result, state = np.empty((SUMS, len(models) * LANES)), _aligned(STATE)
     group, drive = _aligned(groups.shape[1]), _aligned(PIECE * LANES)

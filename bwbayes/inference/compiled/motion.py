@@ -1,7 +1,8 @@
 """From the operator's drive to the displacement, for ``LANES`` models side by side.
 
-The gain adds to the drive, the dynamics follow it, and the lags of the creep beside them. All of
-them see the drive's distance from that of the first sample, at which they may have been at rest.
+The nonlinearity adds to the drive, the dynamics follow it, and the lags of the creep beside them.
+All of them see the drive's distance from that of the first sample, at which they may have been at
+rest.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ PIECE = 64
 
 
 def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what gain and creep of all models have in common, as :func:`displace` takes it."""
+    """Return what :func:`displace` takes of nonlinearity and creep for all models alike."""
     curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.zeros(voltage.size)
-    if actuator.gain is not None:
-        x = actuator.gain.scaled(voltage)
+    if actuator.nonlinearity is not None:
+        x = actuator.nonlinearity.scaled(voltage)
         curve = np.stack([x**2 - x[0] ** 2, x**3 - x[0] ** 3], axis=1)
     if actuator.creep is not None:
         recursions = actuator.creep.recursions(1, actuator.interval, actuator.hold)
@@ -51,10 +52,10 @@ def physics(
 ) -> dict[str, FloatArray]:
     """Return what models (models,) are without a noise, by the names of ``PARAMETERS``.
 
-    ``sections`` are the actuator's; ``equilibrium`` (models,) is w₀ without gain, um.
+    ``sections`` are the actuator's; ``equilibrium`` (models,) is w₀ without nonlinearity, um.
     """
-    if actuator.gain is not None:
-        equilibrium = equilibrium + actuator.gain.displacement(column, voltage[:1])[:, 0]
+    if actuator.nonlinearity is not None:
+        equilibrium = equilibrium + actuator.nonlinearity.displacement(column, voltage[:1])[:, 0]
     level, rows = column["offset"] + equilibrium, {"equilibrium": equilibrium}
     if actuator.creep is not None:
         crept = actuator.creep.drive(column, equilibrium[:, np.newaxis], voltage[:1])[:, 0]
@@ -103,9 +104,9 @@ def displace(
 ) -> None:
     """Put the displacement where the drive's distance from rest is, of samples first to last.
 
-    ``curve`` (samples, 2) are x² − x₀² and x³ − x₀³ of the gain, or empty; ``lags`` (times, 3) each
-    lag's two coefficients of the drive and the part that it keeps of itself; ``growth`` (samples,)
-    is |u| / U, or zero.
+    ``curve`` (samples, 2) are x² − x₀² and x³ − x₀³ of the nonlinearity, or empty; ``lags`` (times,
+    3) each lag's two coefficients of the drive and the part that it keeps of itself; ``growth``
+    (samples,) is |u| / U, or zero.
     """
     if curve.size > 0:
         _bend(state, curve, first, last, drive)

@@ -1,8 +1,8 @@
 """The displacement on the compiled engine: models that walk along a voltage, piece by piece.
 
-What the likelihood does sample by sample, without its noise: the same stages, gain and dynamics,
-for ``LANES`` models side by side. Where stages before the hysteresis give each model a voltage of
-its own, hysteresis and gain are worked out one model after the other.
+What the likelihood does sample by sample, without its noise: the same stages, nonlinearity and
+dynamics, for ``LANES`` models side by side. Where stages before the hysteresis give each model a
+voltage of its own, hysteresis and nonlinearity are worked out one model after the other.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _walk_core(
     operator, compiled = actuator.hysteresis, None
     if actuator.inputs:
         advance, memory = _of_own(actuator, column, voltage, from_rest)
-        actuator = replace(actuator, gain=None)  # it is in the drive
+        actuator = replace(actuator, nonlinearity=None)  # it is in the drive
     else:
         advance = partial(advance_of(operator), operator, column)
         memory = actuator.begin(column, voltage, from_rest=from_rest)
@@ -141,8 +141,8 @@ def _of_own(
             drive, memory = actuator.drive(column, driven, memory)
         else:
             drive, memory = drive_of_own(step, memory, driven)
-            if actuator.gain is not None:
-                drive += actuator.gain.displacement(column, driven)
+            if actuator.nonlinearity is not None:
+                drive += actuator.nonlinearity.displacement(column, driven)
         return drive, (inputs, memory)
 
     return advance, (inputs, memory)

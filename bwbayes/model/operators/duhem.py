@@ -68,7 +68,7 @@ class Duhem(OneState):
             "growth of the hysteresis with the voltage's square",
             lambda context: Distribution(
                 "halfnormal",
-                {"scale": rounded(0.3 * context.ranges.gain / context.ranges.farthest**2)},
+                {"scale": rounded(0.3 * context.ranges.slope / context.ranges.farthest**2)},
             ),
             floor=0.0,
             reaches_floor=True,
@@ -93,7 +93,7 @@ class Duhem(OneState):
             "um/V^2",
             r"\alpha_1",
             "growth of the hysteresis with the voltage",
-            lambda context: normal(0.0, 0.2 * context.ranges.gain / context.ranges.farthest),
+            lambda context: normal(0.0, 0.2 * context.ranges.slope / context.ranges.farthest),
             bounds=_alpha1_bounds,
             stated_bounds="beta^2 (4 alpha alpha2 - alpha1^2) >= alpha2^2",
             loop=True,
@@ -122,7 +122,7 @@ class Duhem(OneState):
         curve, strength = ([column.get(name, nothing) for name in group] for group in names)
         return DuhemStep.of(curve, strength, column["beta"], column["beta"])
 
-    def gain(self, column: Values, span: Span) -> FloatArray:
+    def typical_slope(self, column: Values, span: Span) -> FloatArray:
         """Return the mean of f′ over the span."""
         low, high = span
         even = 0.0 if self.odd else column["d2"]
@@ -160,7 +160,7 @@ def _coefficient(name: str, power: int, label: str, description: str) -> Declara
         label,
         description,
         lambda context: normal(
-            0.0, 0.1 * context.ranges.gain / context.ranges.farthest ** (power - 1)
+            0.0, 0.1 * context.ranges.slope / context.ranges.farthest ** (power - 1)
         ),
         loop=True,
     )

@@ -187,7 +187,7 @@ class RemembersExtrema(Operator):
         """Return ranges about the span's middle, evenly from next to nothing to all of it."""
         return narrower(span)
 
-    def gain(self, column: Values, span: Span) -> FloatArray:
+    def typical_slope(self, column: Values, span: Span) -> FloatArray:
         """Return the mean slope from the span's lowest to its highest voltage (models,), um/V."""
         branch, width = self.branch(column), span.high - span.low
         if not width > 0:

@@ -54,7 +54,7 @@ class MaxwellSlip(Plays):
             "um/V",
             "d",
             "displacement per volt of long sweeps, when all elements slip",
-            lambda ranges: 1.4 * ranges.gain,
+            lambda ranges: 1.4 * ranges.slope,
             0.5,
             bounds=lambda earlier: (_held(earlier), np.inf),
             stated_bounds="the sum of all alpha <= d",

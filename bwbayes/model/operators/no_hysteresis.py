@@ -31,7 +31,7 @@ class NoHysteresis(OneState):
     @property
     def parameters(self) -> tuple[Declaration, ...]:
         """d, and a placeholder for the initial state."""
-        slope = replace(d(), default=lambda c: lognormal(c.ranges.gain, 0.6), bounds=None)
+        slope = replace(d(), default=lambda c: lognormal(c.ranges.slope, 0.6), bounds=None)
         return slope, replace(initial(), default=lambda _: 0.0)
 
     def first_state(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002  # any

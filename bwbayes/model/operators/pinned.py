@@ -79,7 +79,7 @@ class Pinned(OneState):
                 "um/V",
                 r"d",
                 "slope of the displacement without hysteresis, at zero volts",
-                lambda ranges: 1.2 * ranges.gain,
+                lambda ranges: 1.2 * ranges.slope,
                 0.6,
                 aliases=("gain", "d33"),
             ),

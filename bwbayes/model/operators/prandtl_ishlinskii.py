@@ -26,7 +26,7 @@ SLOPE = positive(
     "um/V",
     "d",
     "displacement per volt just after a turn",
-    lambda ranges: 0.7 * ranges.gain,
+    lambda ranges: 0.7 * ranges.slope,
     0.6,
 )
 
@@ -61,7 +61,7 @@ class PrandtlIshlinskii(RemembersExtrema):
                 "um/V",
                 r"\alpha",
                 "displacement per volt that long sweeps add",
-                lambda ranges: 0.7 * ranges.gain,
+                lambda ranges: 0.7 * ranges.slope,
                 reaches_floor=True,
             ),
             positive(
@@ -158,7 +158,7 @@ class Plays(RemembersExtrema):
                 "um/V",
                 rf"{symbol}_{{{j}}}",
                 f"weight of {element} {j}",
-                lambda ranges: 0.4 / self.count * ranges.gain,
+                lambda ranges: 0.4 / self.count * ranges.slope,
                 reaches_floor=True,
             )
             for j in range(1, self.count + 1)

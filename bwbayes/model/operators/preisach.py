@@ -29,7 +29,7 @@ DENSITY = (
         "um/V^2",
         r"\alpha_R",
         "growth of the slope with the length of a branch, about zero volts",
-        lambda ranges: 0.4 * ranges.gain / ranges.voltage,
+        lambda ranges: 0.4 * ranges.slope / ranges.voltage,
         reaches_floor=True,
     ),
     positive(

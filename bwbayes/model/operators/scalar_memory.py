@@ -46,7 +46,7 @@ class OneState(Operator):
         """Tell where α < d, or one of them is missing: there the initial curve rises."""
         return np.asarray(column.get("alpha", -np.inf) < column.get("d", np.inf))
 
-    def gain(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
+    def typical_slope(self, column: Values, span: Span) -> FloatArray:  # noqa: ARG002  # the same anywhere
         """Return d."""
         return column["d"]
 
@@ -132,7 +132,7 @@ def d() -> Declaration:
         r"d",
         "piezoelectric coefficient",
         # A drive that is small for the loop shows d - α, which may be half of d.
-        lambda ranges: 1.6 * ranges.gain,
+        lambda ranges: 1.6 * ranges.slope,
         0.6,
         bounds=lambda earlier: (earlier["alpha"], np.inf),
         aliases=("gain", "d33"),
@@ -146,7 +146,7 @@ def alpha() -> Declaration:
         "um/V",
         r"\alpha",
         "hysteretic displacement per volt at h = 0",
-        lambda ranges: 0.7 * ranges.gain,
+        lambda ranges: 0.7 * ranges.slope,
         bounds=lambda earlier: (-np.inf, earlier["d"]),
         stated_bounds="0 < alpha < d",
         pressed={

@@ -41,7 +41,7 @@ class SensorCurve(Stage):
             "um",
             "m",
             "displacement in the middle of the sensor's curve",
-            lambda context: context.ranges.gain * context.ranges.bias,
+            lambda context: context.ranges.slope * context.ranges.bias,
         ),
         Declaration(
             "sensor_half",

@@ -17,7 +17,7 @@ from bwbayes.inference.map_estimate import fit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.gain import PolynomialGain
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -48,9 +48,9 @@ def posterior(
     """Return a posterior of a short record with an operator."""
     operator = made("hysteresis", name, HYSTERESIS, options or {})
     voltage = decaying_sine(300)[60:]
-    gain = PolynomialGain() if parts else None
+    nonlinearity = PolynomialNonlinearity() if parts else None
     creep = Creep((0.1, 1.0), growing=True) if parts else None
-    actuator = Actuator("lag", "first", 0.01, operator, gain, creep, Span(-100.0, 100.0))
+    actuator = Actuator("lag", "first", 0.01, operator, nonlinearity, creep, Span(-100.0, 100.0))
     displacement = 0.6 * voltage + np.random.default_rng(1).normal(size=voltage.size)
     return posterior_of(voltage, displacement, actuator, "discrepancy", {}, from_rest=from_rest)
 

@@ -13,21 +13,21 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.declaration import Values
-from bwbayes.model.gain import PolynomialGain
 from bwbayes.model.linear import Hold
+from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
 from tests.inference.test_likelihood import assert_dense, moving, responses
 
 REFERENCE = Span(-90.0, 80.0)
-GAIN = PolynomialGain(reference=REFERENCE)
+NONLINEARITY = PolynomialNonlinearity(reference=REFERENCE)
 CREEP = Creep((0.1, 1.0, 10.0), reference=REFERENCE)
 GROWING = replace(CREEP, growing=True)
 
 PARTS: dict[str, dict[str, Any]] = {
-    "gain": {"gain": GAIN},
+    "nonlinearity": {"nonlinearity": NONLINEARITY},
     "creep": {"creep": CREEP},
     "growing": {"creep": GROWING},
-    "both": {"gain": GAIN, "creep": GROWING},
+    "both": {"nonlinearity": NONLINEARITY, "creep": GROWING},
 }
 
 

@@ -1,4 +1,4 @@
-"""Polynomial gain: what an actuator's displacement has of the voltage's square and cube.
+"""Static nonlinearity: quadratic and cubic terms of the voltage in the displacement.
 
 Measured loops are not symmetric about their middle; a curve without memory beside the hysteresis
 says most of that. It is taken about the middle of the voltage's range and in units of half of it,
@@ -37,8 +37,8 @@ TERMS = {
 
 
 @dataclass(frozen=True)
-class PolynomialGain:
-    """Polynomial gain: displacement q₂ x² + q₃ x³ in um, with x = (u − m)/U.
+class PolynomialNonlinearity:
+    """Static nonlinearity: displacement q₂ x² + q₃ x³ in um, with x = (u − m)/U.
 
     m and U are the middle and half of the range of the voltage u, V; q₂ and q₃ are in um.
 
@@ -61,7 +61,7 @@ class PolynomialGain:
     def __post_init__(self) -> None:
         for term in self.terms:
             if term not in TERMS:
-                raise InputError(f"gain: {term!r} is unknown; {suggestion(term, TERMS)}")
+                raise InputError(f"nonlinearity: {term!r} is unknown; {suggestion(term, TERMS)}")
 
     @property
     def parameters(self) -> tuple[Declaration, ...]:
@@ -97,7 +97,7 @@ class PolynomialGain:
         )
 
     def powers(self, column: Values) -> FloatArray:
-        """Return the coefficients (4, models) of 1, u, u² and u³, um/Vᵏ, that make up the gain."""
+        """Return the coefficients (4, models) of 1, u, u² and u³, um/Vᵏ, of the nonlinearity."""
         models = np.broadcast(*column.values()).size
         coefficients = np.zeros((4, models))
         half = self.reference.half
