@@ -304,3 +304,78 @@ def _(folder: Path) -> Written:
     stamps = np.datetime64("2026-03-03", "us") + np.rint(1e6 * TIME).astype("m8[us]")
     np.savez(folder / "a.npz", time=stamps, voltage_V=VOLTAGE, displacement_um=DISPLACEMENT)
     return Written(folder / "a.npz")
+
+
+def _table(path: Path, head: str, *columns: Any, separator: str = "\t", end: str = "") -> Path:
+    rows = (separator.join(f"{value:.6f}" for value in row) for row in zip(*columns, strict=True))
+    path.write_text("\n".join([head, *rows, end]), encoding="utf-8")
+    return path
+
+
+@_maker("ferroelectric tester, electrodes of either polarity")
+def _(folder: Path) -> Written:
+    head = (
+        "Result\nHysteresis Amplitude [V]: 60\nTable 1\nTime [s]\tV+ [V]\tV- [V]\tI1 [A]\tD1 [nm]"
+    )
+    columns = TIME, VOLTAGE, -VOLTAGE, np.cos(TIME), 1e3 * DISPLACEMENT
+    return Written(_table(folder / "a.dat", head, *columns), {"voltage": "V+ [V]"})
+
+
+@_maker("catman, channels and devices below the names")
+def _(folder: Path) -> Written:
+    head = (
+        "HBM_CATMAN_DATAFILE\nVersion:\t5.2\n\n"
+        '"Zeit 1 [s]"\t"U_Piezo [V]"\t"Weg 1 [µm]"\n"CH=1"\t"CH=2"\t"CH=3"\n"Auto"\t"MX"\t"MX"'
+    )
+    return Written(_table(folder / "a.txt", head, *COLUMNS))
+
+
+@_maker("Igor, waves as text")
+def _(folder: Path) -> Written:
+    head = "IGOR\nWAVES/D t_s, voltage_V, pos_nm\nBEGIN"
+    columns = np.full(SAMPLES, ""), TIME, VOLTAGE, 1e3 * DISPLACEMENT
+    rows = ("\t".join(map(str, row)) for row in zip(*columns, strict=True))
+    end = 'END\nX SetScale/P x 0,0.005,"s", voltage_V\n'
+    (folder / "a.itx").write_text("\n".join([head, *rows, end]))
+    return Written(folder / "a.itx")
+
+
+@_maker("potentiostat, voltages against a reference")
+def _(folder: Path) -> Written:
+    head = "EXPLAIN\nCURVE\tTABLE\t600\nPt\tT\tVf\tIm\tPos\n#\ts\tV vs. Ref.\tA\tum"
+    path = _table(folder / "a.dta", head, np.arange(SAMPLES), *COLUMNS[:2], TIME**2, DISPLACEMENT)
+    return Written(path, {"voltage": "Vf"})
+
+
+@_maker("controller's scope, a clock beside each channel and settings above")
+def _(folder: Path) -> Written:
+    head = "Name\tU\tName\tPos\nSampleTime[ms]\t5\tSampleTime[ms]\t5\nUnit\tV\tUnit\tum\n"
+    path = _table(folder / "a.csv", head, 1e3 * TIME, VOLTAGE, 1e3 * TIME, DISPLACEMENT)
+    columns = {"time": "1", "voltage": "2", "displacement": "4"}
+    return Written(path, columns, {"time": "ms", "voltage": "V", "displacement": "um"})
+
+
+@_maker("oscilloscope, units behind a preposition")
+def _(folder: Path) -> Written:
+    path = _table(folder / "a.csv", '"in s","CH1 in V","CH2 in V"', *COLUMNS, separator=",")
+    return Written(path, {"voltage": "CH1 in V", "displacement": "CH2 in V"}, MICRONS)
+
+
+@_maker("oscilloscope, settings in columns of their own")
+def _(folder: Path) -> Written:
+    rows = [f",,,{t:.6f},{v:.6f},{x:.6f}" for t, v, x in zip(*COLUMNS, strict=True)]
+    settings = {"Record Length": 600, "Sample Interval": 0.005, "Trigger Point": 1, "Source": "CH1"}
+    for row, (name, value) in enumerate(settings.items()):
+        rows[row] = f"{name},{value}{rows[row][1:]}"
+    (folder / "a.csv").write_text("\n".join([*rows, ""]))
+    return Written(folder / "a.csv", dict(zip(UNITS, "456", strict=True)), UNITS)
+
+
+@_maker("recorder, settings above fields that begin with a separator")
+def _(folder: Path) -> Written:
+    head = '"Model","DL850"\n"TraceName","CH1","CH2"\n"BlockSize",600,600\n"SampleRate",200,200\n'
+    rows = [f",{v:.5f},{x:.5f}," for v, x in zip(*COLUMNS[1:], strict=True)]
+    text = "\n".join([f'{head}"HResolution",5.0e-03,5.0e-03\n"HOffset",0.0,0.0\n', *rows, ""])
+    (folder / "a.csv").write_text(text)
+    columns = {"voltage": "2", "displacement": "3"}
+    return Written(folder / "a.csv", columns, {"voltage": "V", "displacement": "um"}, 200.0)

@@ -64,8 +64,13 @@ def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
                 read(Written(written.path, columns, units))
         units = {quantity: unit.replace("? ", "1 ") for quantity, unit in units.items()}
         fs = 1000.0 if isinstance(error.fs, str) else error.fs
-        assert 600 == read(Written(written.path, columns, units, fs)).samples
+        record = read(Written(written.path, columns, units, fs))
+        assert 600 == record.samples
+        for values, right in ((record.voltage, VOLTAGE), (record.displacement, DISPLACEMENT)):
+            # Of columns without names, which of two is meant nobody can guess.
+            assert np.corrcoef(np.asarray(values), right)[0, 1] > 0.99
         timeless = {"no times at all", "no names and no times", "numbered samples"}
+        timeless |= {name for name in ALL if name.startswith("recorder, settings above")}
         assert (error.fs is not None) == (name in timeless | {"data recorder of PI"})
     else:
         assert error is None

@@ -17,7 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.errors import InputError, NoNumbersError
-from bwbayes.record.io.units import QUANTITIES, is_other_unit, is_time_form, scale_of
+from bwbayes.record.io.units import (
+    QUANTITIES,
+    is_other_unit,
+    is_time_form,
+    scale_of,
+    unit_in_brackets,
+)
 
 _NUMBER = re.compile(
     r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+(,\d*)?|\d{1,3}(,\d{3})+(\.\d*)?)"
@@ -56,6 +62,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     best, separator, fields = 0.0, "", 0
     columns: list[int] = []
     whole_columns: list[int] = []
+    empty_columns: list[int] = []
     for candidate in SEPARATORS if rows else ():
         split = [cells_of(line, candidate) for line in rows]
         width = Counter(map(len, split)).most_common(1)[0][0]
@@ -70,6 +77,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         if share > best and numeric_columns:
             best, separator, fields, columns = share, candidate, width, numeric_columns
             whole_columns = np.flatnonzero(numeric.all(axis=0)).tolist()
+            empty_columns = [i for i in range(width) if not any(row[i] for row in whole)]
     # A column alone has no separator; as none of its cells has tabs, they are as good as any.
     alone = [_NUMBER.fullmatch(line.strip(' "')) is not None for line in rows]
     if not columns and np.mean([False, *alone]) > 0.5:
@@ -81,6 +89,8 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         cells = cells_of(line, separator)
         numbers = {c for c in columns if c < len(cells) and _NUMBER.fullmatch(cells[c])}
         is_row = len(numbers) > len(columns) / 2 and numbers.issuperset(whole_columns)
+        # Settings may stand before the first numbers, in lines as long as the others.
+        is_row &= len(cells) >= fields or not any("".join(cells[c : c + 1]) for c in empty_columns)
         in_a_row = [*in_a_row, index] if is_row else []
         if len(in_a_row) == 3:
             break
@@ -160,7 +170,10 @@ def find_header(
             # Another row of units; where they differ, it is open which is right.
             units = [_either(*pair) for pair in zip_longest(bare, units, fillvalue="")]
     # From the numbers upwards: comments, units and names, or names alone.
-    used = rows[:1]
+    # Below names with their units, more may be said of the columns, but with units of others.
+    stating = [sum(_states_unit(cell) for cell in cells) for _, cells in rows]
+    best = stating.index(max(stating)) if rows else 0
+    used = rows[best : best + 1]
     if unit_row is not None:
         # Names stand above units as a file's first such line; below settings, beneath the units.
         is_below = unit_row > 0 and len(rows) != unit_row + 2
@@ -172,6 +185,12 @@ def find_header(
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
     return [name or f"column {i}" for i, name in enumerate(names, start=1)], units, first
+
+
+def _states_unit(name: str) -> bool:
+    """Tell whether a name has a unit of one of the quantities in brackets."""
+    unit = unit_in_brackets(name)
+    return unit is not None and any(scale_of(unit, q) for q in QUANTITIES)
 
 
 def _either(unit: str, other: str) -> str:
@@ -193,7 +212,7 @@ def split_header(line: str, layout: Layout) -> list[str]:
     ways += [re.split(pattern, bare.strip()) for pattern in between_names]
     needed = 1 + max(set(range(layout.fields)) - layout.empty, default=0)
     for number, fields in enumerate(ways):
-        cells = [cell.strip().strip('"') for cell in fields]
+        cells = [cell.strip().strip('"').rstrip(",") for cell in fields]
         more = any(cells[layout.fields :]) and (number > 0 or layout.separator == " ")
         filled = [cell for i, cell in enumerate(cells) if i not in layout.empty]
         # A rule of dashes, as below the names of tables that are drawn, is none.

@@ -13,6 +13,7 @@ from bwbayes.record.io.recognition import (
     WORDS,
     beside,
     counts_samples,
+    finite,
     foreign_unit,
     is_demand,
     listed,
@@ -21,7 +22,7 @@ from bwbayes.record.io.recognition import (
     unit_of,
 )
 from bwbayes.record.io.series import Series, Source
-from bwbayes.record.io.units import COMMON_UNITS, rates_by_unit, unit_scale
+from bwbayes.record.io.units import COMMON_UNITS, power_of, rates_by_unit, unit_scale
 
 if TYPE_CHECKING:
     from bwbayes.record.io.columns import Naming
@@ -45,28 +46,22 @@ def columns_error(
     ranges = ranges_of(source.series)
     if not ranges:
         return InputError(f"{where}: no column holds only numbers; export it as CSV")
-    others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
-    if chosen:
-        others = [s for s in others if s.size in {c.size for c in chosen.values()}]
-    moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
-    candidates = beside(moving or others, chosen)
+    candidates = _candidates(source, chosen, ranges)
     clock = chosen["time"] if "time" in unknown else None
-    # But for those that number the samples.
-    candidates = [
-        s for s in candidates if unit_of(s.label, s.unit, "time") or not counts_samples(s)
-    ]
     clocks = [s for s in candidates if s.size > 1 and rises(s)]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
     columns, units = dict(naming.columns), dict(naming.units)
     proposed = {q: chosen[q] for q in unknown}  # those whose unit is open
     for quantity in missing:
-        pool = clocks if quantity == "time" else candidates
+        pool = clocks if quantity == "time" else sorted(candidates, key=rises)
         if quantity == "displacement":
             pool = sorted(pool, key=is_demand)
         words = [word for word in WORDS[quantity] if len(word) > 3]
         alike = [s for s in pool if any(word in s.label.lower() for word in words)]
-        pool = [s for s in pool if unit_of(s.label, s.unit, quantity)] or alike or pool
+        in_unit = [s for s in pool if unit_of(s.label, s.unit, quantity)]
+        in_unit = in_unit or [s for s in pool if unit_scale(s.label, quantity)]
+        pool = in_unit or alike or pool
         if not pool:
             continue
         columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
@@ -101,6 +96,25 @@ def columns_error(
     return ColumnsError(problem, columns, units, fs=fs)
 
 
+def _candidates(
+    source: Source, chosen: Mapping[str, Series], ranges: Mapping[str, tuple[float, float]]
+) -> list[Series]:
+    """Return the series that a missing quantity may be: as long as those chosen, and moving.
+
+    Neither those that number the samples, nor settings in columns beside the first numbers.
+    """
+    others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
+    if chosen:
+        others = [s for s in others if s.size in {c.size for c in chosen.values()}]
+    moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
+    moving = [s for s in moving if 2 * finite(s).size > s.size] or moving
+    return [
+        s
+        for s in beside(moving or others, chosen)
+        if unit_of(s.label, s.unit, "time") or not counts_samples(s)
+    ]
+
+
 def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[str]:
     """Add a guess of the units that are open; return questions for those that a file states."""
     questions = []
@@ -116,5 +130,8 @@ def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[
 
 def _guess(label: str, quantity: str) -> str:
     """Return the unit that stands anywhere in a name, as in ``ms_since_midnight``, or the usual."""
-    words = (word for word in re.split(r"[\W_]+", label) if unit_scale(word, quantity))
-    return next(words, COMMON_UNITS[quantity][0])
+    *words, last = re.split(r"[\W_]+", label)
+    # An inch or a minute, as opposed to a word, only at the end.
+    units = [word for word in words if power_of(word, quantity) is not None]
+    units += [last] if unit_scale(last, quantity) else []
+    return units[0] if units else COMMON_UNITS[quantity][0]

@@ -53,8 +53,10 @@ def likeness(label: str, unit: str, quantity: str) -> int | None:
 def bare_name(label: str, quantity: str) -> str:
     """Return a name without the unit of the quantity at its end."""
     unit = unit_in(label, quantity)
+    # A minus before brackets is part of the name, as in V- [V].
+    between = r"(?:[\s_/.]|\s-)*[\[(]\s*|[\s_/.-]+"
     return (
-        re.sub(rf"[\s_/.\-\[(]*{re.escape(unit)}[\])\s_]*$", "", label).strip() if unit else label
+        re.sub(rf"(?:{between}){re.escape(unit)}[\])\s_]*$", "", label).strip() if unit else label
     )
 
 

@@ -243,8 +243,8 @@ def _samples(
     while len(samples) > 1:
         first, last = (cells_of(line, separator) for _, line in (samples[0], samples[-1]))
         is_short = len(last) < fields and not is_cut
-        begin = next(filter(None, last), "")
-        if not is_short and (re.search(r"\d", begin) or not re.search(r"\d", first[0])):
+        begin, end = (next(filter(None, cells), "") for cells in (first, last))
+        if not is_short and (re.search(r"\d", end) or not re.search(r"\d", begin)):
             break
         is_cut |= is_short
         samples.pop()

@@ -68,8 +68,8 @@ def is_time_form(text: str) -> bool:
 
 def power_of(unit: str, quantity: str) -> int | None:
     """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
-    # As voltmeters write, and in one character, as some alphabets have units.
-    unit = re.sub("(?<=V) ?(?:DC|dc)$", "", normalize("NFKC", unit))
+    # As voltmeters and potentiostats write, and in one character, as some alphabets have units.
+    unit = re.sub("(?<=V) ?(?:DC|dc|vs\\.? .*)$", "", normalize("NFKC", unit))
     base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
     written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
     if written:
@@ -89,6 +89,8 @@ def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
     data sheets write a sensitivity, that is ``0.35 um/V`` or ``2.9 V/um``, or with counts, digits
     or LSB. A voltage per V is none, as it may be an amplifier's gain or its monitor's.
     """
+    if (plain := unit_scale(unit.strip(), quantity)) is not None:
+        return plain
     number = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
     reading = f"(?i:counts?|digits?|LSB{'|V' if quantity == 'displacement' else ''})"
     written = re.fullmatch(
@@ -130,8 +132,8 @@ def factor_in(name: str) -> str:
 
 
 def unit_in_brackets(name: str) -> str | None:
-    """Return what stands in brackets at the end of a column's name, if it is no number."""
-    ending = re.search(r"(?:\[(?!\d+\])([^]]*)\]|\(([^)]*)\))\s*$", name)
+    """Return what stands in brackets at the end of a column's name, if it is no number of it."""
+    ending = re.search(r"(?:\[(?!\d+\])([^]]*)\]|\((?!column \d+\))([^)]*)\))\s*$", name)
     return next(group for group in ending.groups() if group is not None).strip() if ending else None
 
 
