@@ -82,7 +82,7 @@ def test_a_stage_of_ones_own_is_in_the_chain(
     )
     (tmp_path / "my_stage.py").write_text(head + example("my_stage.py"), encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    spec = ModelSpec(stages=("backlash", "my_stage:SoftMount"))
+    spec = ModelSpec().with_stages("backlash", "my_stage:SoftMount")
     made = spec.actuator(1e-3, "first", Extent(Span(-50.0, 50.0), 1e-3, 1.0))
     assert made.parameters[-2:] == ("softness", "offset")
     values = true_values(made, {"d": 1.0, "alpha": 0.3, "beta": 0.05, "gamma": 0.02, "offset": 1.0})

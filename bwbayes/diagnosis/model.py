@@ -64,7 +64,7 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try each stage before or behind the hysteresis that the model has not."""
-    present = scene.study.spec.stages if scene.study is not None else ()
+    present = scene.study.spec.chain if scene.study is not None else ()
     for name, make in STAGES.items():
         if name in present:
             continue
@@ -104,7 +104,7 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
         kind = f"operator {name}"
         if scene.study is None or HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
-        spec = scene.study.spec.with_stage(name)
+        spec = scene.study.spec.with_stages(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
         # One start finds the best place for nearly all records, in half of the time of five.
         places = map_estimate.local_minima(posterior, scene.generator, 1)
@@ -130,7 +130,7 @@ def _changed(
     stated: Mapping[str, Stated] = MappingProxyType({}),
     starts: Sequence[Mapping[str, float]] = ({},),
     facts: Mapping[str, Any] = MappingProxyType({}),
-    **parts: str,
+    **parts: Any,
 ) -> Iterator[Explanation]:
     """Fit the model with further stages from the mode; new parameters start at their medians.
 
@@ -141,9 +141,7 @@ def _changed(
     kind = kind or str(text)
     if scene.study is None or not scene.looks_for(kind):
         return
-    spec = scene.study.spec.with_parts(**parts)
-    for name in stages:
-        spec = spec.with_stage(name)
+    spec = replace(scene.study.spec, **parts).with_stages(*stages)
     posterior = scene.rebuilt(scene.study.with_model(spec, stated))
     places = []
     for coordinates, start in product(scene.places, starts):
@@ -207,9 +205,8 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     study = scene.study
     tailed = study is not None and scene.posterior.only.noise.tailed
     if study is not None and not tailed and nats > isolated_nats(white):
-        before = study.spec
-        spec = before.with_parts(noise=f"{before.noise} + student")
-        fix = _lines(before, spec)
+        spec = replace(study.spec, noise=f"{study.spec.noise} + student")
+        fix = _lines(study.spec, spec)
     yield Explanation(
         "heavy tails",
         text,

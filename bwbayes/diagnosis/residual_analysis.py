@@ -168,7 +168,7 @@ class ResidualAnalysis:
         """
         if self.study is None or not isinstance(self.posterior.only.noise, SmoothNoise):
             return None
-        rough = self.study.spec.with_parts(noise="discrepancy")
+        rough = replace(self.study.spec, noise="discrepancy")
         study = self.study.with_model(rough)
         posterior = self.rebuilt(study)
         rows = [self.posterior.names.index(name) for name in posterior.names]

@@ -22,6 +22,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study
 from bwbayes.inference.thinning import stride_of, thin, thin_posterior
+from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
@@ -37,19 +38,14 @@ DRAWS = 40
 def families(spec: ModelSpec) -> Iterator[ModelSpec]:
     """Yield models of other families than a model: one for each."""
     asymmetric = ("saturation", "sensor-curve")
-    base = spec.with_parts(
-        nonlinearity=(),
-        creep=False,
-        creep_growth=False,
-        stages=tuple(name for name in spec.stages if name not in asymmetric),
-    )
-    curved = base.with_parts(nonlinearity=("quadratic", "cubic"))
-    operators = {"bouc-wen", "duhem", "plays"} - {spec.hysteresis}
+    base = spec.without(*{*asymmetric, *TERMS, "creep"}.intersection(spec.chain))
+    curved = base.with_stages(*TERMS)
+    operators = {"bouc-wen", "duhem", "plays"} - {spec.operator.name}
     for rival in (
         curved,
-        *(base.with_stage(name) for name in asymmetric),
-        curved.with_parts(creep=True),
-        *(curved.with_parts(hysteresis=name) for name in sorted(operators)),
+        *(base.with_stages(name) for name in asymmetric),
+        curved.with_stages("creep"),
+        *(curved.with_stages(name) for name in sorted(operators)),
     ):
         if rival != spec:
             yield rival

@@ -165,13 +165,6 @@ class Study:
             return next(iter(digests.values()))
         return sha256(json.dumps(digests).encode()).hexdigest()
 
-    @property
-    def sha256(self) -> str:
-        """A digest: the same for the same posterior."""
-        return sha256(
-            json.dumps([self.data_sha256, self.keys], sort_keys=True).encode()
-        ).hexdigest()
-
     @cached_property
     def extent(self) -> Extent:
         """What the model takes from all records."""

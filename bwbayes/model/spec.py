@@ -1,17 +1,16 @@
-"""What a model is made of: its parts by name, in the order of the signal path, and its noise.
+"""What a model is made of: a chain of stages in the order of the signal's way, and a noise.
 
 A :class:`ModelSpec` describes a model without any record. It makes the actuator for a record, says
-what it is in words and as a config has it, and gives another one with a part replaced. Whoever
-wants another model (a diagnosis, a comparison, a choice of noise) changes the spec.
+what it is in words and as a config has it, and gives another one with a stage added, replaced or
+left out. Whoever wants another model (a diagnosis, a comparison, a choice of noise) changes the
+spec; a config reads and writes it.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from hashlib import sha256
-from typing import Any, NamedTuple, Self
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
@@ -19,8 +18,11 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.linear import Hold
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, choose, made
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, made
 from bwbayes.model.stage import Side, Stage
+
+Slot = Literal["input", "operator", "nonlinearity", "dynamics", "creep", "output"]
+"""Where a stage stands; the slots are in the order of the signal's way."""
 
 
 class Extent(NamedTuple):
@@ -35,154 +37,114 @@ class Extent(NamedTuple):
     longest: float
 
 
+class StageSpec(NamedTuple):
+    """A stage by name or import path, where it stands, and its options: pairs of name and value."""
+
+    slot: Slot
+    name: str
+    options: tuple[tuple[str, Any], ...] = ()
+
+    @classmethod
+    def of(cls, slot: Slot, name: str, options: Mapping[str, Any]) -> Self:
+        """Return a stage with those of the options that are said, whose lists become tuples."""
+        said = [
+            (option, tuple(value) if isinstance(value, list) else value)
+            for option, value in sorted(options.items())
+            if value is not None
+        ]
+        return cls(slot, name, tuple(said))
+
+    @property
+    def place(self) -> str:
+        """What two stages of a chain cannot both have: the slot of operator or dynamics, a name."""
+        return self.slot if self.slot in ("operator", "dynamics") else self.name
+
+
 @dataclass(frozen=True)
 class ModelSpec:
-    """A model: the parts of an actuator, by name or import path, and the noise of its readings.
+    """A model: the stages of an actuator, and the noise of its readings.
 
     Parameters
     ----------
-    hysteresis
-        The operator.
-    nonlinearity
-        Terms of the static nonlinearity.
-    creep
-        Whether there is creep, or the times of its lags, s.
-    creep_growth
-        Whether the creep grows with the voltage.
-    dynamics
-        The linear dynamics.
+    stages
+        In whatever order, one hysteresis operator among them; they are kept in that of the signal's
+        way, those of the package before others in the same slot.
     hold
         What the voltage does between samples; ``"auto"`` takes it from the record.
     noise
         The model of the residual.
-    options
-        Of the operator, by name.
-    stages
-        Further stages; those of the package stand in the order of :data:`STAGES`, others come last.
+
+    Raises
+    ------
+    InputError
+        A stage that is there twice, or two operators or dynamics.
     """
 
-    hysteresis: str = "bouc-wen"
-    nonlinearity: tuple[str, ...] = ()
-    creep: bool | tuple[float, ...] = False
-    creep_growth: bool = False
-    dynamics: str = "lag"
+    stages: tuple[StageSpec, ...] = (
+        StageSpec("operator", "bouc-wen"),
+        StageSpec("dynamics", "lag"),
+    )
     hold: Hold | str = "auto"
     noise: str = "discrepancy"
-    options: Mapping[str, Any] = field(default_factory=dict)
-    stages: tuple[str, ...] = ()
 
-    def with_parts(self, **changes: Any) -> Self:
-        """Return the spec with other parts; another operator has options of its own."""
-        if "hysteresis" in changes:
-            changes = {"options": {}, **changes}
-        return replace(self, **changes)
+    def __post_init__(self) -> None:
+        slots, names = get_args(Slot), [*TERMS, *STAGES]
+        places = [stage.place for stage in self.stages]
+        for place in places:
+            if places.count(place) > 1:
+                raise InputError(f"model: {place!r} is there twice; leave one out")
 
-    def actuator(self, interval: float, hold: Hold, extent: Extent) -> Actuator:
-        """Put the actuator together for a record, whose own ``hold`` counts where it is open.
+        def position(stage: StageSpec) -> tuple[int, int]:
+            known = stage.name in names
+            return slots.index(stage.slot), names.index(stage.name) if known else len(names)
+
+        chain = sorted((stage for stage in self.stages if stage.name != "none"), key=position)
+        object.__setattr__(self, "stages", tuple(chain))
+
+    @classmethod
+    def from_keys(cls, said: Mapping[str, Any]) -> Self:
+        """Return the model that a config's [model] describes by these keys; others do not count.
 
         Raises
         ------
         InputError
-            A part that does not exist, or an option that it does not have.
+            Something that no model can be.
         """
-        creep = None
-        if self.creep:
-            times: Sequence[float] = creep_times(extent.shortest, extent.longest)
-            if isinstance(self.creep, tuple):
-                times = self.creep
-            creep = Creep(tuple(times), self.creep_growth, extent.span)
-        elif self.creep_growth:
+        keys = cls().keys | {key: value for key, value in said.items() if value is not None}
+        options = {name: said.get(name) for name in OPTIONS}
+        stages = [
+            StageSpec.of("operator", keys["hysteresis"], options),
+            StageSpec("dynamics", keys["dynamics"]),
+            *(StageSpec("nonlinearity", term) for term in keys["nonlinearity"]),
+            *(StageSpec(_side_of(name), name) for name in keys["stages"]),
+        ]
+        if keys["creep"]:
+            times = None if keys["creep"] is True else keys["creep"]
+            options = {"times": times, "growing": keys["creep_growth"] or None}
+            stages.append(StageSpec.of("creep", "creep", options))
+        elif keys["creep_growth"]:
             raise InputError("model.creep_growth: there is no creep; give creep = true with it")
-        return Actuator(
-            self.dynamics,
-            hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
-            interval,
-            made("model.hysteresis", self.hysteresis, HYSTERESIS, self.options, Operator),
-            PolynomialNonlinearity(self.nonlinearity, extent.span) if self.nonlinearity else None,
-            creep,
-            extent.span,
-            tuple(made("model.stages", name, STAGES, {}, Stage) for name in self._in_order),
-        )
+        return cls(tuple(stages), keys["hold"], keys["noise"])
 
     @property
-    def chain(self) -> tuple[str, ...]:
-        """Names of all stages that the model has, in the order of the signal's way."""
-        further = {name: self._side_of(name) for name in self._in_order}
-        core = (
-            self.hysteresis,
-            *self.nonlinearity,
-            self.dynamics,
-            *(("creep",) if self.creep else ()),
-        )
-        inputs = [name for name, side in further.items() if side == "input"]
-        outputs = [name for name, side in further.items() if side == "output"]
-        return (*inputs, *core, *outputs)
-
-    def with_stage(self, name: str) -> Self:
-        """Return the spec with a stage of the package, by its name.
-
-        One operator and one dynamics exclude another; all else is added to what is there.
-
-        Raises
-        ------
-        InputError
-            No stage has that name.
-        """
-        if name in HYSTERESIS:
-            return self.with_parts(hysteresis=name)
-        if name in DYNAMICS:
-            return self.with_parts(dynamics=name)
-        if name in TERMS:
-            terms = tuple(term for term in TERMS if term in (*self.nonlinearity, name))
-            return self.with_parts(nonlinearity=terms)
-        if name == "creep":
-            return self if self.creep else self.with_parts(creep=True)
-        choose("model.stages", name, STAGES)
-        return self.with_parts(stages=(*self.stages, name))
-
-    def without(self, name: str) -> Self:
-        """Return the spec without a stage; that of the dynamics leaves none, the operator stays.
-
-        Raises
-        ------
-        InputError
-            The model has no such stage, or cannot do without.
-        """
-        if name in self.nonlinearity:
-            return self.with_parts(
-                nonlinearity=tuple(term for term in self.nonlinearity if term != name)
-            )
-        if name == "creep" and self.creep:
-            return self.with_parts(creep=False, creep_growth=False)
-        if name == self.dynamics and name != "none":
-            return self.with_parts(dynamics="none")
-        if name in self.stages:
-            return self.with_parts(stages=tuple(one for one in self.stages if one != name))
-        raise InputError(f"model: cannot leave out {name!r}; it has {', '.join(self.chain)}")
-
-    def _side_of(self, name: str) -> Side:
-        return made("model.stages", name, STAGES, {}, Stage).side
-
-    @property
-    def _in_order(self) -> list[str]:
-        """The further stages in the order of the signal's way."""
-        order = [*STAGES]
-        repeated = [name for name in self.stages if self.stages.count(name) > 1]
-        if repeated:
-            raise InputError(f"model.stages: {repeated[0]!r} is there twice; leave one out")
-        return sorted(
-            self.stages, key=lambda name: order.index(name) if name in order else len(order)
-        )
-
-    def explicit(self, actuator: Actuator) -> Self:
-        """Return the spec with all that it left open as an actuator of it has it, but the hold.
-
-        The hold stays: another record has its own.
-        """
-        operator = actuator.hysteresis
-        options = {name: getattr(operator, name) for name in OPTIONS if hasattr(operator, name)}
-        creep = actuator.creep.times if actuator.creep else False
-        return replace(self, creep=creep, options=options)
+    def keys(self) -> dict[str, Any]:
+        """What a config's [model] says of it, by key; lists for tuples."""
+        creep = self._in("creep")
+        options = dict(creep[0].options) if creep else {}
+        keys = {
+            "hysteresis": self.operator.name,
+            "nonlinearity": [stage.name for stage in self._in("nonlinearity")],
+            "creep": options.get("times", bool(creep)),
+            "creep_growth": options.get("growing", False),
+            "dynamics": next((stage.name for stage in self._in("dynamics")), "none"),
+            "hold": self.hold,
+            "noise": self.noise,
+            "stages": [stage.name for stage in self._in("input", "output")],
+            **dict(self.operator.options),
+        }
+        return {
+            key: list(value) if isinstance(value, tuple) else value for key, value in keys.items()
+        }
 
     def changes_to(self, other: ModelSpec) -> dict[str, Any]:
         """Return what another spec has that this one has not, by key of a config's [model]."""
@@ -190,25 +152,116 @@ class ModelSpec:
         return {name: value for name, value in after.items() if before.get(name) != value}
 
     @property
-    def keys(self) -> dict[str, Any]:
-        """What a config's [model] says of it, by key; lists for tuples."""
-        keys = {name: value for name, value in vars(self).items() if name != "options"}
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in {**keys, **self.options}.items()
-        }
+    def operator(self) -> StageSpec:
+        """The hysteresis operator."""
+        return self._in("operator")[0]
 
     @property
-    def sha256(self) -> str:
-        """A digest: the same for the same model."""
-        return sha256(json.dumps(self.keys, sort_keys=True).encode()).hexdigest()
+    def chain(self) -> tuple[str, ...]:
+        """Names of all stages, in the order of the signal's way."""
+        return tuple(stage.name for stage in self.stages)
+
+    def _in(self, *slots: Slot) -> list[StageSpec]:
+        return [stage for stage in self.stages if stage.slot in slots]
+
+    def with_stages(self, *stages: StageSpec | str) -> Self:
+        """Return the spec with further stages; those that the package has go by their names.
+
+        A stage replaces one of its name; an operator replaces another, dynamics do too.
+
+        Raises
+        ------
+        InputError
+            No stage has that name.
+        """
+        chain = list(self.stages)
+        for stage in stages:
+            added = stage if isinstance(stage, StageSpec) else StageSpec(_slot_of(stage), stage)
+            chain = [*(other for other in chain if other.place != added.place), added]
+        return replace(self, stages=tuple(chain))
+
+    def without(self, *names: str) -> Self:
+        """Return the spec without stages; the operator cannot be left out.
+
+        Raises
+        ------
+        InputError
+            The model has no such stage, or cannot do without.
+        """
+        for name in names:
+            if name not in self.chain or name == self.operator.name:
+                raise InputError(
+                    f"model: cannot leave out {name!r}; it has {', '.join(self.chain)}"
+                )
+        return replace(
+            self, stages=tuple(stage for stage in self.stages if stage.name not in names)
+        )
+
+    def explicit(self, actuator: Actuator) -> Self:
+        """Return the spec with all that it left open as an actuator of it has it, but the hold.
+
+        The hold stays: another record has its own.
+        """
+        operator, creep = actuator.hysteresis, actuator.creep
+        options = {name: getattr(operator, name, None) for name in OPTIONS}
+        stages = [StageSpec.of("operator", self.operator.name, options)]
+        if creep is not None:
+            options = {"times": creep.times, "growing": creep.growing or None}
+            stages.append(StageSpec.of("creep", "creep", options))
+        return self.with_stages(*stages)
+
+    def actuator(self, interval: float, hold: Hold, extent: Extent) -> Actuator:
+        """Put the actuator together for a record, whose own ``hold`` counts where it is open.
+
+        Raises
+        ------
+        InputError
+            A stage that does not exist, or an option that it does not have.
+        """
+        keys, creep = self.keys, None
+        for stage in self._in("creep"):
+            times = creep_times(extent.shortest, extent.longest)
+            creep = Creep(**{"times": tuple(times), **dict(stage.options)}, reference=extent.span)
+        terms = tuple(keys["nonlinearity"])
+        return Actuator(
+            keys["dynamics"],
+            hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
+            interval,
+            made(
+                "model.hysteresis",
+                self.operator.name,
+                HYSTERESIS,
+                dict(self.operator.options),
+                Operator,
+            ),
+            PolynomialNonlinearity(terms, extent.span) if terms else None,
+            creep,
+            extent.span,
+            tuple(made("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
+        )
 
     def __str__(self) -> str:
         """Return which parts there are, in a line."""
-        parts = [self.hysteresis]
-        if self.nonlinearity:
-            parts.append(f"{' and '.join(self.nonlinearity)} nonlinearity")
-        if self.creep:
-            parts.append("creep that grows with the voltage" if self.creep_growth else "creep")
-        parts += self.stages
-        return f"{', '.join(parts)}, dynamics {self.dynamics}, {self.hold} hold"
+        keys = self.keys
+        parts = [keys["hysteresis"]]
+        if keys["nonlinearity"]:
+            parts.append(f"{' and '.join(keys['nonlinearity'])} nonlinearity")
+        if keys["creep"]:
+            parts.append(f"creep{' that grows with the voltage' * keys['creep_growth']}")
+        parts += keys["stages"]
+        return f"{', '.join(parts)}, dynamics {keys['dynamics']}, {self.hold} hold"
+
+
+def _slot_of(name: str) -> Slot:
+    """Return where the stage of that name stands."""
+    slots: dict[Slot, Any] = {
+        "operator": HYSTERESIS,
+        "nonlinearity": TERMS,
+        "dynamics": DYNAMICS,
+        "creep": ("creep",),
+    }
+    return next((slot for slot, names in slots.items() if name in names), None) or _side_of(name)
+
+
+def _side_of(name: str) -> Side:
+    return made("model.stages", name, STAGES, {}, Stage).side

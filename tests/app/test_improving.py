@@ -162,7 +162,7 @@ def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> Non
     problem = resolve_config(config, tmp_path)
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     rough = climb(problem.posterior, point.optima)
-    other = problem.study.with_model(problem.study.spec.with_parts(noise="smooth")).posterior
+    other = problem.study.with_model(replace(problem.study.spec, noise="smooth")).posterior
     starts = [dict(zip(problem.posterior.names, place, strict=True)) for place in point.optima]
     places = [[start.get(name, 0.0) for name in other.names] for start in starts]
     smooth = climb(other, np.array(places))

@@ -367,7 +367,11 @@ def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
         ),
         (
             Explanation(
-                "creep", "creep", "set creep = true", nats=20.0, spec=ModelSpec(creep=True)
+                "creep",
+                "creep",
+                "set creep = true",
+                nats=20.0,
+                spec=ModelSpec().with_stages("creep"),
             ),
             "a better model is known (creep, 20 nats); --improve adds it",
         ),

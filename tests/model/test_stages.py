@@ -283,13 +283,13 @@ def test_both_engines_give_the_same_log_density(
 
 
 def test_a_chain_stands_in_the_order_of_the_signal() -> None:
-    spec = ModelSpec(stages=("sensor-curve", "backlash", "saturation"))
+    spec = ModelSpec().with_stages("sensor-curve", "backlash", "saturation", "backlash")
     made = spec.actuator(1e-3, "first", _extent())
     assert [stage.name for stage in made.stages] == ["saturation", "backlash", "sensor-curve"]
     with pytest.raises(InputError, match="'backlash' is there twice; leave one out"):
-        spec.with_stage("backlash").actuator(1e-3, "first", _extent())
+        ModelSpec.from_keys({"stages": ["backlash", "backlash"]})
     with pytest.raises(InputError, match=r"model.stages: 'backlsh' is unknown.*backlash"):
-        ModelSpec(stages=("backlsh",)).actuator(1e-3, "first", _extent())
+        spec.with_stages("backlsh")
 
 
 @every_stage

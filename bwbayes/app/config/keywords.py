@@ -29,6 +29,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES
+from bwbayes.model.spec import ModelSpec, StageSpec
 from bwbayes.record.record import Record
 
 
@@ -150,7 +151,7 @@ def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
         if name in models:
             raise InputError(f"models: {name!r} is there twice; leave one out")
         try:
-            models[name] = ModelConfig.model_validate(base.model_dump() | _changes(name))
+            models[name] = ModelConfig.model_validate(base.model_dump() | _keys_of(name, base))
         except ValidationError as error:
             raise InputError(one_line(f"models: {name!r}", error, ModelConfig)) from None
     if not models:
@@ -158,8 +159,8 @@ def models_of(text: str, base: ModelConfig) -> dict[str, ModelConfig]:
     return models
 
 
-def _changes(name: str) -> dict[str, Any]:
-    """Return the keys of [model] that a model's name says."""
+def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
+    """Return the keys of [model] that a model's name says; dynamics and noise may be the base's."""
     first, *others = re.split(r"\+(?![^(]*\))", name)
     match = re.fullmatch(r"\s*([^\s()+]+)\s*(?:\((.*)\))?\s*", first)
     if match is None:
@@ -167,9 +168,6 @@ def _changes(name: str) -> dict[str, Any]:
     operator, options = match[1], match[2] or ""
     if operator not in HYSTERESIS and ":" not in operator:
         raise InputError(f"models: {operator!r} is unknown; {suggestion(operator, HYSTERESIS)}")
-    changes: dict[str, Any] = dict.fromkeys(OPTIONS)
-    changes |= {"hysteresis": operator, "nonlinearity": [], "creep": False, "creep_growth": False}
-    changes["stages"] = []
     try:
         stated = tomllib.loads(f"options = {{ {options} }}")["options"]
     except (ValueError, RecursionError):
@@ -179,19 +177,13 @@ def _changes(name: str) -> dict[str, Any]:
     for key in stated:
         if key not in OPTIONS:
             raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
-    changes |= stated
-    for word in (term.strip() for term in others):
-        if word in TERMS:
-            changes["nonlinearity"] = [*changes["nonlinearity"], word]
-        elif word == "creep":
-            changes["creep"] = True
-        elif word in STAGES:
-            changes["stages"] = [*changes["stages"], word]
-        elif word in DYNAMICS:
-            changes["dynamics"] = word
-        elif word in NOISES:
-            changes["noise"] = f"{noise} + {word}" if (noise := changes.get("noise")) else word
-        else:
-            words = [*TERMS, "creep", *DYNAMICS, *STAGES, *NOISES]
-            raise InputError(f"models: {name!r}: {word!r} is unknown; {suggestion(word, words)}")
-    return changes
+    words = [term.strip() for term in others]
+    stages = [*TERMS, "creep", *DYNAMICS, *STAGES]
+    for word in words:
+        if word not in (*stages, *NOISES):
+            hint = suggestion(word, [*stages, *NOISES])
+            raise InputError(f"models: {name!r}: {word!r} is unknown; {hint}")
+    core = StageSpec.of("operator", operator, stated), StageSpec("dynamics", base.dynamics)
+    spec = ModelSpec(core).with_stages(*(word for word in words if word in stages))
+    noise = " + ".join(word for word in words if word in NOISES)
+    return dict.fromkeys(OPTIONS) | spec.keys | {"hold": base.hold, "noise": noise or base.noise}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
@@ -34,11 +34,6 @@ Windows = Annotated[
     ),
     Field(min_length=1),
 ]
-
-
-def _frozen(value: Any) -> Any:
-    """Return a list as a tuple, and all else as it is."""
-    return tuple(value) if isinstance(value, list) else value
 
 
 class SignalConfig(ConfigTable):
@@ -197,16 +192,7 @@ class ActuatorConfig(ConfigTable):
     @property
     def spec(self) -> ModelSpec:
         """The model that it describes."""
-        options = {name: _frozen(getattr(self, name)) for name in OPTIONS}
-        return ModelSpec(
-            self.hysteresis,
-            tuple(self.nonlinearity),
-            _frozen(self.creep),
-            self.creep_growth,
-            self.dynamics,
-            options={name: value for name, value in options.items() if value is not None},
-            stages=tuple(self.stages),
-        )
+        return ModelSpec.from_keys(vars(self))
 
 
 class ModelConfig(ActuatorConfig):
@@ -228,14 +214,13 @@ class ModelConfig(ActuatorConfig):
     @property
     def spec(self) -> ModelSpec:
         """The model that it describes; where the noise is open, the one that claims least."""
-        noise = "discrepancy" if self.noise == "auto" else self.noise
-        return replace(super().spec, hold=self.hold, noise=noise)
+        spec = super().spec
+        return replace(spec, noise="discrepancy") if spec.noise == "auto" else spec
 
     def with_spec(self, spec: ModelSpec) -> Self:
         """Return the config of another model; what both have in common is said as it was."""
-        before = self.spec
-        dropped = dict.fromkeys(name for name in before.options if name not in spec.options)
-        return self.model_copy(update=dropped | before.changes_to(spec))
+        dropped = dict.fromkeys(name for name in OPTIONS if name not in spec.keys)
+        return self.model_copy(update=dropped | self.spec.changes_to(spec))
 
 
 class StandModelConfig(ActuatorConfig):

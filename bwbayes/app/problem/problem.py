@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -195,7 +195,7 @@ class Problem:
         model = self.config.model
         if model.noise != "auto" or chosen == "auto":
             return self
-        spec = self.study.spec.with_parts(noise=chosen)
+        spec = replace(self.study.spec, noise=chosen)
         config = with_model(self.config, spec, self.records)
         named = config.model.model_copy(update={"noise": chosen})
         config = config.model_copy(update={"model": named})

@@ -14,6 +14,7 @@ added while the fit follows what the actuator did not do: no stage mends a trans
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     known = {*evidence, "student"}
     others = [n for n in NOISES if n not in known and (n == "white" or p < colored)]
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
-        other = problem.study.with_model(problem.study.spec.with_parts(noise=noise)).posterior
+        other = problem.study.with_model(replace(problem.study.spec, noise=noise)).posterior
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))

@@ -1,0 +1,61 @@
+"""A model's spec: a chain of stages to be changed, compared, and written as a config has it."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bwbayes.app.config.settings import ModelConfig
+from bwbayes.inference.noise import NOISES
+from bwbayes.model.nonlinearity import TERMS
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
+from bwbayes.model.spec import ModelSpec, StageSpec
+
+FURTHER = (*TERMS, *STAGES, "creep")
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> ModelSpec:
+    """Any model of the package's stages, some of which have options."""
+    names = draw(st.lists(st.sampled_from(FURTHER), unique=True))
+    spec = ModelSpec(
+        hold=draw(st.sampled_from(["auto", "first", "zero"])),
+        noise=draw(st.sampled_from([*NOISES])),
+    ).with_stages(*names, draw(st.sampled_from([*DYNAMICS])), draw(st.sampled_from([*HYSTERESIS])))
+    if draw(st.booleans()):
+        passive = draw(st.booleans())
+        spec = spec.with_stages(StageSpec.of("operator", "bouc-wen", {"passive": passive}))
+    if draw(st.booleans()):
+        times = draw(st.lists(st.floats(0.1, 1e3), min_size=1, max_size=3))
+        spec = spec.with_stages(StageSpec.of("creep", "creep", {"times": times, "growing": True}))
+    return spec
+
+
+@given(specs(), specs())
+def test_a_spec_is_what_a_config_says(spec: ModelSpec, other: ModelSpec) -> None:
+    """Written by its keys and read again it is equal, whatever the config said before."""
+    again = ModelSpec.from_keys(json.loads(json.dumps(spec.keys)))
+    assert (again, hash(again)) == (spec, hash(spec))
+    assert (spec == other) == (spec.keys == other.keys)
+    assert (spec == other) == (not spec.changes_to(other))
+    config = ModelConfig.model_validate(other.keys).with_spec(spec)
+    assert ModelConfig.model_validate(config.model_dump()).spec == spec
+
+
+@given(specs(), st.sampled_from(FURTHER))
+def test_a_stage_is_added_replaced_and_left_out(spec: ModelSpec, name: str) -> None:
+    """The order in which stages are added does not count, and what was there stays."""
+    added = spec.with_stages(name)
+    assert {*added.chain} == {*spec.chain, name}
+    assert added.with_stages(name) == added
+    if name not in spec.chain:
+        assert added.without(name) == spec
+    for operator in HYSTERESIS:
+        other = added.with_stages(operator)
+        assert other.operator == StageSpec("operator", operator)
+        assert other == spec.with_stages(operator).with_stages(name)
+    assert [stage for stage in added.chain if stage in STAGES] == [
+        stage for stage in STAGES if stage in added.chain
+    ]
