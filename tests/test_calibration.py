@@ -101,10 +101,10 @@ def test_white_noise_model_fails_the_bands() -> None:
     """It takes the discrepancy of the same records for sensor noise."""
     common = experiment(problem(fixed=("lag", "beta")))
     right = common.posterior
-    names = (*right.only.actuator.parameters, "sensor_sd")
+    names = (*right.single_record.actuator.parameters, "sensor_sd")
     white = replace(
         right,
-        datasets=(replace(right.only, noise=WhiteNoise()),),
+        datasets=(replace(right.single_record, noise=WhiteNoise()),),
         prior=JointPrior(p for p in right.prior.parameters if p.name in names),
         joint=None,
     )
@@ -142,7 +142,7 @@ class Swapped(Posterior):
 def wrong_correlation() -> CalibrationSetup:
     common = experiment(problem(fixed=("alpha", "beta", "gamma", "lag")))
     right = common.posterior
-    wrong = right.altered(noise=WrongCorrelation(right.only.actuator.interval, 3.0))
+    wrong = right.altered(noise=WrongCorrelation(right.single_record.actuator.interval, 3.0))
     return replace(common, posterior=wrong, source=right)
 
 

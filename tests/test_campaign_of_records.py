@@ -65,7 +65,7 @@ def test_joint_intervals_cover_the_truth_and_are_narrower_than_from_the_loops_al
     for seed in range(1, SEEDS + 1):
         problem = campaign(seed)
         both = intervals(problem, problem.posterior)
-        loops = intervals(problem, problem.posterior.alone("loops"))
+        loops = intervals(problem, problem.posterior.for_record("loops"))
         for name in JUDGED:
             low, high = both[name]
             covered[name].append(bool(low <= problem.config.truth[name] <= high))

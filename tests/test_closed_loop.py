@@ -45,7 +45,7 @@ def fitted(seed: int) -> bw.Run:
 
 def on_the_stand(fit: bw.Run) -> Tracking:
     """Return how well the true actuator follows, in as many runs as there were draws."""
-    one = fit.problem.posterior.only
+    one = fit.problem.posterior.single_record
     stand = bw.VirtualTestStand()
     known = stand.parameters()
     truth = np.array([[known[name] for name in one.actuator.parameters]])

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 import bwbayes as bw
 from bwbayes.app.commands import cli
-from bwbayes.app.fit.fitted import finished
+from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
@@ -92,7 +92,7 @@ def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any, folder: Pat
     which the bootstrap of readings does not see.
     """
     held_out = honest["validation"]["held_out"]
-    fit = finished(RunFolder.open(folder))
+    fit = open_finished(RunFolder.open(folder))
     flat = fit.result.flat_draws
     sets = [predictions(fit.problem, flat[i::8], training=False) for i in range(8)]
     covered = [np.mean(bands.covers("sensor", 95, np.asarray(bands.measured))) for (bands,) in sets]
@@ -146,8 +146,10 @@ def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
     """
     fit = bw.open_run(folder)
     record, posterior = fit.problem.record, fit.problem.posterior
-    model = posterior.only.table.actuator(posterior.prior.theta(fit.result.flat_draws)).mean(axis=0)
-    actuator = posterior.only.actuator.within(record.voltage)
+    model = posterior.single_record.table.actuator(
+        posterior.prior.theta(fit.result.flat_draws)
+    ).mean(axis=0)
+    actuator = posterior.single_record.actuator.within(record.voltage)
     assert record.displacement is not None
     displacement = np.asarray(record.displacement)
     smooth = [gaussian_filter1d(displacement, width / record.interval) for width in WIDTHS]
@@ -191,7 +193,7 @@ def test_the_voltage_computed_for_the_held_out_displacement_is_the_applied_one(
 def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
-    fit = finished(RunFolder.open(folder))
+    fit = open_finished(RunFolder.open(folder))
     return fit.problem.posterior, thin_draws(fit.flat_draws, np.random.default_rng(1))
 
 
@@ -252,7 +254,7 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
 ) -> None:
     """Their 95% bands cover 88 to 99%, and are at least 35% narrower than plain Bouc-Wen's."""
     assert parts["converged"]
-    fit = finished(RunFolder.open(parts_folder))
+    fit = open_finished(RunFolder.open(parts_folder))
     # So many draws are enough: most of their band is the discrepancy.
     chosen = thin_draws(fit.flat_draws, np.random.default_rng(1), 250)
     usual, knocked = on_cuts(fit.problem.posterior, chosen)

@@ -36,7 +36,7 @@ from bwbayes.model.inverse import inverse
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, build_part
 from bwbayes.model.step import OneStateStep
 from tests.app import small
 from tests.control.compiled import Compiled
@@ -224,7 +224,9 @@ def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)
-    assert np.max(np.abs(one - other) / (posterior.only.voltage.size + np.abs(one))) < 1e-10
+    assert (
+        np.max(np.abs(one - other) / (posterior.single_record.voltage.size + np.abs(one))) < 1e-10
+    )
 
 
 def test_what_is_compiled_for_an_operator_is_looked_up_without_its_module(
@@ -290,7 +292,7 @@ def test_bounds_that_ask_for_what_no_part_declares_are_refused() -> None:
 
 def test_an_option_that_an_operator_from_outside_does_not_have_is_refused() -> None:
     with pytest.raises(InputError, match="has no option passive; remove it"):
-        made("model.hysteresis", f"{HERE}:TanhLoop", HYSTERESIS, {"passive": True}, Operator)
+        build_part("model.hysteresis", f"{HERE}:TanhLoop", HYSTERESIS, {"passive": True}, Operator)
 
 
 def test_a_noise_or_filter_from_outside_is_checked_too() -> None:

@@ -120,11 +120,11 @@ def drawn(case: Case, size: int) -> list[dict[str, float]]:
 def test_both_read_the_same_case(reference: Reference) -> None:
     posterior, case = reference.problem.posterior, reference.case
     assert case.names == posterior.prior.names
-    assert case.training == posterior.only.training
-    assert case.hold == posterior.only.actuator.hold
-    np.testing.assert_allclose(case.interval, posterior.only.actuator.interval, rtol=1e-9)
-    np.testing.assert_array_equal(case.voltage, posterior.only.voltage)
-    np.testing.assert_array_equal(case.displacement, posterior.only.displacement)
+    assert case.training == posterior.single_record.training
+    assert case.hold == posterior.single_record.actuator.hold
+    np.testing.assert_allclose(case.interval, posterior.single_record.actuator.interval, rtol=1e-9)
+    np.testing.assert_array_equal(case.voltage, posterior.single_record.voltage)
+    np.testing.assert_array_equal(case.displacement, posterior.single_record.displacement)
 
 
 def test_the_reference_is_of_this_case(reference: Reference) -> None:

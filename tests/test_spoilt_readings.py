@@ -68,7 +68,10 @@ def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: i
         told(record, tmp_path, ASIDE),
         told(record, tmp_path),
     )
-    assert rows == np.flatnonzero(np.isnan(aside.problem.posterior.only.displacement)).tolist()
+    assert (
+        rows
+        == np.flatnonzero(np.isnan(aside.problem.posterior.single_record.displacement)).tolist()
+    )
     (remark,) = (line for line in aside.problem.remarks if "set aside" in line)
     assert remark.startswith("10 readings set aside as isolated outliers, at ")
     assert width(aside.bands["rest"]) == pytest.approx(width(clean.bands["rest"]), rel=0.1)
@@ -94,7 +97,9 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
     for seed in range(100, 100 + RECORDS):
         record, rows = spiky(measured(seed), seed)
         clean, aside = told(measured(seed), tmp_path), told(record, tmp_path, ASIDE)
-        gone = set(np.flatnonzero(np.isnan(aside.problem.posterior.only.displacement)).tolist())
+        gone = set(
+            np.flatnonzero(np.isnan(aside.problem.posterior.single_record.displacement)).tolist()
+        )
         outcome, false = outcome + len(gone & set(rows)), false + len(gone - set(rows))
         ratios.append(width(aside.bands["rest"]) / width(clean.bands["rest"]))
         for name, value in TRUTH.items():

@@ -16,7 +16,7 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference.voltage_noise import path_covariance, widened
+from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
@@ -83,7 +83,7 @@ def answer(fitted: Record, other: Record, folder: Path) -> Answer:
     draws, weights = weighted_draws(posterior, source, point)
     draws = draws[source.choice(len(draws), 8 * KEPT, p=weights)]
     more = path_covariance(posterior, {"record": problem.record.path}, point, source)
-    wide = widened(posterior.prior.unconstrain(draws), point.covariance, more)
+    wide = widen_draws(posterior.prior.unconstrain(draws), point.covariance, more)
     draws, _ = posterior.prior.constrain(wide)
     shape = draws[:, [posterior.names.index(name) for name in SHAPE]]
     truth = np.array([TRUTH[name] for name in SHAPE])

@@ -92,8 +92,11 @@ class OtherRecord:
         start_states = estimate_initial_states(posterior, theta, planned, self.start, generator)
         model = start_states.displacement(planned.inputs)[0]
         if self.start.estimate_offset and self.record.displacement is not None:
-            model = model + posterior.only.extent * generator.standard_normal()
-        noise, parameters = posterior.only.noise, posterior.only.table.noise(theta)
+            model = model + posterior.single_record.extent * generator.standard_normal()
+        noise, parameters = (
+            posterior.single_record.noise,
+            posterior.single_record.table.noise(theta),
+        )
         return Simulated.of(
             replace(self.record, truth=None),
             model,
@@ -119,7 +122,7 @@ class OtherRecord:
         return bands, simulated, window
 
 
-def covered(
+def band_coverage(
     predictions: Sequence[tuple[Bands, Simulated, slice]],
 ) -> Iterator[tuple[Kind, int, float]]:
     """Yield the part of simulated records' samples that lie inside each kind and level of band.

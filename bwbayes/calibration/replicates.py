@@ -20,7 +20,7 @@ from typing import TypedDict
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.records import OtherRecord, Simulated, covered
+from bwbayes.calibration.records import OtherRecord, Simulated, band_coverage
 from bwbayes.errors import one_line
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
@@ -223,7 +223,7 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     entry["covered"] = {
         f"{name} {kind} {level}".strip(): share
         for name, predicted in predictions.items()
-        for kind, level, share in covered(predicted)
+        for kind, level, share in band_coverage(predicted)
     }
     return Replicate(entry, drawn)
 
@@ -284,7 +284,7 @@ def _predictions(
     true = np.stack([theta[name] for name in source.prior.names], axis=1)
     for name, other in experiment.others.items():
         like = other.like or posterior.table.records[0]
-        another = other.simulated(source.alone(like), source.table.of(true, like), others)
-        single, record_draws = posterior.alone(like), posterior.select_draws(draws, like)
+        another = other.simulated(source.for_record(like), source.table.of(true, like), others)
+        single, record_draws = posterior.for_record(like), posterior.select_draws(draws, like)
         predictions[name] = [other.predicted(single, record_draws, another, others)]
     return predictions

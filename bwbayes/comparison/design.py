@@ -80,7 +80,7 @@ def rank_designs(
     K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10
     (1995) 273-304: c-optimality, averaged over the posterior.
     """
-    dataset, prior = posterior.only, posterior.prior
+    dataset, prior = posterior.single_record, posterior.prior
     scopes = {d.name: d.scope for d in dataset.actuator.declarations if d.name in prior.free_names}
     names = [name for name, scope in scopes.items() if scope == "actuator"]
     if isinstance(target, str) and target not in names:
@@ -105,7 +105,9 @@ def rank_designs(
             return prior.constrain(places)[0][:, [prior.free_names.index(target)]]
         return band.displacement(*prior.theta_at(places))
 
-    band = _planned(posterior, posterior.only.voltage if isinstance(target, str) else target)
+    band = _planned(
+        posterior, posterior.single_record.voltage if isinstance(target, str) else target
+    )
     factor = np.linalg.cholesky(covariance)
     gradients = [value_and_jacobian(targeted, place[np.newaxis], columns)[1][0] for place in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]

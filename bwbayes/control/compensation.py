@@ -106,7 +106,7 @@ class _Plan:
         )
         theta = self.posterior.prior.theta(self.draws)
         theta = self.posterior.noise_of_new(theta)
-        noise, rng = self.posterior.only.noise.at(self.reference.interval), self.rng()
+        noise, rng = self.posterior.single_record.noise.at(self.reference.interval), self.rng()
         rms, largest, squares = np.empty((3, len(theta), 2))
         for rows, displacement in self.displacements(voltage):
             errors = displacement[:, np.newaxis] - self.references
@@ -184,7 +184,7 @@ def compensate(
         posterior, draws, reference, InitialConditions(from_rest, False, settled=True), hold, seed
     )
     requested, target = plan.references
-    record = posterior.only
+    record = posterior.single_record
     slope, _ = np.polyfit(record.voltage[record.readings.rows], record.readings.values, 1)
     linear = np.clip(requested / slope, limits.low, limits.high)
     states = plan.initial_states(linear)

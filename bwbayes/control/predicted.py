@@ -231,9 +231,9 @@ class Compensation(Product):
 
     def plot(self) -> Figure:
         """Draw reference, prediction and error along time."""
-        from bwbayes.report.figures import control, drawn  # noqa: PLC0415  # slow to load
+        from bwbayes.report.figures import control, draw_styled  # noqa: PLC0415  # slow to load
 
-        return drawn(
+        return draw_styled(
             control.draw_command, self.reference.name, self.asked, self._commands, self.limit
         )
 

@@ -139,7 +139,7 @@ def _way(end: float, samples: int) -> FloatArray:
     return np.asarray(end * (1 - np.cos(np.pi * np.arange(samples) / samples)) / 2)
 
 
-def shaped(
+def build_reference(
     shape: str,
     interval: float,
     amplitude: float,

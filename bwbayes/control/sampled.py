@@ -160,9 +160,9 @@ class SampledStage(NamedTuple):
         if not self.stage.rate_independent:
             return self.stage.settle(self.numbers, value, memory), memory
         self.stage.settle(self.numbers, self.at_rest, memory)
-        return self.moved(memory, value)
+        return self.step(memory, value)
 
-    def moved(self, memory: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def step(self, memory: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) at a sample with a value, and the memory after it."""
         after = np.empty_like(memory)
         return self.stage.move(self.numbers, memory, value, after), after
@@ -396,7 +396,7 @@ def _passed(
     """Let a value (models,) pass stages in a row; return what comes out, and their memories."""
     after = []
     for stage, memory in zip(row, memories, strict=True):
-        value, reached = stage.moved(memory, value)
+        value, reached = stage.step(memory, value)
         after.append(reached)
     return value, tuple(after)
 

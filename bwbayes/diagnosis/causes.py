@@ -17,7 +17,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.departures import ODDS
 from bwbayes.diagnosis.explanations import likely_causes
-from bwbayes.diagnosis.finding import Finding, joined
+from bwbayes.diagnosis.finding import Finding, join_findings
 from bwbayes.diagnosis.model import tail_nats
 from bwbayes.diagnosis.series_patterns import Line, scatter, strongest_line
 from bwbayes.inference.noise import DiscrepancyNoise
@@ -95,7 +95,7 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
         _explanations(bands, np.flatnonzero(bands.scored(bands.measured)), memory),
         key=lambda finding: -finding.nats,
     )
-    likely = joined(likely_causes(ranked)) or Finding(
+    likely = join_findings(likely_causes(ranked)) or Finding(
         "unknown",
         "unknown (no pattern in the residuals)",
         "look at the residuals in the figure; train on a record like this one",

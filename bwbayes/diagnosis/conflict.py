@@ -134,7 +134,7 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
     for parameter in prior.free:
         name, (low, high) = parameter.name, parameter.support
         # A bound that the stage itself declares is no choice of the prior.
-        limits = parameter.declared.limits(prior.seen(values, parameter.record))
+        limits = parameter.declared.limits(prior.values_for_record(values, parameter.record))
         given_low, given_high = low > np.max(limits[0]), high < np.min(limits[1])
         if parameter.declared.reaches_floor and low == parameter.floor:
             if _near(values[name] - low):
@@ -147,7 +147,7 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
             yield _given_bound(parameter, "upper", high)
     for parameter in prior.parameters:
         declared = parameter.declared
-        limits = declared.limits(prior.seen(values, parameter.record))
+        limits = declared.limits(prior.values_for_record(values, parameter.record))
         for side, bound in zip(("lower", "upper"), limits, strict=True):
             advice = declared.pressed.get(side)
             if advice is None or not np.isfinite(bound).all():

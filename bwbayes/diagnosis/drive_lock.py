@@ -96,7 +96,7 @@ def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator
     Of ``draws`` (draws, free), parameters in their own units, some hundred are used, and of long
     records some thousand readings.
     """
-    record, readings = posterior.only, posterior.only.readings
+    record, readings = posterior.single_record, posterior.single_record.readings
     if readings.rows.size <= 10 * NEIGHBORS:
         return DriveLock(0.0, 1.0)  # they tell nothing
     theta = posterior.prior.theta(draws[rng.integers(len(draws), size=DRAWN)])

@@ -70,12 +70,12 @@ def step(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
     Where readings before it were not fitted, the largest of theirs says when it was.
     """
-    rows = scene.posterior.only.readings.rows
+    rows = scene.posterior.single_record.readings.rows
     white = np.abs(scene.innovations)
     white[: max(white.size // 50, 1)] = 0.0
     number = int(np.argmax(white))
     between = scene.posterior.altered(training=(slice(rows[number - 1], rows[number] + 1),))
-    rows_between = between.only.readings.rows
+    rows_between = between.single_record.readings.rows
     white_between = np.abs(innovations(between, scene.fit.free).white)[1:]
     later = 1 + int(np.argmax(white_between))
     row = int(rows_between[later])
@@ -90,7 +90,7 @@ def step(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def oscillation(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A sin ωt + B cos ωt at the innovations' strongest frequency that the drive has not."""
-    rows = scene.posterior.only.readings.rows
+    rows = scene.posterior.single_record.readings.rows
     line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
     if line is None:
         return
@@ -118,7 +118,7 @@ def moving_gain(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def reversed_sign(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try −x, if the readings fall where the voltage rises."""
-    record = scene.posterior.only
+    record = scene.posterior.single_record
     readings, drive = record.readings, record.voltage[record.readings.rows]
     if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) >= 0:
         return
@@ -142,7 +142,7 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
     fit = scene.extended(Effect(np.array([[-1.0], [0.0], [1.0]]), drive=shifted))
     yield _late(scene, scale * float(fit.sizes[0]), fit)
-    record, limit = scene.posterior.only, min(0.55 * scene.turn_time, 0.2 * scene.duration)
+    record, limit = scene.posterior.single_record, min(0.55 * scene.turn_time, 0.2 * scene.duration)
     kept = np.full(record.displacement.size, np.nan)
     for window in record.training:
         kept[window] = record.displacement[window]

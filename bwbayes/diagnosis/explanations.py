@@ -61,7 +61,7 @@ def explain(scene: ResidualAnalysis, watch: Watch = unwatched) -> tuple[Explanat
     called with the share that is done.
     """
     best: dict[str, Explanation] = {}
-    if scene.posterior.only.is_followed(scene.fit.displacement):
+    if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
     rough = scene.with_rough_noise()
     kinds = ADDITIONS + CHANGES

@@ -59,7 +59,7 @@ class Finding:
         return f"Likely cause: {self.note}"
 
 
-def joined(findings: Sequence[Finding]) -> Finding | None:
+def join_findings(findings: Sequence[Finding]) -> Finding | None:
     """Return findings that cannot be told apart as one; None if there is none."""
     if not findings:
         return None

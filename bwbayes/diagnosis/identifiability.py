@@ -58,8 +58,8 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     swings = np.concatenate([np.abs(np.diff(v[turning_points(v)])) for v in windows])
     free = posterior.prior.constrain(point.mode[np.newaxis])[0]
     _, single, record_free = next(posterior.each(free))
-    columns = single.only.table.columns(single.prior.theta(record_free))
-    opening = single.only.actuator.hysteresis.opening(columns, half)
+    columns = single.single_record.table.columns(single.prior.theta(record_free))
+    opening = single.single_record.actuator.hysteresis.opening(columns, half)
     advice = "add larger and smaller amplitudes"
     # A loop closes where its opening is about one; below 0.3 it hardly opens.
     if opening is not None and opening[0] < 0.3:
@@ -113,7 +113,7 @@ def _columns(posterior: Posterior, names: tuple[str, ...]) -> list[int]:
 def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float]) -> float:
     """Return a parameter's prior sd around its value in ``values``."""
     columns = {name: np.array([value]) for name, value in values.items()}
-    lower, upper = parameter.declared.limits(prior.seen(columns, parameter.record))
+    lower, upper = parameter.declared.limits(prior.values_for_record(columns, parameter.record))
     if np.isfinite(lower).all() and np.isfinite(upper).all():
         # What the bounds leave to a parameter of which nothing else is known.
         return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))

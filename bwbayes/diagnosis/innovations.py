@@ -139,7 +139,7 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
 
     ``begin`` is the time of the record's first sample, s.
     """
-    record, readings = posterior.only, posterior.only.readings
+    record, readings = posterior.single_record, posterior.single_record.readings
     theta = posterior.prior.theta(free[np.newaxis])
     residual = readings.values - posterior.simulate(theta, readings.rows)
     parameters = record.table.noise(theta)

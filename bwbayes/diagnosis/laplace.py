@@ -97,19 +97,19 @@ class LocalFit:
     @property
     def rmse(self) -> float:
         """Root mean square of readings less displacement, um."""
-        residual = self.posterior.only.readings.values - self.displacement
+        residual = self.posterior.single_record.readings.values - self.displacement
         return float(np.sqrt(np.mean(residual**2)))
 
     @property
     def follows(self) -> bool:
         """Whether it misses less than a constant would: else the noise takes up the readings."""
-        return self.rmse < float(np.std(self.posterior.only.readings.values))
+        return self.rmse < float(np.std(self.posterior.single_record.readings.values))
 
     def error(self, windows: Sequence[slice]) -> float:
         """Root mean square, um, of what it misses of the readings in windows; nan of none."""
         if not windows:
             return np.nan
-        record = self.posterior.only
+        record = self.posterior.single_record
         likelihood = self.posterior.likelihood
         model = likelihood.table.actuator(self.posterior.prior.theta(self.free[np.newaxis]))
         sizes = self.sizes[np.newaxis]

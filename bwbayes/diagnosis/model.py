@@ -30,7 +30,7 @@ from bwbayes.model.spec import ModelSpec
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
-    nonlinearity = scene.posterior.only.actuator.nonlinearity
+    nonlinearity = scene.posterior.single_record.actuator.nonlinearity
     present = set(nonlinearity.terms) if nonlinearity else set()
     for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
@@ -39,13 +39,13 @@ def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def creep(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try slow lags."""
-    if scene.posterior.only.actuator.creep is None:
+    if scene.posterior.single_record.actuator.creep is None:
         yield from _changed(scene, "creep", ("creep",))
 
 
 def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a mass on a spring; readings show the ratios of its parameters alone."""
-    if scene.posterior.only.actuator.dynamics == "second-order":
+    if scene.posterior.single_record.actuator.dynamics == "second-order":
         return
     frequency = 10 / scene.turn_time
     stiffness, damping = ((2 * np.pi * frequency) ** power for power in (2, 1))
@@ -88,7 +88,7 @@ def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanati
 
 def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the other thing that the voltage may do between samples."""
-    other = "first" if scene.whole.only.actuator.hold == "zero" else "zero"
+    other = "first" if scene.whole.single_record.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
     if other == "first":
         text = "voltage that changes steadily between samples"
@@ -97,7 +97,7 @@ def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try other hysteresis operators."""
-    present = type(scene.posterior.only.actuator.hysteresis)
+    present = type(scene.posterior.single_record.actuator.hysteresis)
     # Compiled ones, each of another family, and plays of any weights, which follow loops that no
     # formula has.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
@@ -116,7 +116,7 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
-    if isinstance(scene.posterior.only.noise, DiscrepancyNoise) and scene.before is None:
+    if isinstance(scene.posterior.single_record.noise, DiscrepancyNoise) and scene.before is None:
         facts = {"noise": True}
         yield from _changed(scene, "a smooth discrepancy", (), facts=facts, noise="smooth")
 
@@ -198,12 +198,12 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     if not far.any():
         return
     text = f"outliers ({np.sum(far)} of {white.size} innovations beyond 5 SD)"
-    others = (scene.posterior.only.readings.values - scene.fit.displacement)[~far]
+    others = (scene.posterior.single_record.readings.values - scene.fit.displacement)[~far]
     rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
     fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
     # Not where they are few and far off: tails that hold those would be too heavy for the others.
     study = scene.study
-    tailed = study is not None and scene.posterior.only.noise.tailed
+    tailed = study is not None and scene.posterior.single_record.noise.tailed
     if study is not None and not tailed and nats > isolated_nats(white):
         spec = replace(study.spec, noise=f"{study.spec.noise} + student")
         fix = _lines(study.spec, spec)
@@ -255,7 +255,7 @@ def isolated_nats(white: FloatArray) -> float:
 
 def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try innovations of sd exp(a + b g), g the drive's speed or distance from its center."""
-    rows, white = scene.posterior.only.readings.rows, scene.innovations
+    rows, white = scene.posterior.single_record.readings.rows, scene.innovations
     center = (scene.voltage.max() + scene.voltage.min()) / 2
     for kind, drive in (("speed", scene.rate), ("voltage", scene.voltage - center)):
         growth = np.abs(drive)[rows]

@@ -99,7 +99,9 @@ def check_predictions(
     watch
         Called with the share that is done.
     """
-    dataset = posterior.only if record is None else posterior.alone(record).only
+    dataset = (
+        posterior.single_record if record is None else posterior.for_record(record).single_record
+    )
     count = min(200, len(draws))  # p-values come in steps of one over them
     chosen = draws[generator.choice(len(draws), count, replace=False)]
     theta = posterior.prior.theta(chosen)

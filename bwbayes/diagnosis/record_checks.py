@@ -18,10 +18,10 @@ from bwbayes.diagnosis.series_patterns import (
     FrozenRun,
     clipped,
     copies,
-    held,
+    find_held,
+    find_repeated,
     lasting_jumps,
     moves_between,
-    repeated,
     resolution,
     scatter,
     spikes,
@@ -316,14 +316,14 @@ def _stuck(record: Record) -> Iterator[Finding]:
     """Find readings that stay where they are while the voltage moves on."""
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     voltage = record.voltage[rows]
-    repeats, jump = repeated(voltage, displacement), "repeat the one before{} and then jump{}"
+    repeats, jump = find_repeated(voltage, displacement), "repeat the one before{} and then jump{}"
     if (times := copies(voltage, displacement)) > 1:
         text = f"every sample is written {times} times"
         yield _whole(record, "repeated samples", text, f"decimate = {times} under [record]")
     elif repeats is not None:
         seen = f"samples {jump.format(', voltage and displacement,', '')}"
         yield _where(record, rows, "repeated samples", seen, repeats)
-    elif (holds := held(voltage, displacement)) is not None:
+    elif (holds := find_held(voltage, displacement)) is not None:
         seen = f"readings {jump.format('', ', while the voltage moves')}"
         yield _where(record, rows, "held readings", seen, holds)
     limits: list[str] = []

@@ -18,7 +18,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study
-from bwbayes.inference.thinning import readings_at, stride_of, thin, thin_posterior, thinned_windows
+from bwbayes.inference.thinning import readings_at, stride_of, thin, thin_posterior, thin_windows
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
@@ -137,15 +137,15 @@ class ResidualAnalysis:
         whole, posterior = posterior, thin_posterior(posterior, theta, READINGS)
         if posterior is not whole:
             posterior = posterior.altered(displacement=readings_at(posterior, whole, theta))
-        rows = posterior.only.readings.rows
+        rows = posterior.single_record.readings.rows
         if rows.size > READINGS:
             # Every so many of them: the voltage stays as it is.
             retained = rows[:: -(-rows.size // READINGS)]
-            readings = posterior.only.displacement.copy()
+            readings = posterior.single_record.displacement.copy()
             readings[np.setdiff1d(rows, retained)] = np.nan
             posterior, rows = posterior.altered(displacement=readings), retained
         first = int(rows[rows.size // 5])
-        windows = posterior.only.training
+        windows = posterior.single_record.training
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
         places = optima
         try:
@@ -157,7 +157,7 @@ class ResidualAnalysis:
         best = max((climb(posterior, p) for p in places), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
-        held_out = thinned_windows(held_out, stride_of(posterior, whole))
+        held_out = thin_windows(held_out, stride_of(posterior, whole))
         return cls(best, whole, starts, generator, held_out, begin, study)
 
     def with_rough_noise(self) -> ResidualAnalysis | None:
@@ -166,7 +166,7 @@ class ResidualAnalysis:
         A smooth discrepancy takes up what an explanation is to explain, and no climb leads from
         there to where it leaves that to the explanation.
         """
-        if self.study is None or not isinstance(self.posterior.only.noise, SmoothNoise):
+        if self.study is None or not isinstance(self.posterior.single_record.noise, SmoothNoise):
             return None
         rough = replace(self.study.spec, noise="discrepancy")
         study = self.study.with_model(rough)
@@ -189,12 +189,12 @@ class ResidualAnalysis:
     @property
     def interval(self) -> float:
         """Sampling interval, s."""
-        return self.posterior.only.actuator.interval
+        return self.posterior.single_record.actuator.interval
 
     @property
     def time(self) -> FloatArray:
         """Time since the first reading (samples,), s, along the whole record."""
-        record = self.posterior.only
+        record = self.posterior.single_record
         samples = np.arange(record.voltage.size) - record.readings.rows[0]
         time: FloatArray = self.interval * np.maximum(samples, 0.0)
         return time
@@ -202,13 +202,13 @@ class ResidualAnalysis:
     @property
     def duration(self) -> float:
         """Time from the first reading to the last, s."""
-        rows = self.posterior.only.readings.rows
+        rows = self.posterior.single_record.readings.rows
         return self.interval * max(float(rows[-1] - rows[0]), 1.0)
 
     @property
     def voltage(self) -> FloatArray:
         """Voltage (samples,) up to the last reading, V."""
-        return self.posterior.only.voltage[: self.posterior.only.readings.samples]
+        return self.posterior.single_record.voltage[: self.posterior.single_record.readings.samples]
 
     @property
     def rate(self) -> FloatArray:
@@ -223,7 +223,7 @@ class ResidualAnalysis:
     @property
     def extent(self) -> float:
         """Range of the readings, um."""
-        return self.posterior.only.extent
+        return self.posterior.single_record.extent
 
     @cached_property
     def innovations(self) -> FloatArray:
@@ -237,7 +237,7 @@ class ResidualAnalysis:
         What the discrepancy takes up, no other model can gain more; inf without a discrepancy, as
         the sensor's noise takes it up then.
         """
-        record = self.posterior.only
+        record = self.posterior.single_record
         if not record.noise.states:
             return np.inf
         parameters = record.table.noise(self.posterior.prior.theta(self.fit.free[np.newaxis]))
@@ -266,14 +266,17 @@ class ResidualAnalysis:
 
     def clock(self, time: float) -> str:
         """Write a time since the first reading as one of the record, s."""
-        first = self.begin + self.interval * float(self.posterior.only.readings.rows[0])
+        first = self.begin + self.interval * float(self.posterior.single_record.readings.rows[0])
         return clock(first + time, self.interval)
 
     def rebuilt(self, study: Study) -> Posterior:
         """Return the posterior of another model and the same readings."""
-        rebuilt, readings = study.posterior, self.posterior.only.displacement
-        posterior = replace(rebuilt, datasets=(thin(rebuilt.only, self.stride),))
-        if self.stride > 1 and rebuilt.only.actuator.hold != self.whole.only.actuator.hold:
+        rebuilt, readings = study.posterior, self.posterior.single_record.displacement
+        posterior = replace(rebuilt, datasets=(thin(rebuilt.single_record, self.stride),))
+        if (
+            self.stride > 1
+            and rebuilt.single_record.actuator.hold != self.whole.single_record.actuator.hold
+        ):
             # Of a thinned record the hold is in the readings.
             theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
             held = readings_at(posterior, rebuilt, theta)
@@ -296,7 +299,10 @@ class ResidualAnalysis:
 
     def confirmed(self, explanation: Explanation) -> Explanation:
         """Weigh another model on all readings, if the scene looked at some of them."""
-        few = self.posterior.only.readings.rows.size < self.whole.only.readings.rows.size
+        few = (
+            self.posterior.single_record.readings.rows.size
+            < self.whole.single_record.readings.rows.size
+        )
         spec, coordinates = explanation.spec, explanation.coordinates
         if not few or self.study is None or spec is None or coordinates is None:
             return explanation
@@ -327,7 +333,7 @@ class ResidualAnalysis:
         shift = 0.0
         if fit.posterior is self.posterior:
             # The largest shift of the actuator's parameters, in sds of both fits together.
-            of_record = self.posterior.only.table.of_scope("record", "event")
+            of_record = self.posterior.single_record.table.of_scope("record", "event")
             rows = [
                 row
                 for row, name in enumerate(self.posterior.names)

@@ -66,7 +66,7 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
         # One that needs a prior that is not stated is no rival.
         with suppress(InputError):
             posterior = study.with_model(spec).posterior
-            posterior = replace(posterior, datasets=(thin(posterior.only, stride),))
+            posterior = replace(posterior, datasets=(thin(posterior.single_record, stride),))
             start = np.array([[known.get(name, 0.0) for name in posterior.names]])
             places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
             fits.append(climb(posterior, places))
@@ -98,7 +98,7 @@ def disagreement(
         Draws rivals' parameters and initial states.
     """
     draws = draws[rng.integers(len(draws), size=DRAWS)]
-    trained = posterior.only
+    trained = posterior.single_record
     theta = posterior.prior.theta(draws)
     fitted = np.mean(posterior.simulate(theta), axis=0)
     missed = trained.readings.values - fitted[trained.readings.rows]
@@ -109,7 +109,7 @@ def disagreement(
     for rival in rivals:
         if rival.rmse > most:
             continue
-        rows = rival.posterior.only.readings.rows * stride_of(rival.posterior, posterior)
+        rows = rival.posterior.single_record.readings.rows * stride_of(rival.posterior, posterior)
         training = np.mean((rival.displacement - fitted[rows]) ** 2)
         other = predict_record(rival.posterior, _laplace(rival, rng), record, start, rng)
         apart = other.mean[scored] - predicted.mean[scored]

@@ -162,7 +162,7 @@ def clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
     return enough
 
 
-def held(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
+def find_held(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
     """Return where readings (samples,) are held while the voltage moves, and then jump.
 
     A coarse sensor repeats itself where it moves slowly, and goes on by a step or two; one that is
@@ -204,7 +204,7 @@ def _jumps(before: FloatArray, after: FloatArray, step: float) -> BoolArray:
     return result
 
 
-def repeated(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
+def find_repeated(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
     """Return where whole samples are repeated and what follows has gone on without them.
 
     The voltage (samples,) then jumps by as many of its steps as samples were repeated; that of a

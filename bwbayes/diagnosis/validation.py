@@ -31,11 +31,11 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
 from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
-from bwbayes.diagnosis.finding import Finding, joined
+from bwbayes.diagnosis.finding import Finding, join_findings
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import ExitStatus, InputError
 from bwbayes.inference.posterior import Posterior
-from bwbayes.prediction.bands import Bands, titled
+from bwbayes.prediction.bands import Bands, title_of
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import brief
 
@@ -69,7 +69,7 @@ class ValidationContext:
         """Return what a posterior and its draws (draws, free) say."""
         memory, noise_log_sd = [], []
         for _, single, record_draws in posterior.each(draws):
-            dataset = single.only
+            dataset = single.single_record
             noise = dataset.table.noise(single.prior.theta(record_draws))
             # Rather too long than too short.
             memory.append(float(np.quantile(dataset.noise.correlation_time(noise), 0.9)))
@@ -128,7 +128,7 @@ class BandValidation:
     @property
     def where(self) -> str:
         """Name and kind of the record."""
-        return titled(self.name, training=self.training, separate=self.separate)
+        return title_of(self.name, training=self.training, separate=self.separate)
 
     @property
     def line(self) -> str:
@@ -255,7 +255,7 @@ def validate_bands(
     if reasons:
         missed = any(reason.startswith("NRMSE") for reason in reasons)
         mending = [each for each in explanations if each.mends or not missed]
-        why = joined(likely_causes(mending)) or (
+        why = join_findings(likely_causes(mending)) or (
             REVERSED_SIGN
             if reasons[0].startswith("the readings fall")
             else cause(bands, background.memory, beyond)
@@ -265,7 +265,9 @@ def validate_bands(
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"
         for text, chance in standard.chances()
     ]
-    better, followed = (joined(find(explanations)) for find in (better_models, followed_causes))
+    better, followed = (
+        join_findings(find(explanations)) for find in (better_models, followed_causes)
+    )
     if followed is not None:
         doubts.append(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"

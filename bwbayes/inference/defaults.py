@@ -65,7 +65,7 @@ def rounding_sd(readings: FloatArray) -> float:
     return rounding if enough and noise_sd(readings)[0] < 1.1 * rounding else 0.0
 
 
-def joined(records: Sequence[Ranges]) -> Ranges:
+def join_ranges(records: Sequence[Ranges]) -> Ranges:
     """Return the ranges of several records of one actuator together.
 
     Displacements are not held against each other, for sensors are set to zero between records: the

@@ -18,7 +18,7 @@ Engine = Literal["numpy", "numba"]
 EngineChoice = Literal["auto", "numpy", "numba"]
 
 
-def choose(choice: EngineChoice = "auto") -> Engine:
+def resolve_engine(choice: EngineChoice = "auto") -> Engine:
     """Return the engine to use.
 
     Raises

@@ -106,7 +106,7 @@ def local_minima(
     InputError
         As :func:`fit`.
     """
-    known = posterior.only
+    known = posterior.single_record
     covered = np.maximum.accumulate(known.voltage) - np.minimum.accumulate(known.voltage)
     everywhere = int(np.searchsorted(covered, 0.9 * covered[-1]))
     last = max(everywhere, int(known.readings.rows[0])) + SAMPLES

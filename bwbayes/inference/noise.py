@@ -14,14 +14,14 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.state_space import Noise
-from bwbayes.model.declaration import Context, Declaration, lognormal, rounded
+from bwbayes.model.declaration import Context, Declaration, lognormal, round_to_scale
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.registry import made
+from bwbayes.model.registry import build_part
 
 
 def _sensor_sd(context: Context) -> Distribution:
     """Return the default prior of the sensor's sd; where rounding alone is seen, above its sd."""
-    if not (rounding := rounded(context.ranges.rounding)):
+    if not (rounding := round_to_scale(context.ranges.rounding)):
         return lognormal(0.006 * context.ranges.displacement, 2.0)
     # What is seen may be all there is; a model that misses some of it needs many times that.
     return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
@@ -331,5 +331,7 @@ def noise_model(kind: str, interval: float) -> Noise:
     ['sensor_sd', 'discrepancy_sd', 'discrepancy_time']
     """
     options = {"interval": interval}
-    first, *others = (made("noise", k.strip(), NOISES, options, Noise) for k in kind.split("+"))
+    first, *others = (
+        build_part("noise", k.strip(), NOISES, options, Noise) for k in kind.split("+")
+    )
     return sum(others, start=first)

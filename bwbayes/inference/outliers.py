@@ -109,7 +109,7 @@ def surprise(
     Backwards in time the states go on by P₀ Fᵀ P₀⁻¹.
     """
     theta = posterior.prior.theta(posterior.prior.constrain(position[np.newaxis])[0])
-    dataset, readings = posterior.only, readings or posterior.only.readings
+    dataset, readings = posterior.single_record, readings or posterior.single_record.readings
     simulated = posterior.simulate(theta, readings.rows)[0]
     residual = readings.values - simulated
     noise = dataset.noise.at(dataset.actuator.interval * readings.stride)

@@ -308,7 +308,7 @@ class JointPrior:
             np.asarray(high) if upper.ndim == 0 and upper >= high else np.minimum(high, upper),
         )
 
-    def seen(self, values: Values, record: str) -> Values:
+    def values_for_record(self, values: Values, record: str) -> Values:
         """Return values by the names that the parts declare, as one record has them.
 
         ``values`` are by the parameters' names, and some may be missing; ``record`` is empty if
@@ -323,7 +323,9 @@ class JointPrior:
         """Return the bounds (models,) that other values set; of several records, the tightest."""
         # Those of a parameter that all records have depend on the values of each.
         views = (parameter.record,) if parameter.record or not self.records else self.records
-        limits = [parameter.declared.limits(self.seen(values, record)) for record in views]
+        limits = [
+            parameter.declared.limits(self.values_for_record(values, record)) for record in views
+        ]
         low, high = limits[0]
         for lower, upper in limits[1:]:
             low, high = np.maximum(low, lower), np.minimum(high, upper)
@@ -334,5 +336,5 @@ class JointPrior:
         possible = np.asarray(True)
         if self.constraint is not None:
             for record in self.records or ("",):
-                possible = possible & self.constraint(self.seen(values, record))
+                possible = possible & self.constraint(self.values_for_record(values, record))
         return possible

@@ -171,8 +171,8 @@ class Posterior:
         return self.joint or replace(self.datasets[0].table, records=names)
 
     @property
-    def only(self) -> Dataset:
-        """The record, of a posterior of one; see :meth:`alone` for one of several.
+    def single_record(self) -> Dataset:
+        """The record, of a posterior of one; see :meth:`for_record` for one of several.
 
         Raises
         ------
@@ -237,7 +237,7 @@ class Posterior:
         Each is (some models, rows), in the order of θ.
         """
         number = 0 if record is None else self.table.records.index(record)
-        dataset = self.only if record is None else self.datasets[number]
+        dataset = self.single_record if record is None else self.datasets[number]
         likelihood, theta = self.likelihoods[number], self.table.of(theta, dataset.name)
         model = dataset.table.actuator(theta)
         initial_transient = likelihood.start(theta).mean if likelihood.unknowns else None
@@ -291,7 +291,7 @@ class Posterior:
 
         Of a posterior of one record; ``theta`` (models, parameters) are draws from it.
         """
-        readings = self.only.readings
+        readings = self.single_record.readings
 
         def missed() -> float:
             total = np.zeros(readings.rows.size)
@@ -299,13 +299,15 @@ class Posterior:
                 total += simulated.sum(axis=0)
             return float(np.mean((readings.values - total / len(theta)) ** 2))
 
-        return self.only.noise.for_new_readings(self.only.table.noise(theta), missed)
+        return self.single_record.noise.for_new_readings(
+            self.single_record.table.noise(theta), missed
+        )
 
     def altered(self, *, voltage: FloatArray | None = None, **fields: Any) -> Posterior:
         """Return a posterior of one record with another voltage, or other fields of its dataset."""
         if voltage is not None:
-            fields["inputs"] = replace(self.only.inputs, voltage=voltage)
-        return replace(self, datasets=(replace(self.only, **fields),))
+            fields["inputs"] = replace(self.single_record.inputs, voltage=voltage)
+        return replace(self, datasets=(replace(self.single_record, **fields),))
 
     def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:
         """Return the posterior of other training windows of the same records, by name."""
@@ -327,10 +329,10 @@ class Posterior:
         return self.with_readings(displacements)
 
     @cached_property
-    def _alone(self) -> dict[str, Posterior]:
+    def _by_record(self) -> dict[str, Posterior]:
         """The posterior of each record alone."""
         if len(self.datasets) == 1:
-            return {self.only.name: self}
+            return {self.single_record.name: self}
         posteriors = {}
         for dataset in self.datasets:
             columns = self.table.columns_of[dataset.name]
@@ -341,13 +343,13 @@ class Posterior:
             posteriors[dataset.name] = Posterior((dataset,), prior, self.engine)
         return posteriors
 
-    def alone(self, record: str) -> Posterior:
+    def for_record(self, record: str) -> Posterior:
         """Return the posterior of one record alone, its parameters by their plain names."""
-        return self._alone[record]
+        return self._by_record[record]
 
     def select_draws(self, draws: FloatArray, record: str) -> FloatArray:
         """Return the columns of draws (draws, free) that are free parameters of a record alone."""
-        names = (self.table.name_of(name, record) for name in self.alone(record).names)
+        names = (self.table.name_of(name, record) for name in self.for_record(record).names)
         columns = [self.names.index(name) for name in names]
         columns_of: FloatArray = draws[..., columns]
         return columns_of
@@ -356,4 +358,4 @@ class Posterior:
         """Yield the records one by one, with their parameters of draws (draws, free)."""
         for dataset in self.datasets:
             name = dataset.name
-            yield RecordView(name, self.alone(name), self.select_draws(draws, name))
+            yield RecordView(name, self.for_record(name), self.select_draws(draws, name))

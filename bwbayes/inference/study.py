@@ -20,7 +20,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.inference.defaults import joined, ranges_of
+from bwbayes.inference.defaults import join_ranges, ranges_of
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameter_table import Column, ParameterTable
@@ -125,7 +125,7 @@ class Study:
         )
         return replace(self, spec=spec, stated=stated, per_record=per_record, shared=shared)
 
-    def alone(self, record: str) -> Self:
+    def for_record(self, record: str) -> Self:
         """Return the study of one of the records, with what is stated of its own parameters."""
         stated = {name.removesuffix(f"[{record}]"): said for name, said in self.stated.items()}
         return replace(
@@ -234,7 +234,7 @@ class Study:
         if not varied:
             table = place_of(next(iter(self.records)))
             raise InputError(f"{table}.train: voltage or displacement is constant there; widen it")
-        pooled = joined(varied)
+        pooled = join_ranges(varied)
         contexts = {"": Context(pooled, self._values())}
         for name, extents in ranges.items():
             # A record whose voltage stands still says where its sensor is, and nothing else.

@@ -65,7 +65,7 @@ def thin(dataset: Dataset, stride: int) -> Dataset:
         dataset,
         inputs=inputs,
         displacement=dataset.displacement[::stride],
-        training=thinned_windows(dataset.training, stride),
+        training=thin_windows(dataset.training, stride),
         actuator=actuator,
         noise=dataset.noise.at(inputs.interval),
     )
@@ -78,18 +78,18 @@ def readings_at(short: Posterior, whole: Posterior, theta: FloatArray) -> FloatA
     displacement, so that no other model gains from mending that.
     """
     stride = stride_of(short, whole)
-    before = displacement(whole, whole.only, theta)[0, ::stride]
-    after = displacement(short, short.only, theta)[0]
-    readings: FloatArray = whole.only.displacement[::stride] + after - before
+    before = displacement(whole, whole.single_record, theta)[0, ::stride]
+    after = displacement(short, short.single_record, theta)[0]
+    readings: FloatArray = whole.single_record.displacement[::stride] + after - before
     return readings
 
 
 def stride_of(short: Posterior, whole: Posterior) -> int:
     """Return the samples of a whole record for each of a thinned one."""
-    return round(short.only.inputs.interval / whole.only.inputs.interval)
+    return round(short.single_record.inputs.interval / whole.single_record.inputs.interval)
 
 
-def thinned_windows(windows: Iterable[slice], stride: int) -> tuple[slice, ...]:
+def thin_windows(windows: Iterable[slice], stride: int) -> tuple[slice, ...]:
     """Return where windows of a record (slices of its samples) are in a thinned one."""
     return tuple(slice(-(-w.start // stride), -(-w.stop // stride)) for w in windows)
 

@@ -58,7 +58,7 @@ def path_covariance(
     return added
 
 
-def widened(coordinates: FloatArray, covariance: FloatArray, more: FloatArray) -> FloatArray:
+def widen_draws(coordinates: FloatArray, covariance: FloatArray, more: FloatArray) -> FloatArray:
     """Return draws (..., free) of a posterior of a ``covariance`` C that has ``more`` now: C + M.
 
     Each moves linearly away from their mean, by L(C + M) L(C)⁻¹ with Cholesky's factors L, so that

@@ -30,7 +30,7 @@ from bwbayes.model.linear import Hold, Sections
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.registry import DYNAMICS, made
+from bwbayes.model.registry import DYNAMICS, build_part
 from bwbayes.model.stage import Advance, Side, Stage, Timing, begin_stages, pass_stages
 from bwbayes.shown import brief
 
@@ -108,7 +108,7 @@ class Actuator:
     stages: tuple[Stage, ...] = ()
 
     def __post_init__(self) -> None:
-        made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
+        build_part("dynamics", self.dynamics, DYNAMICS, {}, Filter)
         if self.hold not in get_args(Hold):
             choices = ", ".join(get_args(Hold))
             raise InputError(f"hold: {self.hold!r} is unknown; write one of {choices}")
@@ -118,7 +118,7 @@ class Actuator:
     @cached_property
     def filter(self) -> Filter:
         """The linear dynamics."""
-        return made("dynamics", self.dynamics, DYNAMICS, {}, Filter)
+        return build_part("dynamics", self.dynamics, DYNAMICS, {}, Filter)
 
     @cached_property
     def declarations(self) -> tuple[Declaration, ...]:

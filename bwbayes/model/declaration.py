@@ -203,15 +203,17 @@ def refuse(name: str, wrong: BoolArray, values: FloatArray, demand: str) -> None
 
 def lognormal(median: float, sigma: float) -> Distribution:
     """Return a lognormal prior with rounded arguments."""
-    return Distribution("lognormal", {"median": rounded(median), "sigma": rounded(sigma)})
+    return Distribution(
+        "lognormal", {"median": round_to_scale(median), "sigma": round_to_scale(sigma)}
+    )
 
 
 def normal(mean: float, sd: float) -> Distribution:
     """Return a normal prior with rounded arguments; the mean need not be more exact than the sd."""
-    return Distribution("normal", {"mean": rounded(mean, sd), "sd": rounded(sd)})
+    return Distribution("normal", {"mean": round_to_scale(mean, sd), "sd": round_to_scale(sd)})
 
 
-def rounded(value: float, scale: float | None = None) -> float:
+def round_to_scale(value: float, scale: float | None = None) -> float:
     """Keep three digits of the value, or of another ``scale`` that it need not be more exact than.
 
     A default prior is not more exact than that, and people read it.

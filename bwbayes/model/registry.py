@@ -66,7 +66,7 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
 }
 
 
-def choose[Part](
+def resolve_part[Part](
     where: str, name: str, registry: Mapping[str, Callable[..., Part]]
 ) -> Callable[..., Part]:
     """Return what makes the part of that name, or of that import path ``module:Class``.
@@ -94,7 +94,7 @@ def choose[Part](
     return maker
 
 
-def made[Part](
+def build_part[Part](
     where: str,
     name: str,
     registry: Mapping[str, Callable[..., Part]],
@@ -109,7 +109,7 @@ def made[Part](
         As :func:`choose`; or the part does not take an option, cannot be made, or is not of the
         ``kind`` that is asked for.
     """
-    maker = choose(where, name, registry)
+    maker = resolve_part(where, name, registry)
     arguments = {key: value for key, value in options.items() if value is not None}
     takes = inspect.signature(maker).parameters
     for key in arguments:

@@ -18,7 +18,7 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.linear import Hold
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, made
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, build_part
 from bwbayes.model.stage import Side, Stage
 
 Slot = Literal["input", "operator", "nonlinearity", "dynamics", "creep", "output"]
@@ -227,7 +227,7 @@ class ModelSpec:
             keys["dynamics"],
             hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
             interval,
-            made(
+            build_part(
                 "model.hysteresis",
                 self.operator.name,
                 HYSTERESIS,
@@ -237,7 +237,7 @@ class ModelSpec:
             PolynomialNonlinearity(terms, extent.span) if terms else None,
             creep,
             extent.span,
-            tuple(made("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
+            tuple(build_part("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
         )
 
     def __str__(self) -> str:
@@ -264,4 +264,4 @@ def _slot_of(name: str) -> Slot:
 
 
 def _side_of(name: str) -> Side:
-    return made("model.stages", name, STAGES, {}, Stage).side
+    return build_part("model.stages", name, STAGES, {}, Stage).side

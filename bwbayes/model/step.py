@@ -83,7 +83,7 @@ class HysteresisStep(ABC):
     def coefficients(self) -> dict[str, tuple[Any, str]]:
         """Return what the equation of the first model has: numbers by name, and their units."""
 
-    def go(self, memory: FloatArray, voltage: FloatArray) -> StepResult:
+    def apply(self, memory: FloatArray, voltage: FloatArray) -> StepResult:
         """Return what is once the voltage has gone there; the memory that is given stays."""
         after = np.empty_like(memory)
         return StepResult(*self.move(self.parameters.T, memory.T, voltage, after.T), after)
@@ -116,7 +116,7 @@ class OneStateStep(HysteresisStep):
         ``state`` (models,), um, is h at its first sample.
         """
         w = np.empty((state.size, voltage.size))
-        w[:, 0] = self.go(self._at(voltage[0], state), np.full(state.size, voltage[0])).w
+        w[:, 0] = self.apply(self._at(voltage[0], state), np.full(state.size, voltage[0])).w
         if np.ptp(voltage) == 0:
             w[:] = w[:, :1]
             return w, state

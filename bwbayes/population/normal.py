@@ -80,7 +80,7 @@ class NormalLikelihoods:
         logs: FloatArray = np.where(precision > 0, np.log(np.maximum(density, 1e-300)), 0.0)
         return logs
 
-    def mixed(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
+    def mixture_log_density(self, mean: FloatArray, spread: FloatArray) -> FloatArray:
         """Log density (specimens, n) of each record, which may be an outlier."""
         sound, odd = self.marginal(mean, spread), self.outlying(mean, spread)
         logs: FloatArray = np.logaddexp(np.log1p(-ODD) + sound, np.log(ODD) + odd)

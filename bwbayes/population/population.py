@@ -313,7 +313,7 @@ def _populations(
     k = 0.0
     for _ in range(4):
         # Log p(data of i | μ, τ), each up to a constant of its own.
-        logs = normal.mixed(mean, spread)
+        logs = normal.mixture_log_density(mean, spread)
         for i in np.flatnonzero(~is_normal).tolist():
             by_draw, largest = _weights(*draws[i], mean, spread)
             logs[i] = largest + np.log(np.sum(by_draw, axis=0))

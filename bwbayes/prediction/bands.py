@@ -25,7 +25,7 @@ KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
 LEVELS = (50, 90, 95)
 
 
-def titled(name: str, *, training: bool, separate: bool) -> str:
+def title_of(name: str, *, training: bool, separate: bool) -> str:
     """Return the name of bands, and what they are of."""
     kind = "training" if training else "separate record" if separate else "held out"
     return name if name == kind else f"{name} ({kind})"

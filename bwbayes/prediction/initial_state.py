@@ -172,7 +172,7 @@ def estimate_initial_states(
     InputError
         A lead-in that does not fit into the record.
     """
-    training = posterior.only
+    training = posterior.single_record
     hold, inputs = start.hold or record.hold, record.inputs
     (low, high), voltage = training.span, inputs.voltage
     span = Span(min(float(np.min(voltage)), low), max(float(np.max(voltage)), high))
@@ -230,7 +230,7 @@ def _of_new_record(
 
     What happened once does not happen again. Beside θ come the names of what was drawn.
     """
-    table, redrawn = posterior.only.table, list[str]()
+    table, redrawn = posterior.single_record.table, list[str]()
     for parameter in posterior.prior.parameters:
         declared, name = parameter.declared, parameter.name
         stands = declared.at_rest if declared.scope == "event" or start.from_rest else None
@@ -255,7 +255,7 @@ def _choose_by_lead_in(
     """Let the lead-in choose every draw's unknowns of stages, of so many from their prior."""
     if not names:
         return theta
-    table, parameters = posterior.only.table, posterior.prior.parameters
+    table, parameters = posterior.single_record.table, posterior.prior.parameters
     candidates = [theta]
     for _ in range(tries - 1):
         other = theta

@@ -166,7 +166,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, watch: Watch = unwatc
         A voltage that does not change.
     """
     _, single, record_draws = next(posterior.each(draws))
-    dataset = single.only
+    dataset = single.single_record
     actuator = dataset.actuator.within(dataset.voltage)
     column = dataset.table.columns(single.prior.theta(record_draws))
     low = min(float(np.min(record.voltage)) for record in posterior.datasets)

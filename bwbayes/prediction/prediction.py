@@ -102,7 +102,9 @@ def predict_windows(
     bands = []
     for name, parts in several.items():
         training = any(
-            w.start < p.stop and p.start < w.stop for w in posterior.only.training for p in parts
+            w.start < p.stop and p.start < w.stop
+            for w in posterior.single_record.training
+            for p in parts
         )
         moved = [slice(window.start - first, window.stop - first) for window in parts]
         bands.append(replace(whole.within(moved), name=name, training=training))
@@ -241,7 +243,7 @@ def _bands(
     """Walk through a record from every draw's start, and summarize the mixture over a window."""
     # The same for all predictions: bands differ by what is predicted, not by chance.
     scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
-    noise, parameters = posterior.only.noise, posterior.noise_of_new(theta)
+    noise, parameters = posterior.single_record.noise, posterior.noise_of_new(theta)
     sds, tails = noise.marginal_sd(parameters), None
     if noise.tailed:
         inverse_df = noise.inverse_df(parameters)

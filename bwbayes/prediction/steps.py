@@ -108,7 +108,7 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     ``draws`` (draws, free) are parameters in their own units.
     """
     _, single, record_draws = next(posterior.each(draws))
-    dataset = single.only
+    dataset = single.single_record
     column = dataset.table.columns(single.prior.theta(record_draws))
     column |= {"initial": np.zeros(len(draws)), "offset": np.zeros(len(draws))}
     actuator = replace(dataset.actuator.within(dataset.voltage), hold="zero")

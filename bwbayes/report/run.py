@@ -31,7 +31,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.result import Result
 from bwbayes.report.tables import priors_table
-from bwbayes.report.words import circumstances, covered, error_text, length_text, mark
+from bwbayes.report.words import circumstances, coverage_text, error_text, length_text, mark
 
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
@@ -164,7 +164,7 @@ def _results(result: Result) -> list[Text]:
             ).format(
                 f"{title(bands)}, {_span(bands)}",
                 status,
-                covered(scores, "sensor", 95),
+                coverage_text(scores, "sensor", 95),
                 length_text(scores.width_um[95]),
                 error_text(scores),
                 length_text(scores.max_error_um),

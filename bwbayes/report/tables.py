@@ -20,7 +20,15 @@ from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.report import UNKNOWN, Table, TableColumn
 from bwbayes.report.result import Result
-from bwbayes.report.words import covered, digits, error_text, length_text, mark, symbol, unit_text
+from bwbayes.report.words import (
+    coverage_text,
+    digits,
+    error_text,
+    length_text,
+    mark,
+    symbol,
+    unit_text,
+)
 
 # A parameter in words, with its symbol; and the columns of names, bare on a screen.
 WORDS = Markup("{words}")
@@ -152,7 +160,7 @@ def scores_table(
     """
     rows = []
     for name, judged in scores.items():
-        covers = [covered(judged, "sensor", level).removesuffix("%") for level in LEVELS]
+        covers = [coverage_text(judged, "sensor", level).removesuffix("%") for level in LEVELS]
         shares = (judged.coverage["sensor"] or {}).values()
         row = {
             "title": titles[name],
@@ -196,7 +204,7 @@ def other_scores_table(
     judged = scores.values()
     rows = [["CRPS", *(length_text(score.crps_um) for score in judged)]]
     for level in sorted(LEVELS, reverse=True):
-        covers = [covered(score, "displacement", level) for score in judged]
+        covers = [coverage_text(score, "displacement", level) for score in judged]
         if any(covers):
             title = f"{level}% displacement band covers displacement"
             rows.append([title, *(text or UNKNOWN for text in covers)])

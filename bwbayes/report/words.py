@@ -85,7 +85,7 @@ def mark(status: str) -> Markup:
     return Markup('<span class="mark {}">{}</span>').format(STATUS_KINDS.get(status, "bad"), status)
 
 
-def covered(scores: Scores, kind: str, level: int) -> str:
+def coverage_text(scores: Scores, kind: str, level: int) -> str:
     """Write how much a band covers, with its standard error; nothing if that is not known."""
     share, error = scores.coverage[kind], scores.coverage_error[kind]
     if share is None:

@@ -89,9 +89,9 @@ class QuadraticMap:
             # Few draws tell little: each coefficient is drawn to zero by a thousandth of them all.
             information = products.T @ products / count + 1e-3 * np.eye(terms)
             coefficients = np.linalg.solve(information, products.T @ z[:, j] / count)
-            straight = z[:, j] - products @ coefficients
-            if np.var(straight) < 0.9 * np.var(z[:, j]):
-                z[:, j], bends[:terms, j] = straight, coefficients
+            whitened = z[:, j] - products @ coefficients
+            if np.var(whitened) < 0.9 * np.var(z[:, j]):
+                z[:, j], bends[:terms, j] = whitened, coefficients
             near = np.clip(z[:, : min(j, LONGEST)], -FARTHEST, FARTHEST)
             scale = scales[: near.shape[1], j] = _fit_log_scales(near, z[:, j])
             z[:, j] *= np.exp(-near @ scale)
@@ -125,11 +125,11 @@ class QuadraticMap:
         numbered = zip(range(self.center.size), *ends, strict=True)
         return tuple((j, pairs, others) for j, pairs, others in numbered if pairs or others)
 
-    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of z (..., free), and log |∂x/∂z| (...)."""
         i, k = self._pairs
-        near = np.clip(straight[..., :LONGEST], -FARTHEST, FARTHEST)
-        y, log_slope = straight, np.full(straight.shape[:-1], self._log_volume)
+        near = np.clip(whitened[..., :LONGEST], -FARTHEST, FARTHEST)
+        y, log_slope = whitened, np.full(whitened.shape[:-1], self._log_volume)
         if self.scales is not None:
             widths = near @ self.scales
             y, log_slope = y * np.exp(widths), log_slope + np.sum(widths, axis=-1)
@@ -137,7 +137,7 @@ class QuadraticMap:
             y = y + (near[..., i] * near[..., k] - (i == k)) @ self.bends
         return self.center + y @ self.factor.T, log_slope
 
-    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def forward(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z (..., free) of x (..., free), and log |∂z/∂x| (...)."""
         z = ((bent - self.center) @ self._inverse).reshape(-1, self.center.size)
         log_slope = np.full(len(z), -self._log_volume)
@@ -202,14 +202,14 @@ class SkewMap:
         ]
         return cls(center, scale, np.array(powers))
 
-    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of y (..., free), and log |∂x/∂y| (...)."""
-        power = self._power(straight)
-        log = np.log1p(power * np.abs(straight) / self.scale) / power
-        x = self.center + self.scale * np.sign(straight) * np.expm1(log)
+        power = self._power(whitened)
+        log = np.log1p(power * np.abs(whitened) / self.scale) / power
+        x = self.center + self.scale * np.sign(whitened) * np.expm1(log)
         return x, np.sum((1 - power) * log, axis=-1)
 
-    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def forward(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return y (..., free) of x (..., free), and log |∂y/∂x| (...)."""
         z = (bent - self.center) / self.scale
         power, log = self._power(z), np.log1p(np.abs(z))
@@ -265,15 +265,15 @@ class TotalRatioMap:
         center, scale = np.moveaxis(np.array(scales), -1, 0)
         return cls(np.array(rows), center, scale)
 
-    def to_curved(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of y (..., free), and log |∂x/∂y| (...), which is zero."""
-        x = straight.copy()
-        total, ratio = np.moveaxis(self.scale * straight[..., self.rows], -1, 0)
+        x = whitened.copy()
+        total, ratio = np.moveaxis(self.scale * whitened[..., self.rows], -1, 0)
         a = total - 0.5 * np.logaddexp(0.0, 2 * ratio)
         x[..., self.rows] = (np.stack([a, a + ratio], axis=-1) - self.center) / self.scale
-        return x, np.zeros(straight.shape[:-1])
+        return x, np.zeros(whitened.shape[:-1])
 
-    def to_straight(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def forward(self, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return y (..., free) of x (..., free), and log |∂y/∂x| (...), which is zero."""
         y = bent.copy()
         a, b = np.moveaxis(self.center + self.scale * bent[..., self.rows], -1, 0)
@@ -306,31 +306,31 @@ def fit_maps(draws: FloatArray) -> list[Map]:
     candidates: list[tuple[float, list[Map]]] = []
     without: list[Map] = []
     for skews in (without, [*without, SkewMap.fitted(draws)]):
-        bend = QuadraticMap.fitted(to_straight(skews, draws)[0])
+        bend = QuadraticMap.fitted(apply_maps(skews, draws)[0])
         maps: list[Map] = [*skews, *([] if bend is None else [bend])]
-        straight, log_slope = to_straight(maps, draws)
-        _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(straight, rowvar=False)))
+        whitened, log_slope = apply_maps(maps, draws)
+        _, log_volume = np.linalg.slogdet(np.atleast_2d(np.cov(whitened, rowvar=False)))
         candidates.append((float(np.mean(log_slope) - 0.5 * log_volume), maps))
     (log_density, bends), (log_density_skewed, bends_and_skews) = candidates
     return bends_and_skews if log_density_skewed > log_density + 0.01 else bends
 
 
-def to_straight(maps: Sequence[Map], bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+def apply_maps(maps: Sequence[Map], bent: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return coordinates z (..., free) of x (..., free) after all maps, and log |∂z/∂x| (...)."""
     log_slope = np.zeros(bent.shape[:-1])
     for map_ in maps:
-        bent, slope = map_.to_straight(bent)
+        bent, slope = map_.forward(bent)
         log_slope = log_slope + slope
     return bent, log_slope
 
 
-def to_curved(maps: Sequence[Map], straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def invert_maps(maps: Sequence[Map], whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return coordinates x (..., free) of z (..., free) before all maps, and log |∂x/∂z| (...)."""
-    log_slope = np.zeros(straight.shape[:-1])
+    log_slope = np.zeros(whitened.shape[:-1])
     for map_ in reversed(maps):
-        straight, slope = map_.to_curved(straight)
+        whitened, slope = map_.inverse(whitened)
         log_slope = log_slope + slope
-    return straight, log_slope
+    return whitened, log_slope
 
 
 def subsample(draws: FloatArray, count: int) -> FloatArray:

@@ -22,10 +22,10 @@ from bwbayes.sampling.curvature import (
     QuadraticMap,
     SkewMap,
     TotalRatioMap,
+    apply_maps,
     fit_maps,
+    invert_maps,
     subsample,
-    to_curved,
-    to_straight,
 )
 from bwbayes.shown import brief
 
@@ -89,14 +89,14 @@ class StudentMixture:
         maps, modes = [], []
         if guess is not None:
             maps, modes = [*guess.maps], [guess._stand_ins(mode) for mode in guess._lesser]
-        draws, log_slope = to_straight(maps, draws)
+        draws, log_slope = apply_maps(maps, draws)
         first = draws
         if guess is not None and modes:
             likeliest = np.argmax(guess.log_parts(guess.squares(draws)), axis=0)
             first = draws[np.asarray(guess._modes)[likeliest] == 0]
         further = fit_maps(first)
-        draws, slope = to_straight(further, draws)
-        modes = [to_straight(further, mode)[0] for mode in modes]
+        draws, slope = apply_maps(further, draws)
+        modes = [apply_maps(further, mode)[0] for mode in modes]
         # First with so few of the draws that they cost little, then with all.
         sample = subsample(draws, 1024)
         # A draw belongs at first to the nearest of a few, or of the modes, in units of their sds.
@@ -135,7 +135,7 @@ class StudentMixture:
         if totals is not None:
             slopes = totals.slopes(optima)
             covariances = slopes @ covariances @ slopes.transpose(0, 2, 1)
-            optima = totals.to_straight(optima)[0]
+            optima = totals.forward(optima)[0]
         modes = np.arange(3) % len(optima)
         widths = 1.0 + np.arange(3) // len(optima)
         factors = widths[:, np.newaxis, np.newaxis] * np.linalg.cholesky(covariances)[modes]
@@ -176,10 +176,10 @@ class StudentMixture:
         """The log determinants of the factors, (components,)."""
         return np.sum(np.log(np.diagonal(self.factors, axis1=1, axis2=2)), axis=1)
 
-    def squares(self, straight: FloatArray) -> FloatArray:
+    def squares(self, whitened: FloatArray) -> FloatArray:
         """Squared distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
         pairs = zip(self.centers, self._whitening, strict=True)
-        white = [(straight - center) @ whitening for center, whitening in pairs]
+        white = [(whitened - center) @ whitening for center, whitening in pairs]
         return np.stack([np.einsum("...j,...j->...", z, z) for z in white])
 
     def log_parts(self, squares: FloatArray) -> FloatArray:
@@ -199,14 +199,14 @@ class StudentMixture:
         density = np.empty(len(flat))
         for start in range(0, len(flat), 1 << 15):  # maps and components take memory
             rows = slice(start, start + (1 << 15))
-            straight, log_slope = to_straight(self.maps, flat[rows])
-            density[rows] = self._straight_density(straight) + log_slope
+            whitened, log_slope = apply_maps(self.maps, flat[rows])
+            density[rows] = self._whitened_density(whitened) + log_slope
         return density.reshape(coordinates.shape[:-1])
 
-    def evaluate(self, straight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def evaluate(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return coordinates (count, free) of straight ones, and their log density (count,)."""
-        coordinates, log_slope = to_curved(self.maps, straight)
-        return coordinates, self._straight_density(straight) - log_slope
+        coordinates, log_slope = invert_maps(self.maps, whitened)
+        return coordinates, self._whitened_density(whitened) - log_slope
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw straight coordinates (count, free) with emcee's generator."""
@@ -216,12 +216,12 @@ class StudentMixture:
         normal = random.standard_normal((count, self.centers.shape[1]))
         spread = np.sqrt(self.freedom / random.chisquare(self.freedom, count))
         steps = (self.factors[chosen] @ (normal * spread[:, np.newaxis])[:, :, np.newaxis])[:, :, 0]
-        straight: FloatArray = self.centers[chosen] + steps
-        return straight
+        whitened: FloatArray = self.centers[chosen] + steps
+        return whitened
 
-    def _straight_density(self, straight: FloatArray) -> FloatArray:
+    def _whitened_density(self, whitened: FloatArray) -> FloatArray:
         """Log density (count,) of straight coordinates (count, free)."""
-        density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(straight)))
+        density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(whitened)))
         return density
 
     @cached_property

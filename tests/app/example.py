@@ -14,7 +14,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
-from bwbayes.report.figures import drawn, plots_of
+from bwbayes.report.figures import draw_styled, plots_of
 from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.page import render
 from bwbayes.report.result import Result, summary
@@ -144,4 +144,4 @@ def page(
 
 def figures(run: Result) -> dict[str, Figure]:
     """Draw all figures of a run, by name."""
-    return {name: drawn(picture.draw) for name, picture in pictures(run).items()}
+    return {name: draw_styled(picture.draw) for name, picture in pictures(run).items()}

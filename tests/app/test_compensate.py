@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.control.references import shaped
+from bwbayes.control.references import build_reference
 from bwbayes.errors import InputError
 from tests.app.conftest import Type
 
@@ -22,7 +22,7 @@ from tests.app.conftest import Type
 )
 def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Run, tmp_path: Path) -> None:
     """What is written: a record that the package reads again, numbers, a table, a page."""
-    made = fit.compensate(shaped("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
+    made = fit.compensate(build_reference("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
     files = made.save(tmp_path / "new")
     names = ["command.csv", *(f"compensation.{kind}" for kind in ("json", "csv", "html"))]
     assert names == [path.name for path in files]
@@ -77,7 +77,7 @@ def test_a_shape_is_that_of_the_command_line(
     assert numbers["remarks"] == [str(warning.message) for warning in warned]
     assert Path(__file__).name == Path(warned[0].filename).name
     assert "triangle" == made.reference.name
-    same = shaped("triangle", 0.02, 30.0, 1.0, periods=2)
+    same = build_reference("triangle", 0.02, 30.0, 1.0, periods=2)
     np.testing.assert_array_equal(made.asked, same.given)
     with pytest.warns(bw.InputWarning):
         assert numbers == fit.compensate(same, from_rest=True, limit=5).summary
@@ -109,8 +109,16 @@ def test_a_limit_that_is_not_kept_is_no_success(
         ("sine", {"amplitude": "much", "frequency": 1.0}, "sine: amplitude 'much'; must be a num"),
         (None, {}, "reference: NoneType is none; give one of sine, triangle"),
         ([0.0, 1.0] * 10, {"amplitude": 1.0}, "displacements take no amplitude; leave it out, or"),
-        (shaped("sine", 0.02, 1.0, 1.0), {"smoothed": 0.1}, "made already takes no smoothed"),
-        (shaped("sine", 0.02, 40.0, 10.0), {"slew": 500.0}, "it is faster than the amplifier's"),
+        (
+            build_reference("sine", 0.02, 1.0, 1.0),
+            {"smoothed": 0.1},
+            "made already takes no smoothed",
+        ),
+        (
+            build_reference("sine", 0.02, 40.0, 10.0),
+            {"slew": 500.0},
+            "it is faster than the amplifier's",
+        ),
         ([0.0, *[900.0] * 49], {}, "on it is beyond the amplifier's"),
         ("sine", {"amplitud": 1.0}, "compensate: amplitud is unknown; did you mean amplitude?"),
         (

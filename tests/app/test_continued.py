@@ -102,7 +102,7 @@ def test_windows_and_what_is_held_out_are_those_of_the_whole(order: tuple[int, .
     listed = {"abc"[i]: tables["abc"[i]] for i in order}
     validation = {"late": {"window": (0.2, 1.0), "of": "c"}}
     three = problem(listed, validation=validation)
-    assert one.posterior.only.training == three.posterior.only.training
+    assert one.posterior.single_record.training == three.posterior.single_record.training
     assert one.validations["late"].windows == three.validations["late"].windows
     np.testing.assert_allclose(densities(three), densities(one), rtol=1e-10)
 

@@ -22,7 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from bwbayes.app.running.figure_worker import FigureWorker, artist_of
+from bwbayes.app.running.figure_worker import FigureWorker, open_figure_worker
 from bwbayes.report.figures import interactive, picture_of, plots_of, save_pictures
 from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.pictures import pictures
@@ -252,12 +252,12 @@ def short() -> Result:
 
 def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Path) -> None:
     run = short()
-    with artist_of(2) as artist:
-        if artist.pool is None:
+    with open_figure_worker(2) as figure_worker:
+        if figure_worker.pool is None:
             pytest.skip("this machine has one core")
-        artist.draw(dataclasses.replace(run, predictions=(), scores={}, innovations={}))
-        artist.draw(dataclasses.replace(run, scores={}))
-        drawn, plots = artist.drawn(run, tmp_path / "apart")
+        figure_worker.draw(dataclasses.replace(run, predictions=(), scores={}, innovations={}))
+        figure_worker.draw(dataclasses.replace(run, scores={}))
+        drawn, plots = figure_worker.collect(run, tmp_path / "apart")
     here = {name: picture_of(picture.draw) for name, picture in pictures(run).items()}
     save_pictures(here, tmp_path / "here")
     assert list(here.items()) == list(drawn.items())
@@ -269,9 +269,9 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
     """Also where the process that was to draw them has died."""
-    artist, run = FigureWorker(Broken()), example.run(converged=False)
-    artist.draw(run)
-    drawn, plots = artist.drawn(run, tmp_path)
+    figure_worker, run = FigureWorker(Broken()), example.run(converged=False)
+    figure_worker.draw(run)
+    drawn, plots = figure_worker.collect(run, tmp_path)
     assert plots == NO_PLOTS
     assert ["trace", "ranks"] == list(drawn)
     assert {"trace.png", "ranks.png"} == {path.name for path in tmp_path.iterdir()}

@@ -13,7 +13,7 @@ import pytest
 
 from bwbayes.app.commands.products import predict
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import finished
+from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running import fingerprint as fingerprint_module
 from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
@@ -116,10 +116,10 @@ def test_other_versions_are_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     expected = "the chain was begun with other versions: scipy 1.1, now 1.2"
     assert (expected,) == version_remarks(noted, now)
     assert () == version_remarks(noted, {"numpy": "1.0"})
-    assert not any("other versions" in r for r in finished(RunFolder(run)).result.remarks)
+    assert not any("other versions" in r for r in open_finished(RunFolder(run)).result.remarks)
     installed = versions("numpy")
     monkeypatch.setattr(fingerprint_module, "versions", lambda _: installed | {"numpy": "99"})
-    remarks = finished(RunFolder(run)).result.remarks
+    remarks = open_finished(RunFolder(run)).result.remarks
     (remark,) = [text for text in remarks if "other versions" in text]
     assert remark.endswith(", now 99")
 

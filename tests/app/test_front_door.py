@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from bwbayes.app.config.proposal import propose
+from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
@@ -86,7 +86,7 @@ def resolved(path: Path, naming: Naming | None = None) -> Problem:
     """Return the problem of a file that has no config: all but the sampling of a run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        return resolve_config(propose(path, path.parent, naming).config, path.parent)
+        return resolve_config(draft_config(path, path.parent, naming).config, path.parent)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
@@ -135,7 +135,7 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
     rounded = np.spacing(abs(start) + samples / rate)  # of the times in the file
     assert record.interval == pytest.approx(1 / rate, rel=1e-4, abs=2 * rounded / (samples - 1))
     np.testing.assert_allclose(record.voltage, voltage, rtol=1e-8, atol=1e-9)
-    fitted = np.concatenate([np.r_[w] for w in problem.posterior.only.training])
+    fitted = np.concatenate([np.r_[w] for w in problem.posterior.single_record.training])
     held = [np.r_[w] for v in problem.validations.values() for w in v.windows]
     assert all(window.size for window in held)
     every = np.sort(np.concatenate([fitted, *held]))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands.cli import cli
-from bwbayes.app.config.proposal import propose
+from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
@@ -49,7 +49,7 @@ def ended(path: Path, folder: Path) -> str:
     """Run a file to its report; return how it ended."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        config = propose(path, path.parent).config
+        config = draft_config(path, path.parent).config
         begun = RunFolder.create(folder / path.stem, resolve_config(config, path.parent))
         result = resume(begun, small.quiet(), workers=1, ess=100, steps=300)
     assert (begun.path / "report.html").is_file()

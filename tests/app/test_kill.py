@@ -243,7 +243,7 @@ def test_request_to_stop_ends_in_order(
     assert "interrupted; resume with `bwbayes resume a`\n" == (tmp_path / "err").read_text()
     assert not (folder / "summary.json").exists()
     with pytest.raises(InputError, match=r"no draws yet; resume with|chain does not exist"):
-        fitted.finished(RunFolder(folder))
+        fitted.open_finished(RunFolder(folder))
 
 
 # Slow

@@ -90,7 +90,7 @@ def test_resolved_config_resolves_to_the_same_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.record.truth, again.record.truth)
     assert first.parameters == again.parameters
     assert first.plan == again.plan
-    assert first.posterior.only.training == again.posterior.only.training
+    assert first.posterior.single_record.training == again.posterior.single_record.training
     for name, one in first.validations.items():
         other = again.validations[name]
         assert (one.windows, one.start) == (other.windows, other.start)
@@ -127,15 +127,15 @@ def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
     text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\nexclude = [1.5, 1.7]\n" + train
     first = of(text, folder)
     assert (300, 0.01, 0.0) == (first.record.samples, first.record.interval, first.record.start)
-    np.testing.assert_array_equal(record().voltage[:300], first.posterior.only.voltage)
+    np.testing.assert_array_equal(record().voltage[:300], first.posterior.single_record.voltage)
     assert [*range(100, 150, 2), *range(170, 300, 2)] == np.flatnonzero(
         first.record.has_reading
     ).tolist()
-    assert (slice(100, 200 if train else 299),) == first.posterior.only.training
+    assert (slice(100, 200 if train else 299),) == first.posterior.single_record.training
     assert first.facts["record"].endswith("90 readings, none from 0 to 1 s")
     again = RunFolder.create(folder / "run", first, overwrite=False).problem()
     assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
-    assert again.posterior.only.training == first.posterior.only.training
+    assert again.posterior.single_record.training == first.posterior.single_record.training
     assert again.parameters == first.parameters
     assert again.config == first.config
 
@@ -151,11 +151,11 @@ def test_automatic_hold_follows_what_the_voltage_is(
     silent = [row for row in rows if not row.startswith("#")]
     (folder / "record.csv").write_text("\n".join(silent) + "\n")
     problem = of(RECORD + said, folder)
-    assert hold == problem.posterior.only.actuator.hold
+    assert hold == problem.posterior.single_record.actuator.hold
     # Kept as it was asked for: another record has a hold of its own.
     assert problem.config.model.hold == "auto"
     given = of(RECORD + said + "[model]\nhold = 'first'", folder)
-    assert "first" == given.posterior.only.actuator.hold
+    assert "first" == given.posterior.single_record.actuator.hold
 
 
 def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None:
@@ -274,7 +274,7 @@ def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
 def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Path) -> None:
     def records(seed: int) -> tuple[str | None, ...]:
         problem = resolve_config(small.config(("seed = 3", f"seed = {seed}")), tmp_path)
-        assert "zero" == problem.posterior.only.actuator.hold
+        assert "zero" == problem.posterior.single_record.actuator.hold
         truth = problem.config.truth
         names = ("d", "alpha", "beta", "sensor_sd")
         assert (0.7, 0.3575, 0.0272, 0.5) == tuple(truth[name] for name in names)

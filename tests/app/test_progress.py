@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.fit.fitted import converged, finished
+from bwbayes.app.fit.fitted import open_converged, open_finished
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
@@ -235,7 +235,7 @@ def test_every_job_tells_what_share_of_its_steps_is_done(copy: RunFolder, job: s
     module, _, name = where.partition(":")
     steps = Steps()
     call = getattr(import_module(f"bwbayes.app.jobs.{module}"), name)
-    call(converged(copy.path), *arguments, **options, watch=steps)
+    call(open_converged(copy.path), *arguments, **options, watch=steps)
     steps.require(*names)
 
 
@@ -250,7 +250,7 @@ def test_a_check_tells_what_share_of_its_steps_is_done(tmp_path: Path) -> None:
 def test_a_run_tells_what_share_is_done_until_its_last_file(copy: RunFolder) -> None:
     copy.result.unlink()
     steps = Steps()
-    finished(copy).compute(steps)
+    open_finished(copy).compute(steps)
     steps.require(
         "predictions",
         "scores",

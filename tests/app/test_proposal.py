@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load, parse
-from bwbayes.app.config.proposal import ConfigProposal, propose
+from bwbayes.app.config.proposal import ConfigProposal, draft_config
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -67,7 +67,7 @@ def command(*arguments: str | Path) -> Result:
 
 
 def proposed(path: Path, **units: str) -> ConfigProposal:
-    return propose(path, path.parent, Naming(units=units))
+    return draft_config(path, path.parent, Naming(units=units))
 
 
 def test_the_comments_say_what_the_record_shows_and_what_it_cannot_tell(write: Write) -> None:
@@ -269,7 +269,7 @@ def test_readings_that_are_clipped_are_missing(write: Write) -> None:
         np.clip(displacement, 0.8 * low, 0.8 * high, out=displacement)
 
     path = write(change=clip)
-    proposal = propose(path, path.parent, Naming())
+    proposal = draft_config(path, path.parent, Naming())
     (source,) = proposal.config.records.values()
     assert proposal.record.displacement is not None
     limits = np.min(proposal.record.displacement), np.max(proposal.record.displacement)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray
 
-from bwbayes.app.fit.fitted import finished
+from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.app.running.stages import STAGES
@@ -109,13 +109,13 @@ def test_report_is_drawn_again_with_the_same_numbers(run: Path, copy: RunFolder)
 
 def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
     folder = RunFolder(run)
-    fit = finished(folder)
+    fit = open_finished(folder)
     outcome = replace(fit.outcome, converged=False)  # no bands are needed
     fit = fit.with_cache(outcome=outcome, kept={})
     assert () == fit.remarks
     nanometres = Distribution("lognormal", {"median": 1e-3, "sigma": 0.6})
     odd = replace(fit.problem, defaults={**fit.problem.defaults, "d": nanometres})
-    (remark,) = finished(folder).with_cache(problem=odd, outcome=outcome, kept={}).remarks
+    (remark,) = open_finished(folder).with_cache(problem=odd, outcome=outcome, kept={}).remarks
     assert "Fix: check its unit" in remark
 
 

@@ -83,7 +83,7 @@ def resolved(record: Record, model: str = "") -> Problem:
 
 
 def set_aside(problem: Problem) -> list[int]:
-    return np.flatnonzero(np.isnan(problem.posterior.only.displacement)).tolist()
+    return np.flatnonzero(np.isnan(problem.posterior.single_record.displacement)).tolist()
 
 
 def prior_arguments(problem: Problem) -> FloatArray:

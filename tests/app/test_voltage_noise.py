@@ -49,7 +49,7 @@ def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder
     record, measured = problem.record, noisy_record(1)
     np.testing.assert_array_equal(record.voltage, measured.voltage)
     assert record.sha256 == measured.sha256
-    np.testing.assert_array_equal(problem.posterior.only.voltage, record.path.voltage)
+    np.testing.assert_array_equal(problem.posterior.single_record.voltage, record.path.voltage)
     assert np.std(record.path.voltage - record.voltage) > 0.1
     said = [remark for remark in problem.remarks if "voltage has noise of 0.1" in remark]
     assert [remark.split(":")[0] for remark in said] == ["record", "next"]
@@ -67,7 +67,9 @@ def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folde
     kept = RunFolder.create(folder / "run", problem, overwrite=False)
     again = RunFolder.open(kept.path).problem()
     np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
-    np.testing.assert_array_equal(again.posterior.only.voltage, problem.posterior.only.voltage)
+    np.testing.assert_array_equal(
+        again.posterior.single_record.voltage, problem.posterior.single_record.voltage
+    )
     assert again.remarks == problem.remarks
 
 
@@ -110,5 +112,5 @@ def test_noise_on_a_planned_voltage_is_said() -> None:
 def test_a_command_is_what_it_says(folder: Path) -> None:
     text = TEXT.replace('"noisy.h5"\n', '"noisy.h5"\nvoltage_is = "command"\n')
     problem = resolve_config(parse(text, "my.toml"), folder)
-    np.testing.assert_array_equal(problem.posterior.only.voltage, problem.record.voltage)
+    np.testing.assert_array_equal(problem.posterior.single_record.voltage, problem.record.voltage)
     assert not any(remark.startswith("record: voltage has") for remark in problem.remarks)

@@ -61,7 +61,7 @@ def engines(posterior: Posterior, rounds: int) -> Table:
     theta = trial(posterior)
     posterior.log_likelihood(theta[:1])
     calls = {name: partial(one.log_likelihood, theta) for name, one in by_engine(posterior).items()}
-    work = MODELS * posterior.only.voltage.size
+    work = MODELS * posterior.single_record.voltage.size
     cost = interleaved(calls, rounds)
     row: dict[str, Cell] = {name: 1e9 * cost[name].wall / work for name in calls}
     text = "ns per sample and model on one core, best of several; stock: a loop over the samples"

@@ -44,7 +44,7 @@ class StockPosterior(Posterior):
         """Log likelihood (models,) at θ (models, parameters)."""
         column = dict(zip(self.prior.names, theta.T, strict=True))
         shape = (column[name] for name in ("alpha", "beta", "gamma", "initial"))
-        one = self.only
+        one = self.single_record
         drive = column["d"][:, np.newaxis] * one.voltage - hysteresis_loop(one.voltage, *shape)
         rest = drive[:, :1].copy()
         (recursion,) = one.actuator.sections(column).recursions

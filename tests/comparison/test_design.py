@@ -65,7 +65,7 @@ def test_where_the_model_is_linear_it_is_the_closed_form() -> None:
     # dx/dd is the lagged voltage, seen by two slopes.
     theta = posterior.prior.theta(exact.mean + np.array([[0.0, 0.0], [1e-3, 0.0]]))
     base, moved = posterior.likelihood.actuator.displacement(
-        posterior.only.table.actuator(theta), voltage, from_rest=True
+        posterior.single_record.table.actuator(theta), voltage, from_rest=True
     )
     slope = (moved - base) / 1e-3
     dense = model.covariance(voltage.size) + model.sd[1] ** 2
@@ -89,7 +89,7 @@ def test_large_loops_are_told_from_small_ones_and_four_from_one(
 
 def both(posterior: Posterior, voltage: FloatArray, reading: FloatArray) -> Posterior:
     """Return the posterior of the first record and a new one."""
-    first, whole = replace(posterior.only, name="first"), (slice(0, voltage.size),)
+    first, whole = replace(posterior.single_record, name="first"), (slice(0, voltage.size),)
     inputs = replace(first.inputs, voltage=voltage)
     second = replace(first, name="new", inputs=inputs, displacement=reading, training=whole)
     table = replace(first.table, records=("first", "new"))
@@ -103,14 +103,16 @@ def kept(known: tuple[Posterior, FloatArray], voltage: FloatArray, seed: int) ->
     """Measure a voltage on an actuator that is a draw, and fit it: part of β's sd that is left."""
     posterior, draws = known
     source = np.random.default_rng(seed)
-    table, prior = posterior.only.table, posterior.prior
+    table, prior = posterior.single_record.table, posterior.prior
     truth = prior.theta(draws[source.integers(len(draws))][np.newaxis])
     # The new record has a start and an offset of its own.
     new = prior.theta(prior.draw(source, 1))
     for name in ("initial", "offset"):
         truth = table.replaced(truth, name, table.columns(new)[name])
     clean = posterior.likelihood.actuator.displacement(table.actuator(truth), voltage)[0]
-    discrepancy, sensor = posterior.only.noise.draw(table.noise(truth), voltage.size, source)
+    discrepancy, sensor = posterior.single_record.noise.draw(
+        table.noise(truth), voltage.size, source
+    )
     fitted = both(posterior, voltage, clean + discrepancy + sensor)
     after, weights = weighted_draws(fitted, source)
     beta = after[:, fitted.names.index("beta")]

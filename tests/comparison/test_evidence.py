@@ -82,7 +82,7 @@ def test_a_cut_prior_has_the_mass_of_a_grid() -> None:
     other = Distribution("normal", {"mean": 0.4, "sd": 0.2})
     prior = JointPrior(
         [replace(d, prior=wide), replace(alpha, prior=other)],
-        posterior.only.actuator.hysteresis.holds,
+        posterior.single_record.actuator.hysteresis.holds,
     )
     mass, error = log_prior_mass(prior, np.random.default_rng(3))
 

@@ -82,7 +82,7 @@ def test_two_records_are_scored_given_the_beginnings_of_both() -> None:
     posterior = model.posterior
     names = ("first", "second")
     datasets = tuple(
-        replace(posterior.only, training=(window,), name=name)
+        replace(posterior.single_record, training=(window,), name=name)
         for name, window in zip(names, WINDOWS, strict=True)
     )
     table = replace(datasets[0].table, records=names, shared=("initial", "offset"))

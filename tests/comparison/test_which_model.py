@@ -22,7 +22,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.keywords import config_of, models_of
-from bwbayes.app.fit.fitted import finished
+from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.jobs.compare import compare_models
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
@@ -84,7 +84,7 @@ def plant(model: str, seed: int) -> tuple[Record, Record]:
     ).posterior
     theta = posterior.prior.theta(posterior.prior.draw(rng, 1))
     actuator = posterior.likelihood.actuator
-    of_actuator = posterior.only.table.actuator(theta)
+    of_actuator = posterior.single_record.table.actuator(theta)
     clean, fresh = (
         actuator.displacement(of_actuator, drive, from_rest=True)[0] for drive in drives
     )
@@ -113,13 +113,13 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
     for candidate in comparison.candidates:
         run = RunFolder.open(folder / re.sub(r"[^\w.-]+", "-", candidate.name).strip("-."))
         if candidate.converged:
-            mean = finished(run).predict(planned, from_rest=True, estimate_offset=False).mean
+            mean = open_finished(run).predict(planned, from_rest=True, estimate_offset=False).mean
         else:
             problem, point = begin(run)
             free, _ = problem.posterior.prior.constrain(point.mode[np.newaxis])
             theta = problem.posterior.prior.theta(free)
             mean = problem.posterior.likelihood.actuator.displacement(
-                problem.posterior.only.table.actuator(theta), fresh.voltage, from_rest=True
+                problem.posterior.single_record.table.actuator(theta), fresh.voltage, from_rest=True
             )[0]
         made[candidate.name] = float(np.sqrt(np.mean((fresh.displacement - mean) ** 2)))
     return made

@@ -122,7 +122,7 @@ def promised(
     Each plays the command by a DAC, which holds it, after another voltage, and has a sample at
     which it is judged.
     """
-    record = of.posterior.only
+    record = of.posterior.single_record
     theta = of.posterior.prior.theta(truths)
     actuator = replace(record.actuator, interval=command.reference.interval, hold="zero")
     noise = record.noise.at(command.reference.interval)

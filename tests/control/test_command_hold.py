@@ -16,7 +16,7 @@ import pytest
 
 from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem
-from bwbayes.control.references import Reference, shaped
+from bwbayes.control.references import Reference, build_reference
 from bwbayes.model.linear import Hold
 from tests.control.commands import (
     about,
@@ -43,7 +43,7 @@ def measured() -> Problem:
 
 @pytest.fixture(scope="module")
 def asked() -> Reference:
-    return shaped("triangle", 1 / RATE, 40.0, 2.0)
+    return build_reference("triangle", 1 / RATE, 40.0, 2.0)
 
 
 @pytest.mark.parametrize("fitted", ["command", "output"])
@@ -52,7 +52,7 @@ def test_by_default_a_command_is_for_a_dac(
 ) -> None:
     """With the right model the stand is at the reference but for the DAC's steps of 0.1 V."""
     of = measured if fitted == "output" else problem()
-    assert ("first" if fitted == "output" else "zero") == of.posterior.only.actuator.hold
+    assert ("first" if fitted == "output" else "zero") == of.posterior.single_record.actuator.hold
     flat = about(of, 0.0, 2, np.random.default_rng(1))
     command = compensated(of, asked, flat)
     assert ("zero", "zoh", "command") == (
@@ -73,12 +73,16 @@ def test_between_samples_the_displacement_is_where_it_is_said_to_be(
     """Against the stand's actuator at a hundred times the rate."""
     flat = about(measured, 0.0, 2, np.random.default_rng(1))
     command = compensated(measured, asked, flat, hold=hold)
-    actuator = replace(measured.posterior.only.actuator, interval=asked.interval / 100, hold=hold)
+    actuator = replace(
+        measured.posterior.single_record.actuator, interval=asked.interval / 100, hold=hold
+    )
     samples, fine = np.arange(asked.time.size), np.arange(100 * (asked.time.size - 1) + 1) / 100
     voltage = np.interp(fine, samples, command.voltage)
     if hold == "zero":
         voltage = np.repeat(command.voltage, 100)[: fine.size]
-    theta = measured.posterior.only.table.actuator(measured.posterior.prior.theta(flat[:1]))
+    theta = measured.posterior.single_record.table.actuator(
+        measured.posterior.prior.theta(flat[:1])
+    )
     moved = actuator.displacement(theta, voltage, from_rest=True)[0]
     between = np.max(np.abs(moved - np.interp(fine, samples, moved[::100])))
     assert command.between == pytest.approx(between, rel=0.03)
@@ -113,7 +117,7 @@ def test_a_model_is_exported_for_a_dac(measured: Problem, tmp_path: Path) -> Non
 def parts(seed: int) -> dict[tuple[str, int], float]:
     """Return what the bands held of a DAC's plays of a command for one fit."""
     of, source = measured_voltage(RATE, seed), np.random.default_rng(10_000 + seed)
-    asked = shaped("triangle", 1 / RATE, 40.0, 2.0, periods=16)
+    asked = build_reference("triangle", 1 / RATE, 40.0, 2.0, periods=16)
     command = compensated(of, asked, drawn(of))
     truth = played(asked, command.voltage)
     plays = [

@@ -19,7 +19,7 @@ import pytest
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.control.references import SHAPES, Reference, shaped
+from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.prediction.bands import LEVELS
@@ -51,7 +51,7 @@ def references(interval: float) -> dict[str, Reference]:
         _, voltage = signal(name).sample(1 / interval)
         begun = np.concatenate([np.zeros(round(0.1 / interval)), PER_VOLT * voltage])
         every[name] = Reference(begun, interval, name, SMOOTH)
-    every["raster"] = shaped("raster", interval, 40.0, 1.0, periods=10)
+    every["raster"] = build_reference("raster", interval, 40.0, 1.0, periods=10)
     return every
 
 
@@ -87,7 +87,7 @@ def running(voltage: float, source: np.random.Generator, interval: float) -> Flo
 
 @pytest.fixture(scope="module")
 def asked() -> Reference:
-    return shaped("triangle", 0.01, 40.0, 1.0, periods=2)
+    return build_reference("triangle", 0.01, 40.0, 1.0, periods=2)
 
 
 def test_truths_are_where_the_command_says(asked: Reference) -> None:
@@ -163,7 +163,7 @@ def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> Non
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_shapes_begin_at_rest_and_reach_their_amplitude(shape: str) -> None:
-    made_shape = shaped(shape, 1e-3, 40.0, 1.0, middle=20.0, periods=3)
+    made_shape = build_reference(shape, 1e-3, 40.0, 1.0, middle=20.0, periods=3)
     values = np.asarray(made_shape.displacement)
     np.testing.assert_allclose(values[:20], 0.0, atol=1e-9)
     assert np.max(values) == pytest.approx(60.0, abs=3.0)
@@ -181,15 +181,15 @@ def test_shapes_that_make_no_sense_are_refused() -> None:
         ({"smoothed": -1.0}, "not negative"),
     ):
         with pytest.raises(InputError, match=line):
-            shaped("sine", 1e-3, **{"amplitude": 1.0, "frequency": 1.0, **options})  # type: ignore[arg-type]
+            build_reference("sine", 1e-3, **{"amplitude": 1.0, "frequency": 1.0, **options})  # type: ignore[arg-type]
     with pytest.raises(InputError, match="did you mean sine"):
-        shaped("sinus", 1e-3, 1.0, 1.0)
+        build_reference("sinus", 1e-3, 1.0, 1.0)
 
 
 def test_what_is_out_of_reach_is_said_with_its_time() -> None:
     of = problem()
     flat = about(of, 0.0, 2, np.random.default_rng(1))
-    far = shaped("sine", 0.01, 100.0, 1.0)
+    far = build_reference("sine", 0.01, 100.0, 1.0)
     with pytest.raises(InputError, match=r"needs .* V, and from .* s on it is beyond"):
         compensated(of, far, flat)
     near = compensated(of, far, flat, nearest=True)
@@ -205,7 +205,7 @@ def test_forty_seeds_of_the_stand_are_where_their_commands_say() -> None:
 
     def part(seed: int) -> dict[tuple[str, int], float]:
         of = problem.__wrapped__("process", 1000.0, seed)
-        asked = shaped("triangle", 1e-3, 40.0, 0.5, periods=8)
+        asked = build_reference("triangle", 1e-3, 40.0, 0.5, periods=8)
         command = compensated(of, asked, drawn(of))
         return inside(command, played(asked, command.voltage, "process", 10_000 + seed))
 

@@ -8,7 +8,7 @@ import pytest
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, build_part
 from tests.control import cases
 
 every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
@@ -40,7 +40,7 @@ def test_slopes_lie_within_their_bounds(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["prandtl-ishlinskii", "preisach", "jiles-atherton"])
 def test_operators_without_a_step_are_refused(name: str) -> None:
-    operator = made("hysteresis", name, HYSTERESIS, {})
+    operator = build_part("hysteresis", name, HYSTERESIS, {})
     column = {one.name: np.ones(1) for one in operator.parameters}
     with pytest.raises(InputError, match=r"no step of bounded time .* such as bouc-wen"):
         operator.step(column)

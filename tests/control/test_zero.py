@@ -13,7 +13,7 @@ from bwbayes.app.jobs.control import export
 from bwbayes.app.jobs.fit_methods import limits_of
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.control.compensation import compensate
-from bwbayes.control.references import Reference, shaped
+from bwbayes.control.references import Reference, build_reference
 from bwbayes.errors import InputError
 from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Span
@@ -47,7 +47,7 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     """With a gain about another voltage, and creep; what C makes counts from zero volts as well."""
     of = problem(nonlinearity=["quadratic"], creep=[0.1, 1.0])
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
-    asked = shaped("sine", INTERVAL, 10.0, 2.0, middle=15.0)
+    asked = build_reference("sine", INTERVAL, 10.0, 2.0, middle=15.0)
     command = compensated(of, asked, flat, from_rest=True).voltage
     assert command[0] == pytest.approx(0.0, abs=1e-9)
     at_zero = flat.copy()
@@ -66,7 +66,7 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     compiled = Compiled(model, tmp_path, needs("cc"))
     np.testing.assert_allclose(compiled.run("inverse", 0.0, reference), command[:-1], atol=1e-6)
     assert model.model.displacement(model.model.begin(np.zeros(1))) == pytest.approx(0.0, abs=1e-12)
-    theta = of.posterior.only.table.actuator(of.posterior.prior.theta(at_zero[:1]))
+    theta = of.posterior.single_record.table.actuator(of.posterior.prior.theta(at_zero[:1]))
     moved = model.model.actuator.displacement(theta, command, from_rest=True)[0]
     assert abs(moved[0]) > 0.1
     got = compiled.run("forward", 0.0, command)
@@ -125,7 +125,7 @@ def test_smoothing_keeps_where_a_reference_begins_and_ends() -> None:
 def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> None:
     of = problem(dynamics="lag")
     flat = np.array([[VALUES[name] for name in of.posterior.names]] * 2)
-    asked = shaped("sine", INTERVAL, 5.0, 2.0)
+    asked = build_reference("sine", INTERVAL, 5.0, 2.0)
     with pytest.raises(InputError, match=r"20 to 100 V leaves out zero volts.*include it"):
         compensate(of.posterior, flat, asked, np.random.default_rng(1), limits=Limits(20.0, 100.0))
     voltage = 60 + 40 * np.sin(4 * np.pi * TIME)

@@ -111,7 +111,7 @@ def test_parts_of_a_record_tell_of_each_other(size: float, seen: tuple[float, fl
 def test_posterior_of_a_record_is_looked_at(planted: bool) -> None:
     """With gaps between its readings; what is found is said in words."""
     posterior = short_posterior(samples=800)
-    record, rng = posterior.only, np.random.default_rng(5)
+    record, rng = posterior.single_record, np.random.default_rng(5)
     readings = record.displacement + 2.0 * planted * misfit(record.voltage)
     readings[100:160] = np.nan
     posterior = posterior.altered(displacement=readings)

@@ -57,7 +57,7 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
     """With gain and offset free alone, and a trend of an unknown size, all is jointly normal."""
     write_record(plant("drift", (5, 1), seconds=2.0), tmp_path / "record.h5")
     problem = problem_of(f'[record]\nfile = "record.h5"\nfrom_rest = true\n{LINEAR}', tmp_path)
-    posterior, readings = problem.posterior, problem.posterior.only.readings.values
+    posterior, readings = problem.posterior, problem.posterior.single_record.readings.values
     along = np.linspace(0, 1, readings.size)
     trend = effects.add_shapes(along[np.newaxis], 4.0)
     lag = problem.record.interval * np.abs(np.subtract.outer(*2 * [np.arange(readings.size)]))
@@ -182,7 +182,7 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
     """Not that of the first reading after them, where the fit comes upon it."""
     write_record(plant("good", (5, 2), 5.0), tmp_path / "record.h5")
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
-    shifted = problem.posterior.only.displacement + 5.0 * (problem.record.time >= time)
+    shifted = problem.posterior.single_record.displacement + 5.0 * (problem.record.time >= time)
     windows = slice(0, 320), slice(480, 1000)
     posterior = problem.posterior.altered(displacement=shifted, training=windows)
     rng = np.random.default_rng(0)
@@ -282,7 +282,7 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
             )
         seen = scene(kind, 2, tmp_path)
         assert stride == seen.stride
-        assert 500 == seen.posterior.only.readings.rows.size
+        assert 500 == seen.posterior.single_record.readings.rows.size
         families = effects.delay, effects.moving_gain, model.creep, model.hold
         found = [explanation for family in families for explanation in family(seen)]
         found.sort(key=lambda explanation: explanation.nats)
@@ -306,7 +306,7 @@ def test_what_leads_on_some_readings_is_weighed_on_all(
     full = explain(scene("cubic", 0, tmp_path, 8.0))[0]
     monkeypatch.setattr(scenes, "READINGS", 200)
     few = scene("cubic", 0, tmp_path, 8.0)
-    assert few.posterior.only.readings.rows.size <= 200
+    assert few.posterior.single_record.readings.rows.size <= 200
     on_few = max(model.nonlinearity(few), key=lambda found: found.nats)
     found = explain(few)[0]
     assert (found.kind, found.text) == (full.kind, full.text)

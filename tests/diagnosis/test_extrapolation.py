@@ -96,9 +96,9 @@ def test_rest_small_drives_and_long_ones_of_the_same_frequency_are_not_slow() ->
     small = 5 * np.sin(0.2 * np.pi * TIME)
     assert [] == kinds(FAST, rested, 0.005)
     assert ["reversals"] == kinds(FAST, small, 0.005)
-    repeated = np.tile(FAST.only.voltage, 4)
+    repeated = np.tile(FAST.single_record.voltage, 4)
     assert ["duration"] == kinds(FAST, repeated, 0.005)
-    assert [] == kinds(fitted(repeated, 0.005), FAST.only.voltage, 0.005)
+    assert [] == kinds(fitted(repeated, 0.005), FAST.single_record.voltage, 0.005)
 
 
 def test_held_out_part_of_the_same_drive_is_no_extrapolation() -> None:

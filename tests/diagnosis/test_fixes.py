@@ -20,7 +20,7 @@ import pytest
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem
-from bwbayes.app.running.explaining import explained
+from bwbayes.app.running.explaining import explain_record
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.inference import map_estimate as pointfit
@@ -117,7 +117,7 @@ def study(kind: str, seed: int, folder: Path) -> SamplingResult:
     problem = problem_of(config, folder)
     source = np.random.default_rng((6, seed))
     point = pointfit.fit(problem.posterior, source)
-    found = likely_causes(explained(problem, "record", point.optima))
+    found = likely_causes(explain_record(problem, "record", point.optima))
     if found:
         config = followed(config, problem, found[0], kind, seed, folder)
     judged = judge(problem_of(config, folder), source, again=False)

@@ -72,7 +72,7 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
 def test_small_steady_sine_does_not_tell_alpha_from_beta() -> None:
     """What it shows is d - alpha and alpha beta: both may grow while beta falls."""
     fixed = {"gamma": 0.0, "initial": 0.0, "mass": 0.00134, "stiffness": 4.1e5}
-    record = measured(sine(10.0, 1.0, 3.0), rate=250.0).only
+    record = measured(sine(10.0, 1.0, 3.0), rate=250.0).single_record
     small = posterior_of(record.voltage, record.displacement, record.actuator, "discrepancy", fixed)
     (finding,) = undetermined(small, at_truth(small))
     assert finding.text.startswith("alpha with d against beta: ")
@@ -94,10 +94,10 @@ def test_what_is_left_of_one_parameter_is_that_of_the_dense_matrix(sigma: float)
     known = {"alpha": 0.3575, "beta": 0.0272, "gamma": 0.0172, "initial": 0.0, "offset": 0.0}
     prior = {"d": Distribution("lognormal", {"median": 0.7, "sigma": sigma})}
     posterior = short_posterior("white", 400, fixed=known, priors=prior)
-    voltage = posterior.only.voltage
+    voltage = posterior.single_record.voltage
     turns = 1 + np.count_nonzero(np.diff(np.sign(np.diff(voltage))))
     lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
-    floor = 0.01 * np.ptp(posterior.only.displacement)
+    floor = 0.01 * np.ptp(posterior.single_record.displacement)
     covariance = floor**2 * np.exp(-lags / (200 / turns)) + TRUE_NOISE["sensor_sd"] ** 2 * np.eye(
         400
     )

@@ -32,7 +32,7 @@ def looked_at(posterior: Posterior) -> PredictiveChecks:
 
 
 def changed(posterior: Posterior, added: FloatArray) -> Posterior:
-    return posterior.altered(displacement=posterior.only.displacement + added)
+    return posterior.altered(displacement=posterior.single_record.displacement + added)
 
 
 def test_good_records_are_not_odd() -> None:
@@ -71,7 +71,7 @@ def test_what_the_model_does_not_do_is_odd(kind: str, statistic: str) -> None:
 
 def test_readings_that_are_missing_are_missing_in_all() -> None:
     posterior = short_posterior(samples=SAMPLES)
-    displacement = posterior.only.displacement.copy()
+    displacement = posterior.single_record.displacement.copy()
     displacement[100:180] = np.nan
     made = looked_at(posterior.altered(displacement=displacement))
     assert all(np.isfinite(one.observed) for one in made.statistics.values())

@@ -110,7 +110,7 @@ class Linear:
     @property
     def rows(self) -> IntArray:
         """The readings that are fitted."""
-        return self.posterior.only.readings.rows
+        return self.posterior.single_record.readings.rows
 
     def covariance(self, samples: int) -> FloatArray:
         """Dense covariance (samples, samples) of the noise; one goes through all windows."""

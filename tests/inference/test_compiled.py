@@ -21,7 +21,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import compiled, engine
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.inference.engine import choose
+from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.registry import HYSTERESIS
 from tests.inference.problems import short_posterior, truth
@@ -33,7 +33,7 @@ MASS = {"mass": 0.00134, "stiffness": 4.1e5}
 def assert_engines_agree(posterior: Posterior, theta: FloatArray) -> None:
     expected = replace(posterior, engine="numpy").log_likelihood(theta)
     got = replace(posterior, engine="numba").log_likelihood(theta)
-    samples = sum(window.stop - window.start for window in posterior.only.training)
+    samples = sum(window.stop - window.start for window in posterior.single_record.training)
     np.testing.assert_array_less(np.abs(got - expected), 1e-10 * (samples + np.abs(expected)))
 
 
@@ -195,10 +195,14 @@ def test_twin_a_defect_of_a_millionth_is_found() -> None:
 
 
 def test_engine_is_chosen_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert ("numba", "numpy", "numba") == (choose(), choose("numpy"), choose("numba"))
+    assert ("numba", "numpy", "numba") == (
+        resolve_engine(),
+        resolve_engine("numpy"),
+        resolve_engine("numba"),
+    )
     monkeypatch.setattr(engine, "find_spec", lambda _: None)
-    assert ("numpy", "numpy") == (choose("auto"), choose("numpy"))
+    assert ("numpy", "numpy") == (resolve_engine("auto"), resolve_engine("numpy"))
     with pytest.raises(InputError, match="numba is not installed; pip install numba"):
-        choose("numba")
+        resolve_engine("numba")
     with pytest.raises(InputError, match="'fortran' is unknown; write one of auto, numpy, numba"):
-        choose("fortran")  # type: ignore[arg-type]
+        resolve_engine("fortran")  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.defaults import joined, ranges_of, rounding_sd
+from bwbayes.inference.defaults import join_ranges, ranges_of, rounding_sd
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
@@ -183,5 +183,8 @@ def test_a_record_without_noise_has_a_sensor_as_good_as_its_rounding_at_best() -
         for readings in (clean, np.round(clean, 2), clean + noise)
     )
     assert prior("sensor_sd", rounded).support[0] == pytest.approx(0.01 / np.sqrt(12), rel=0.01)
-    assert prior("sensor_sd", joined([exact, rounded])).support == prior("sensor_sd", exact).support
-    assert prior("sensor_sd", joined([rounded, noisy])).support[0] == 0
+    assert (
+        prior("sensor_sd", join_ranges([exact, rounded])).support
+        == prior("sensor_sd", exact).support
+    )
+    assert prior("sensor_sd", join_ranges([rounded, noisy])).support[0] == 0

@@ -161,9 +161,9 @@ def test_from_rest_means_a_path_from_zero_volts() -> None:
     """A record from rest at 50 V is one from zero volts whose first samples were not read."""
     usual = short_posterior(samples=200, dynamics="lag", fixed={})
     approach = np.concatenate([np.zeros(1), np.full(400, 50.0)])
-    voltage = 50 + usual.only.voltage / 4
+    voltage = 50 + usual.single_record.voltage / 4
     whole = np.concatenate([approach, voltage])
-    reading = ring_bender(usual.only.actuator, "discrepancy", whole, 9)
+    reading = ring_bender(usual.single_record.actuator, "discrepancy", whole, 9)
     theta = usual.prior.theta(usual.prior.draw(np.random.default_rng(10), 5))
     theta[:, usual.prior.names.index("initial")] = 0.0
     settled = usual.altered(

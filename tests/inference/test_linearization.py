@@ -106,10 +106,12 @@ def test_the_gradient_is_that_of_the_density_where_nothing_is_unknown(engine: En
 def test_what_two_records_say_adds_up() -> None:
     single = short_posterior(samples=200, fixed={"initial": 0.0, "offset": 0.0, "sensor_sd": 0.3})
     single = single.altered(name="first")
-    second = replace(single.only, name="second", displacement=single.only.displacement[::-1])
+    second = replace(
+        single.single_record, name="second", displacement=single.single_record.displacement[::-1]
+    )
     shared = single.table.of_scope("record", "event")
     table = replace(single.table, records=("first", "second"), shared=shared)
-    joint = Posterior((single.only, second), single.prior, single.engine, table)
+    joint = Posterior((single.single_record, second), single.prior, single.engine, table)
     z = np.full((1, len(joint.names)), 0.1)
     parts = [Target(p).linearize(z) for p in (single, single.altered(**vars(second)))]
     whole = Target(joint).linearize(z)

@@ -58,8 +58,8 @@ def test_a_displacement_that_is_held_gives_the_density_of_the_noise(
 ) -> None:
     posterior = replace(short_posterior(samples=200), engine=engine)
     if sparse:
-        reading = np.full_like(posterior.only.displacement, np.nan)
-        reading[::4] = posterior.only.displacement[::4]
+        reading = np.full_like(posterior.single_record.displacement, np.nan)
+        reading[::4] = posterior.single_record.displacement[::4]
         posterior = posterior.altered(displacement=reading)
     target = Target(posterior)
     places = np.tile(np.random.default_rng(1).normal(0, 0.5, len(posterior.names)), (5, 1))

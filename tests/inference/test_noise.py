@@ -169,9 +169,9 @@ def altered(quality: float | None, **changes: object) -> tuple[Posterior, FloatA
 def test_what_others_predict_of_a_reading_is_that_of_a_dense_matrix(quality: float | None) -> None:
     posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
-    rows = posterior.only.readings.rows
-    full = dense(posterior.only.table.noise(theta)[0], rows, INTERVAL)
-    residual = posterior.only.readings.values - posterior.simulate(theta, rows)[0]
+    rows = posterior.single_record.readings.rows
+    full = dense(posterior.single_record.table.noise(theta)[0], rows, INTERVAL)
+    residual = posterior.single_record.readings.values - posterior.simulate(theta, rows)[0]
     inverse = np.linalg.inv(full)
     expected = inverse @ residual / np.sqrt(np.diag(inverse))
     np.testing.assert_allclose(expected, surprise(posterior, place), rtol=1e-5, atol=1e-5)
@@ -182,14 +182,14 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None
     """Mean and variance of the discrepancy at any later sample, given all readings but a gap."""
     posterior, place = altered(quality, training=(slice(5, 60), slice(80, 120)))
     theta = posterior.prior.theta(posterior.prior.constrain(place[np.newaxis])[0])
-    rows = posterior.only.readings.rows
+    rows = posterior.single_record.readings.rows
     simulated = posterior.simulate(theta, rows)
     left = filter_discrepancy(posterior.likelihood, theta, simulated)
-    noise = posterior.only.table.noise(theta)[0]
+    noise = posterior.single_record.table.noise(theta)[0]
     later = rows[-1] + np.array([0, 3, 50])
     across = covariance(noise, INTERVAL * np.abs(np.subtract.outer(later, rows)))
     gain = np.linalg.solve(dense(noise, rows, INTERVAL), across.T).T
-    expected = gain @ (posterior.only.readings.values - simulated[0])
+    expected = gain @ (posterior.single_record.readings.values - simulated[0])
     known = np.sum(gain * across, axis=1) / noise[1] ** 2
     first = int(later[0])
     means, told = (values[0][later - first] for values in left.after(first, 51))
@@ -201,7 +201,7 @@ def test_what_readings_leave_is_that_of_the_dense_gaussian(quality: float | None
 def test_engines_agree_on_an_offset_any_stride_and_gaps(stride: int) -> None:
     pytest.importorskip("numba")
     posterior = short_posterior("smooth", 700, "lag", {})
-    reading = posterior.only.displacement.copy()
+    reading = posterior.single_record.displacement.copy()
     reading[80:160] = reading[np.random.default_rng(6).integers(700, size=30)] = np.nan
     reading[np.arange(700) % stride != 0] = np.nan
     posterior = posterior.altered(displacement=reading, from_rest=False)
@@ -218,10 +218,15 @@ def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:
     for noise in ("smooth", "discrepancy"):
         posterior = short_posterior(noise, 400)
         theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(7), 20))
-        rows, kernel = posterior.only.readings.rows, posterior.only.table.noise(theta)
+        rows, kernel = (
+            posterior.single_record.readings.rows,
+            posterior.single_record.table.noise(theta),
+        )
         kernel[:, 0] = theta[:, posterior.table.names.index("sensor_sd")] = 1e-3
         sized = posterior.noise_of_new(theta)
-        residual = posterior.only.readings.values - posterior.simulate(theta, rows).mean(axis=0)
+        residual = posterior.single_record.readings.values - posterior.simulate(theta, rows).mean(
+            axis=0
+        )
         if noise == "smooth":
             kernel[:, 1] = np.sqrt(np.mean(residual**2) - 1e-6)
         np.testing.assert_allclose(sized, kernel, rtol=1e-9)

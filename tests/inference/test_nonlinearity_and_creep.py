@@ -75,8 +75,8 @@ def test_engines_agree_along_records_that_are_long_for_the_filter(
     posterior = moving(noise, "lag", missing=missing, parts=PARTS[parts])
     repeated = 12
     posterior = posterior.altered(
-        voltage=np.tile(posterior.only.voltage, repeated),
-        displacement=np.tile(posterior.only.displacement, repeated),
+        voltage=np.tile(posterior.single_record.voltage, repeated),
+        displacement=np.tile(posterior.single_record.displacement, repeated),
         training=(slice(0, 200 * repeated),),
     )
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(5), 40))
@@ -94,12 +94,12 @@ def test_engines_agree_along_records_that_are_long_for_the_filter(
 
 def test_creep_that_grows_is_as_strong_as_stated_at_the_largest_voltage() -> None:
     posterior = moving("white", "none", {"offset": 0.0}, parts={"creep": GROWING})
-    names = posterior.only.actuator.parameters
+    names = posterior.single_record.actuator.parameters
     value = {"d": 1.0, "alpha": 1e-12, "beta": 0.02, "exponent": 1.0, "creep_1": 0.05}
     voltage = np.concatenate([[0.0], np.full(3000, 90.0)])
     for growth in (0.0, 0.5):
         theta = [[(value | {"creep_growth": growth}).get(name, 0.0) for name in names]]
-        x = posterior.only.actuator.displacement(theta, voltage)[0]
+        x = posterior.single_record.actuator.displacement(theta, voltage)[0]
         assert x[-1] == pytest.approx(90 * (1 + 0.05 * (1 + growth)), rel=1e-9)
 
 

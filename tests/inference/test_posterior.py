@@ -75,7 +75,7 @@ def test_parameters_must_be_those_of_the_model() -> None:
 
 
 def spoilt(posterior: Posterior, rows: list[int], size: float = 20.0) -> Posterior:
-    displacement = posterior.only.displacement.copy()
+    displacement = posterior.single_record.displacement.copy()
     displacement[rows] += size * (-1.0) ** np.arange(len(rows))
     return posterior.altered(displacement=displacement)
 
@@ -97,7 +97,7 @@ def test_what_is_left_is_the_posterior_without_those_readings() -> None:
     spiky = spoilt(good, rows)
     aside = outliers(spiky.without, np.random.default_rng(4))["record"]
     assert rows == aside.tolist()
-    cleaned, missing = (p.only.displacement.copy() for p in (spiky, good))
+    cleaned, missing = (p.single_record.displacement.copy() for p in (spiky, good))
     cleaned[aside] = missing[rows] = np.nan
     z = good.prior.unconstrain(good.prior.draw(np.random.default_rng(5), 5))
     np.testing.assert_array_equal(

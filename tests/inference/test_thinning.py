@@ -16,7 +16,7 @@ from bwbayes.inference.thinning import (
     readings_at,
     thin,
     thin_posterior,
-    thinned_windows,
+    thin_windows,
 )
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
@@ -75,7 +75,7 @@ def test_the_reversals_of_a_drive_stay(periods: float, decay: float, stride: int
 def test_windows_hold_the_same_samples(windows: list[int], stride: int) -> None:
     slices = [slice(*pair) for pair in zip(windows[::2], windows[1::2], strict=False)]
     kept = np.arange(0, 300, stride)
-    for window, short in zip(slices, thinned_windows(slices, stride), strict=True):
+    for window, short in zip(slices, thin_windows(slices, stride), strict=True):
         inside = (kept >= window.start) & (kept < window.stop)
         assert kept[short].tolist() == kept[inside].tolist()
 
@@ -84,10 +84,11 @@ def test_a_thinned_record_is_left_the_residuals_of_the_whole() -> None:
     whole = short_posterior(samples=2000, dynamics="lag")
     theta = truth(whole)
     short = thin_posterior(whole, theta, 250)
-    assert 250 == short.only.voltage.size
+    assert 250 == short.single_record.voltage.size
     corrected = short.altered(displacement=readings_at(short, whole, theta))
     residuals = [
-        posterior.only.displacement - displacement(posterior, posterior.only, theta)[0]
+        posterior.single_record.displacement
+        - displacement(posterior, posterior.single_record, theta)[0]
         for posterior in (whole, corrected, short)
     ]
     np.testing.assert_allclose(residuals[1], residuals[0][::8], atol=1e-9)
@@ -116,7 +117,7 @@ def test_a_record_is_thinned_as_far_as_its_displacement_allows(
     readings[np.arange(2000) % every != first] = np.nan
     whole = posterior_of(voltage, readings, actuator, "white")
     short = thin_posterior(whole, truth(whole), 250)
-    assert samples == short.only.voltage.size
+    assert samples == short.single_record.voltage.size
     assert (short is whole) is (samples == 2000)
 
 
@@ -130,7 +131,7 @@ def test_what_is_searched_in_a_thinned_record_is_found_on_the_whole(
 
     def noted(posterior: Posterior, *arguments: object) -> Posterior:
         short = thin_posterior(posterior, *arguments)  # type: ignore[arg-type]
-        searched.append(short.only.voltage.size)
+        searched.append(short.single_record.voltage.size)
         return short
 
     monkeypatch.setattr(map_estimate, "SAMPLES", 500)

@@ -9,7 +9,7 @@ import pytest
 
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference import voltage_noise
-from bwbayes.inference.voltage_noise import path_covariance, widened
+from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.record.voltage_path import estimate_path
 from tests.inference.problems import decaying_sine, short_posterior
 
@@ -47,8 +47,8 @@ def test_draws_are_as_much_wider_as_is_said() -> None:
     square = rng.standard_normal((2, 3, 3))
     covariance, more = square @ np.swapaxes(square, 1, 2)
     draws = rng.multivariate_normal(np.ones(3), covariance, size=(50, 4, 500))
-    wide = widened(draws, covariance, more)
+    wide = widen_draws(draws, covariance, more)
     flat = wide.reshape(-1, 3)
     np.testing.assert_allclose(flat.mean(axis=0), draws.mean(axis=(0, 1, 2)))
     np.testing.assert_allclose(np.cov(flat.T), covariance + more, rtol=0.05, atol=0.05)
-    np.testing.assert_allclose(widened(draws, covariance, 0 * more), draws)
+    np.testing.assert_allclose(widen_draws(draws, covariance, 0 * more), draws)

@@ -19,7 +19,7 @@ from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, build_part
 from bwbayes.record.teststand import RingBender
 from tests.control import cases
 from tests.inference.problems import decaying_sine
@@ -102,7 +102,7 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
     integrated = name in ("jiles-atherton", "domain-wall")
     of = posterior(name, parts=parts)
     actuator = of.likelihood.actuator
-    theta = of.only.table.actuator(drawn_from(of, 1 if integrated or parts else 4))
+    theta = of.single_record.table.actuator(drawn_from(of, 1 if integrated or parts else 4))
     if parts:
         creep = Creep((0.1, 1.0), growing=not integrated, reference=SPAN)
         actuator = replace(
@@ -258,7 +258,7 @@ def test_references_that_are_none_are_refused(reference: list[object], line: str
 
 def test_a_displacement_beyond_saturation_is_refused_with_its_time() -> None:
     """Pinned walls have a largest displacement."""
-    operator = made("hysteresis", "domain-wall", HYSTERESIS, {})
+    operator = build_part("hysteresis", "domain-wall", HYSTERESIS, {})
     actuator = Actuator("none", "first", 1e-3, operator, span=SPAN)
     known = {"d": 0.7, "saturation": 40.0, "coupling": 0.2, "pinning": 20.0, "reversible": 0.3}
     theta = np.array([[{**TABLE_1, **known}[name] for name in actuator.parameters]])

@@ -17,7 +17,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.registry import HYSTERESIS, STAGES, made
+from bwbayes.model.registry import HYSTERESIS, STAGES, build_part
 from bwbayes.prediction.bands import KINDS, Bands, Kind
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
@@ -62,7 +62,7 @@ class Case:
     @property
     def actuator(self) -> Actuator:
         """The model."""
-        operator = made("hysteresis", self.hysteresis, HYSTERESIS, {})
+        operator = build_part("hysteresis", self.hysteresis, HYSTERESIS, {})
         stages = tuple(STAGES[name]() for name in self.stages)
         return Actuator(self.dynamics, "first", 1 / RATE, operator, stages=stages)
 

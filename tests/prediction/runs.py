@@ -17,7 +17,7 @@ from arviz_stats.base import array_stats  # not in an __all__
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import chosen_noise, explained
+from bwbayes.app.running.explaining import chosen_noise, explain_record
 from bwbayes.app.running.predictions import validate_predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import BandValidation, ValidationContext
@@ -120,7 +120,7 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     """
     posterior, record = problem.posterior, problem.record
     point, draws = posterior_draws(posterior, source)
-    windows = {"training": posterior.only.training}
+    windows = {"training": posterior.single_record.training}
     windows |= {name: v.windows for name, v in problem.validations.items() if v.windows}
     bands = predict_windows(posterior, draws, record, windows, source)
     for name, other in problem.validations.items():
@@ -136,7 +136,7 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     if again:
         places = posterior.prior.unconstrain(best[np.newaxis])
         places = np.concatenate([places, point.optima])
-        found = explained(problem, "record", places)
+        found = explain_record(problem, "record", places)
         validation = validate_predictions(problem, bands, background, {"record": found})
     return Judged(problem, draws, {one.name: one for one in bands}, validation)
 

@@ -34,7 +34,7 @@ def whole(seed: int) -> tuple[Posterior, Record, FloatArray]:
     voltage = decaying_sine(LEAD + LATER)
     posterior = short_posterior("discrepancy", LEAD)
     theta = truth(posterior)
-    one = posterior.only
+    one = posterior.single_record
     clean = one.actuator.displacement(one.table.actuator(theta), voltage, from_rest=True)[0]
     noise = DiscrepancyNoise(INTERVAL)
     parts = noise.draw(one.table.noise(theta), voltage.size, np.random.default_rng([5, seed]))
@@ -136,7 +136,7 @@ def replicate(seed: int) -> Replicate:
     usual = short_posterior("discrepancy", LEAD, fixed=FIXED, priors=PRIORS)
     theta = usual.prior.theta(usual.prior.draw(source, 1))
     voltage = decaying_sine(LEAD + LATER)[::-1].copy()
-    one = usual.only
+    one = usual.single_record
     clean = one.actuator.displacement(one.table.actuator(theta), voltage, from_rest=True)[0]
     reading = clean + sum(one.noise.draw(one.table.noise(theta), voltage.size, source))
     record = Record(voltage[:LEAD], reading[:LEAD], interval=INTERVAL)

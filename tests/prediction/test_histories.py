@@ -29,8 +29,8 @@ def record_after(reach: float) -> Record:
     time = np.arange(int(2 * RATE)) / RATE
     before = reach * np.sin(2 * np.pi * np.arange(int(2 * RATE)) / RATE)
     voltage = np.concatenate([before, 95 * np.sin(2 * np.pi * time)])
-    theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
-    displacement = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
+    theta = DRAWS[:1, : len(POSTERIOR.single_record.actuator.parameters)]
+    displacement = POSTERIOR.single_record.actuator.displacement(theta, voltage, from_rest=True)[0]
     noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
     return Record(
         95 * np.sin(2 * np.pi * time), displacement[before.size :] + noise, interval=1 / RATE
@@ -95,7 +95,7 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
             posterior.likelihood,
             from_rest=False,
             offset_sd=50.0,
-            actuator=replace(posterior.only.actuator, span=s),
+            actuator=replace(posterior.single_record.actuator, span=s),
         )
         for s in spans
     )
@@ -126,8 +126,8 @@ def level_error(seed: int) -> tuple[float, float]:
     swing = np.sin(2 * np.pi * np.arange(18 * second) / RATE)
     sizes = np.concatenate([rng.uniform(0.3, 1.0, 12), np.full(6, rng.uniform(0.4, 0.7))])
     voltage = 95 * np.repeat(sizes, second) * swing
-    theta = DRAWS[:1, : len(POSTERIOR.only.actuator.parameters)]
-    moved = POSTERIOR.only.actuator.displacement(theta, voltage, from_rest=True)[0]
+    theta = DRAWS[:1, : len(POSTERIOR.single_record.actuator.parameters)]
+    moved = POSTERIOR.single_record.actuator.displacement(theta, voltage, from_rest=True)[0]
     voltage, moved = voltage[12 * second :], moved[12 * second :]
     record = Record(voltage, moved + 0.1 * rng.standard_normal(moved.size), interval=1 / RATE)
     start = InitialConditions(estimate_offset=False, lead_in=0.6)

@@ -80,8 +80,8 @@ def problem(name: str, draws: int = 40) -> tuple[Any, FloatArray]:
 
 def test_loops_are_those_of_the_whole_range_and_of_half_of_it() -> None:
     of, draws = problem("bouc-wen")
-    loops = measure_loops(of.altered(voltage=of.only.voltage + 30.0), draws)
-    low, high = np.min(of.only.voltage) + 30, np.max(of.only.voltage) + 30
+    loops = measure_loops(of.altered(voltage=of.single_record.voltage + 30.0), draws)
+    low, high = np.min(of.single_record.voltage) + 30, np.max(of.single_record.voltage) + 30
     quarter = (high - low) / 4
     assert (low, high) == (loops.major.voltage[0], loops.major.voltage[-1])
     assert [low + quarter, high - quarter] == pytest.approx(loops.minor.voltage[[0, -1]])
@@ -95,7 +95,7 @@ def test_remanence_and_coercive_voltage_are_of_loops_about_zero_volts(
     """Elsewhere they have no number, no row and no term; an opening is where the loop has zero."""
     of, draws = problem("bouc-wen")
     # Over 200 V, with a coercive voltage of some 10 V.
-    voltage = 100 * of.only.voltage / np.max(np.abs(of.only.voltage))
+    voltage = 100 * of.single_record.voltage / np.max(np.abs(of.single_record.voltage))
     loops = measure_loops(of.altered(voltage=voltage + shift), draws)
     for loop in (loops.major, loops.minor):
         for name in ("remanence_um", "coercive_V"):

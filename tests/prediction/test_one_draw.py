@@ -98,7 +98,11 @@ def test_readings_are_judged_by_the_sensors_distribution(
     posterior: Posterior, draw: FloatArray
 ) -> None:
     """Its sd is the root of both squares; the discrepancy's alone is less than a third of it."""
-    record = Record(posterior.only.voltage, posterior.only.displacement + 0.5, interval=INTERVAL)
+    record = Record(
+        posterior.single_record.voltage,
+        posterior.single_record.displacement + 0.5,
+        interval=INTERVAL,
+    )
     bands = predict_windows(
         posterior, draw, record, {"all": slice(0, record.samples)}, np.random.default_rng(2)
     )[0]

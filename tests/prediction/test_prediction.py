@@ -92,9 +92,11 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
     command = predicted(
         posterior, draws, replace(planned, voltage_is="command"), InitialConditions(from_rest=True)
     )
-    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
-    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
-    held = replace(posterior.only.actuator, hold="zero").displacement(theta, planned.voltage)
+    theta = posterior.prior.theta(draws)[:, : len(posterior.single_record.actuator.parameters)]
+    theta[:, posterior.single_record.actuator.parameters.index("initial")] = 0.0
+    held = replace(posterior.single_record.actuator, hold="zero").displacement(
+        theta, planned.voltage
+    )
     np.testing.assert_allclose(held.mean(axis=0), command.mean, rtol=1e-9)
     assert np.max(np.abs(command.mean - output.mean)) > 0.5
     given = predicted(
@@ -109,10 +111,10 @@ def test_another_record_has_its_own_hold(posterior: Posterior, draws: FloatArray
 def test_rest_means_a_path_from_zero_volts(posterior: Posterior, draws: FloatArray) -> None:
     planned = replace(made(start=1.2), displacement=None)
     bands = predicted(posterior, draws, planned, InitialConditions(from_rest=True))
-    theta = posterior.prior.theta(draws)[:, : len(posterior.only.actuator.parameters)]
-    theta[:, posterior.only.actuator.parameters.index("initial")] = 0.0
+    theta = posterior.prior.theta(draws)[:, : len(posterior.single_record.actuator.parameters)]
+    theta[:, posterior.single_record.actuator.parameters.index("initial")] = 0.0
     path = np.concatenate([[0.0], np.full(3000, planned.voltage[0]), planned.voltage])
-    expected = posterior.only.actuator.displacement(theta, path)[:, 3001:].mean(axis=0)
+    expected = posterior.single_record.actuator.displacement(theta, path)[:, 3001:].mean(axis=0)
     np.testing.assert_allclose(expected, bands.mean, atol=1e-6)
 
 

@@ -130,6 +130,6 @@ def test_what_is_no_step_from_zero_is_left_alone(voltage: FloatArray) -> None:
 @pytest.mark.parametrize("voltage", [np.zeros((2, 2)), np.array([]), np.array([1.0, np.nan])])
 def test_a_forecast_needs_a_voltage(voltage: FloatArray) -> None:
     of, draws = problem(Actuator("lag", "first", INTERVAL))
-    record = Record(of.only.voltage, of.only.displacement, interval=INTERVAL)
+    record = Record(of.single_record.voltage, of.single_record.displacement, interval=INTERVAL)
     with pytest.raises(InputError, match="give one finite row"):
         forecast(of, draws, record, voltage, np.random.default_rng(1))

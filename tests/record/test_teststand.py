@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, build_part
 from bwbayes.record.teststand import Amplifier, LaserSensor, VirtualTestStand, creep
 from bwbayes.record.waveforms import Decay, Sine, Triangle, Waveform, signal
 
@@ -182,7 +182,7 @@ def assert_reproduced(problem: Problem) -> None:
     posterior, true = problem.posterior, problem.config.truth
     actuator, truth = posterior.likelihood.actuator, problem.record.truth
     theta = np.array([[({"initial": 0.0} | true)[name] for name in actuator.parameters]])
-    output = Amplifier().output(posterior.only.voltage, actuator.interval)
+    output = Amplifier().output(posterior.single_record.voltage, actuator.interval)
     (displacement,) = actuator.displacement(theta, output, from_rest="initial" not in true)
     assert truth is not None
     np.testing.assert_allclose(displacement, truth, rtol=0, atol=1e-12 * np.ptp(truth))
@@ -222,7 +222,7 @@ def test_every_operator_is_an_actuator_of_the_ring_benders_size(name: str) -> No
     voltage = 100 * np.sin(np.arange(2000) * 2 * np.pi / 1000)
 
     def size(operator: str) -> tuple[float, float]:
-        actuator = Actuator("none", "zero", 1e-3, made("", operator, HYSTERESIS, {}))
+        actuator = Actuator("none", "zero", 1e-3, build_part("", operator, HYSTERESIS, {}))
         stand = VirtualTestStand("none", sensor=LaserSensor(sd=0.0), actuator=actuator)
         truth = stand.run(voltage, np.random.default_rng(1)).truth
         assert truth is not None

@@ -15,7 +15,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference import map_estimate
-from bwbayes.inference.engine import choose
+from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
@@ -41,7 +41,7 @@ def few_readings(seed: int) -> Posterior:
     displacement = actuator.displacement(theta, voltage)[0] + missed
     fixed = {"initial": 0.0, "exponent": 1.0}
     posterior = posterior_of(voltage, displacement, actuator, "discrepancy", fixed)
-    return replace(posterior, engine=choose())
+    return replace(posterior, engine=resolve_engine())
 
 
 def without_discrepancy(posterior: Posterior, coordinates: FloatArray) -> BoolArray:

@@ -149,12 +149,12 @@ def test_straight_undoes_bent_and_tells_how_much_it_stretches(
     """The log determinant is that of differences over a millionth of a straight sd."""
     generator = np.random.default_rng(seed)
     map_, z = any_map(free, generator), generator.standard_normal((2, 3, free))
-    x, log_stretch = map_.to_curved(z)
+    x, log_stretch = map_.inverse(z)
     assert x.shape == z.shape
-    straight, log_slope = map_.to_straight(x)
+    straight, log_slope = map_.forward(x)
     np.testing.assert_allclose(straight, z, atol=1e-7)
     step = 1e-6 * np.eye(free)
-    ahead, behind = (map_.to_curved(z[..., np.newaxis, :] + sign * step)[0] for sign in (1, -1))
+    ahead, behind = (map_.inverse(z[..., np.newaxis, :] + sign * step)[0] for sign in (1, -1))
     _, stretched = np.linalg.slogdet((ahead - behind) / 2e-6)
     np.testing.assert_allclose(log_slope, -stretched, atol=1e-3)
     np.testing.assert_allclose(log_slope, -log_stretch, atol=1e-7)
@@ -165,7 +165,7 @@ def test_skewed_tails_are_scipys(power: float, seed: int) -> None:
     x = np.random.default_rng(seed).normal(0, 3, (20, 1))
     skew = SkewMap(np.array([1.0]), np.array([2.0]), np.array([power]))
     expected = 2 * stats.yeojohnson((x[:, 0] - 1) / 2, power)
-    np.testing.assert_allclose(skew.to_straight(x)[0][:, 0], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(skew.forward(x)[0][:, 0], expected, rtol=1e-9, atol=1e-12)
 
 
 def test_what_is_normal_is_neither_bent_nor_widened_nor_skewed() -> None:
@@ -296,7 +296,7 @@ def legs(count: int, seed: int) -> FloatArray:
     generator = np.random.default_rng(seed)
     y = generator.standard_normal((50 * count, 4)) * [1.0, 3.0, 0.1, 1.0]
     y[:, 2] += np.log(0.5) / 2
-    x, _ = TOTAL.to_curved(y)
+    x, _ = TOTAL.inverse(y)
     width = 0.5 * np.sum(((y - [0.0, 0.0, np.log(0.5) / 2, 0.0]) / [1.0, 3.0, 0.1, 1.0]) ** 2, 1)
     logs = log_legs(x) + width
     weights = np.exp(logs - np.max(logs))
@@ -309,14 +309,14 @@ def test_total_and_ratio_are_those_of_the_sds_and_change_no_volume(seed: int) ->
     rows = generator.permutation(5)[:4].reshape(2, 2)
     center, scale = generator.normal(0, 5, (2, 2)), np.exp(generator.normal(0, 1, (2, 2)))
     map_, x = TotalRatioMap(rows, center, scale), generator.normal(0, 2, (3, 5))
-    y, log_slope = map_.to_straight(x)
+    y, log_slope = map_.forward(x)
     for (i, j), c, s in zip(rows, center, scale, strict=True):
         a, b = np.exp(c[0] + s[0] * x[:, i]), np.exp(c[1] + s[1] * x[:, j])
         np.testing.assert_allclose(y[:, i], np.log(np.hypot(a, b)) / s[0], atol=1e-9)
         np.testing.assert_allclose(y[:, j], np.log(b / a) / s[1], atol=1e-9)
     np.testing.assert_array_equal(log_slope, 0.0)
     step = 1e-5 * np.eye(5)
-    near = (map_.to_straight(x[:, np.newaxis] + sign * step)[0] for sign in (1, -1))
+    near = (map_.forward(x[:, np.newaxis] + sign * step)[0] for sign in (1, -1))
     slopes = np.subtract(*near).transpose(0, 2, 1) / 2e-5
     np.testing.assert_allclose(map_.slopes(x), slopes, atol=1e-6)
     np.testing.assert_allclose(np.abs(np.linalg.det(map_.slopes(x))), 1.0, rtol=1e-9)

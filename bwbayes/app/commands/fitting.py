@@ -24,7 +24,7 @@ from bwbayes.app.commands.shared import (
     show_report,
     working,
 )
-from bwbayes.app.running.figure_worker import artist_of
+from bwbayes.app.running.figure_worker import open_figure_worker
 from bwbayes.app.verbs import Verb
 from bwbayes.errors import (
     ColumnsError,
@@ -107,7 +107,7 @@ def run(
     Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     # First of all: it loads what draws while this process loads what samples.
-    with artist_of(workers) as artist:
+    with open_figure_worker(workers) as figure_worker:
         with working():
             from bwbayes.app.problem.problem import resolve_config
             from bwbayes.app.running.explaining import improve_model
@@ -132,7 +132,7 @@ def run(
                 banners = [] if is_proposal else remarks_banner(remarks)
                 priors = priors_table(problem.posterior.prior)
                 show_report(Report(title="priors", banners=banners, blocks=[priors]))
-            options = {"workers": workers, "executor": executor, "artist": artist}
+            options = {"workers": workers, "executor": executor, "figure_worker": figure_worker}
             return finish(folder.path, quiet=quiet, problem=problem, **options)
 
 
@@ -145,11 +145,11 @@ def resume(folder: Path, quiet: bool, **options: Any) -> int:
 
     Example: bwbayes resume results/ring_bender --steps 40000
     """
-    with artist_of(options["workers"]) as artist:
+    with open_figure_worker(options["workers"]) as figure_worker:
         with working():
             import bwbayes.app.running.run  # noqa: F401  # what takes long to load
 
-        return finish(folder, quiet=quiet, artist=artist, **options)
+        return finish(folder, quiet=quiet, figure_worker=figure_worker, **options)
 
 
 @click.command()
@@ -214,10 +214,10 @@ def _proposed(path: Path, where: Path, naming: dict[str, Any]) -> ConfigProposal
     """Propose a config; of unknown columns say the command that settles them."""
     try:
         with working():
-            from bwbayes.app.config.proposal import propose
+            from bwbayes.app.config.proposal import draft_config
             from bwbayes.record.io.columns import Naming
 
-            return propose(path, where, Naming(**naming))
+            return draft_config(path, where, Naming(**naming))
     except ColumnsError as error:
         raise error.in_command(command_as_typed()) from None
 

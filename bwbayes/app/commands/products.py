@@ -49,13 +49,13 @@ def command_of(verb: Verb) -> click.Command:
         stem = "".join(Path(str(value)).stem for value in arguments)
         out = out or folder / below.replace("NAME", stem)
         with working() as watch:
-            from bwbayes.app.fit.fitted import converged
+            from bwbayes.app.fit.fitted import open_converged
             from bwbayes.report.outputs import refuse_existing
 
             # Refuse before the computation; saving refuses every single file.
             kind = verb.load(verb.product)
             refuse_existing([out / f"{kind.NAME}.json"], overwrite=overwrite)
-            fit = converged(folder)
+            fit = open_converged(folder)
             try:
                 product = verb.load()(fit, *arguments, watch=watch, **options)
             except ColumnsError as error:
@@ -130,14 +130,14 @@ def predict(
     with working() as watch:
         import numpy as np
 
-        from bwbayes.app.fit.fitted import converged
+        from bwbayes.app.fit.fitted import open_converged
         from bwbayes.app.jobs.predict import predict as predict_record
         from bwbayes.app.jobs.predict import write_prediction
         from bwbayes.report.outputs import refuse_existing
         from bwbayes.report.report import remarks_banner, standing_banner
 
         refuse_existing(files, overwrite=overwrite)
-        fit = converged(folder)
+        fit = open_converged(folder)
         try:
             options |= {"name": name, "estimate_offset": not same_offset, "watch": watch}
             reading = {key: options.pop(key) for key in ("columns", "units", "fs")}

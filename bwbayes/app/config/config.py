@@ -142,7 +142,7 @@ def load(path: str | Path) -> Config:
     Raises InputError: the file cannot be read, is not valid TOML, or says something that no config
     can say.
     """
-    return checked(read_toml(Path(path)), str(path))
+    return validated_config(read_toml(Path(path)), str(path))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -188,7 +188,7 @@ def parse(text: str, where: str) -> Config:
     >>> config.model.hysteresis, config.model.dynamics
     ('bouc-wen', 'lag')
     """
-    return checked(_tables(text, where), where)
+    return validated_config(_tables(text, where), where)
 
 
 def _tables(text: str, where: str) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def _tables(text: str, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: invalid TOML: {error}; correct the config") from None
 
 
-def checked(table: Mapping[str, object], where: str) -> Config:
+def validated_config(table: Mapping[str, object], where: str) -> Config:
     """Return the config of tables and their keys, with errors as in :func:`load`."""
     try:
         return Config.model_validate(table)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bwbayes.app.config.config import ALONE, Config, checked
+from bwbayes.app.config.config import ALONE, Config, validated_config
 from bwbayes.app.config.keys import one_line, synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.errors import InputError, suggestion
@@ -85,7 +85,7 @@ def config_of(
             tables["validation"][str(name)] = _table(str(name), held_out, records, where)
         else:
             tables["validation"][str(name)] = {"window": _plain(held_out)}
-    return checked(tables, where), records
+    return validated_config(tables, where), records
 
 
 def _by_name(record: Any, where: str) -> Mapping[str, Any]:

@@ -56,7 +56,7 @@ class ConfigProposal:
         return next((finding for finding in self.findings if finding.kind in kinds), None)
 
 
-def propose(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
+def draft_config(path: Path, where: Path, naming: Naming | None = None) -> ConfigProposal:
     """Propose a config, to be in the folder ``where``, for the record in a file.
 
     ``naming`` has columns and units, where they are not to be recognized.

@@ -23,7 +23,7 @@ from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES, made
+from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES, build_part
 from bwbayes.record.true_values import RING_BENDER
 from bwbayes.record.waveforms import signal_names
 
@@ -125,7 +125,7 @@ def parts_reference(requested: str | None) -> str:
             registered = {
                 name: maker for makers in PARTS.values() for name, maker in makers.items()
             }
-            found = [("from outside", made("models", requested, registered, {}))]
+            found = [("from outside", build_part("models", requested, registered, {}))]
         return "\n\n".join(_part(kind, requested, component) for kind, component in found)
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():

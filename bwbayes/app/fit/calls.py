@@ -232,10 +232,10 @@ def open_run(folder: str | Path) -> Run:
     InputError
         No such run, or it has no draws yet.
     """
-    from bwbayes.app.fit.fitted import finished
+    from bwbayes.app.fit.fitted import open_finished
     from bwbayes.app.running.folder import RunFolder
 
-    return finished(RunFolder.open(Path(folder)))
+    return open_finished(RunFolder.open(Path(folder)))
 
 
 def resume(

@@ -272,7 +272,7 @@ for verb in VERBS:
     setattr(Run, verb.name, _Method(verb))
 
 
-def finished(folder: RunFolder) -> Run:
+def open_finished(folder: RunFolder) -> Run:
     """Return the fit that a run's folder holds, as far as its chain goes: only that is read.
 
     Raises InputError: the chain is missing, damaged or still in its pilot.
@@ -283,12 +283,12 @@ def finished(folder: RunFolder) -> Run:
     return Run(chain, folder, folder.numbers().get("wall_s", 0.0))
 
 
-def converged(path: Path) -> Run:
+def open_converged(path: Path) -> Run:
     """Return the fit in a folder, if it is finished and has converged.
 
     Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
     """
-    fit = finished(RunFolder.open(path))
+    fit = open_finished(RunFolder.open(path))
     fit.folder.require_finished()
     fit.require_converged()
     return fit

@@ -13,7 +13,7 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
-from bwbayes.report.figures import drawn
+from bwbayes.report.figures import draw_styled
 from bwbayes.report.figures.control import draw_tracking
 from bwbayes.report.figures.pictures import PICTURES, draw_kind, pictures
 from bwbayes.report.figures.record import record_pictures
@@ -45,7 +45,7 @@ class Plots:
                 for key, picture in pictures(self._fit.result).items()
                 if key.partition("_")[0] == kind
             }
-            return drawn(_named(shown, name or next(iter(shown), kind))[1].draw)
+            return draw_styled(_named(shown, name or next(iter(shown), kind))[1].draw)
 
         return draw
 
@@ -56,9 +56,9 @@ class Plots:
         """Draw a training record: along "time", as a "loop", or its "drive"'s spectrum."""
         problem = self._fit.problem
         name, record = _named(problem.records, name)
-        training = problem.posterior.alone(name).only.training
+        training = problem.posterior.for_record(name).single_record.training
         shown = record_pictures(record, training, problem.findings[name])
-        return drawn(_named(shown, kind)[1].draw)
+        return draw_styled(_named(shown, kind)[1].draw)
 
     def loop(self, *names: str) -> Figure:
         """Draw displacement against voltage with its bands, and its tip enlarged.
@@ -66,11 +66,11 @@ class Plots:
         By default for all that was predicted with the fit, or for the bands of these names.
         """
         bands = self._fit.bands
-        return drawn(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
+        return draw_styled(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
 
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
-        return drawn(draw_tracking, tracked.to_pandas(), CONTROLLERS)
+        return draw_styled(draw_tracking, tracked.to_pandas(), CONTROLLERS)
 
 
 def _named[T](items: Mapping[str, T], name: str | None) -> tuple[str, T]:

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from bwbayes.app.config.config import checked, dump, parse, read_toml
-from bwbayes.app.config.proposal import propose
+from bwbayes.app.config.config import dump, parse, read_toml, validated_config
+from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.campaign import SPECIMEN, Campaign
@@ -44,7 +44,7 @@ def config_text(path: Path) -> str:
     record = table.setdefault("record", {})
     if isinstance(record, dict) and not {"file", "signal"} & set(record):
         record["file"] = "each"
-    return dump(checked(table, str(path)))
+    return dump(validated_config(table, str(path)))
 
 
 def records_in(folder: Path) -> list[Path]:
@@ -184,7 +184,7 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
     if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = propose(file, where, Naming(**origin.reading))
+        proposal = draft_config(file, where, Naming(**origin.reading))
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import explained, find_map, lines
+from bwbayes.app.running.explaining import explain_record, find_map, lines
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
@@ -43,7 +43,9 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
     for name in problem.records:
-        remarks += lines(explained(problem, name, point.optima, partial(watch, "explanations")))
+        remarks += lines(
+            explain_record(problem, name, point.optima, partial(watch, "explanations"))
+        )
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)
@@ -59,7 +61,10 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     about += [why] * bool(why)
     pictures: list[Picture] = []
     for name, record in problem.records.items():
-        training, found = problem.posterior.alone(name).only.training, problem.findings[name]
+        training, found = (
+            problem.posterior.for_record(name).single_record.training,
+            problem.findings[name],
+        )
         drawn = record_pictures(record, training, found, name if several else "")
         pictures += drawn.values()
     name = problem.config.name or problem.record.origin

@@ -23,10 +23,10 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
-from bwbayes.app.fit.fitted import Run, finished
+from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.problem.parameters import with_model
 from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator, joined, training_records
+from bwbayes.app.problem.records import generator, join_records, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.progress import ProgressLine, StepProgress, batch
@@ -62,7 +62,7 @@ def fits_of(runs: Iterable[Any]) -> dict[str, Run]:
             fits.append(run)
             names.append((run.name, f"{run.name} {number}"))
         elif isinstance(run, str | Path):
-            fits.append(finished(RunFolder.open(Path(run))))
+            fits.append(open_finished(RunFolder.open(Path(run))))
             names.append((Path(run).name, str(run)))
         else:
             raise InputError(
@@ -134,7 +134,7 @@ def compare_models(
     """
     folders: dict[str, RunFolder] = {}
     with ProgressLine(console, f"reading records for {len(models)} models ...", announced=False):
-        _, wholes = joined(config, training_records(config, where, in_memory or {})[0])
+        _, wholes = join_records(config, training_records(config, where, in_memory or {})[0])
         for name, model in models.items():
             named = config.model_copy(update={"name": name, "model": model})
             problem = resolve_config(with_model(named, model.spec, wholes), where, in_memory)
@@ -287,7 +287,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     """Sample a model to its end, from wherever it stands, and say what it is worth."""
     is_finished = bool(folder.numbers())
     quiet = Console(quiet=True)
-    fit = finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
+    fit = open_finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
     with open_executor(1, fit.problem.posterior.engine) as pool:
         result = _candidate(name, fit, pool, future=future)
     return replace(result, standing=fit.standing) if is_finished else result

@@ -29,7 +29,7 @@ from bwbayes.control.exported import Exported, exported
 from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.predicted import Compensation
-from bwbayes.control.references import SHAPES, Reference, shaped
+from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.control.tracking import Tracking
 from bwbayes.control.tracking import track as tracked
 from bwbayes.diagnosis.extrapolation import beyond_training
@@ -211,7 +211,7 @@ def _reference(
         for name, unit in (("amplitude", "um"), ("frequency", "Hz")):
             if name not in options:
                 raise InputError(f"{requested}: has no {name}; give it, in {unit}")
-        return shaped(requested, **{"interval": interval, **options})
+        return build_reference(requested, **{"interval": interval, **options})
     is_file, is_made = isinstance(requested, str | Path), isinstance(requested, Reference)
     kind, allowed = "displacements take", {"smoothed", "interval"}
     if is_made or is_file:
@@ -383,7 +383,7 @@ def track(
     dataset = posterior.datasets[0]
     free = thin_draws(fit.flat_draws, generator(seed, "draws"))
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
-    alone = posterior.alone(dataset.name)
+    alone = posterior.for_record(dataset.name)
     parameters = alone.noise_of_new(theta[:draws])
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),

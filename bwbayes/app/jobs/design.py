@@ -116,7 +116,7 @@ def design(
     else:
         quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
     scores = rank_designs(
-        problem.posterior.alone(record),
+        problem.posterior.for_record(record),
         problem.posterior.select_draws(fit.flat_draws, record),
         signals,
         quantity,

@@ -9,7 +9,7 @@ import numpy as np
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ParameterConfig
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import choose
+from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.study import (
     Stated,
@@ -43,7 +43,7 @@ def study_of(
         {name: _stated(name, parameter) for name, parameter in config.parameters.items()},
         tuple(config.model.per_record),
         tuple(config.model.shared),
-        choose(config.sampling.engine),
+        resolve_engine(config.sampling.engine),
     )
 
 

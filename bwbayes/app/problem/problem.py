@@ -25,7 +25,7 @@ from bwbayes.app.problem.records import (
     Validation,
     findings_of,
     generator,
-    joined,
+    join_records,
     set_aside,
     training_records,
     unlike,
@@ -150,7 +150,7 @@ class Problem:
             facts[f"start{which}"] = _start(record, self.config.records[name].from_rest)
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
-                for w in self.posterior.alone(name).only.training
+                for w in self.posterior.for_record(name).single_record.training
             )
         drive = str(Drive.of(self.posterior))
         model, noise = str(self.study.spec), self.config.model.noise
@@ -185,7 +185,7 @@ class Problem:
     def rivals(self) -> dict[str, tuple[LocalFit, ...]]:
         """Models of other families, fitted to each training record alone, by its name."""
         rng = generator(self.config.seed, "rivals")
-        return {name: fit_rivals(self.study.alone(name), rng) for name in self.records}
+        return {name: fit_rivals(self.study.for_record(name), rng) for name in self.records}
 
     def with_noise(self, chosen: str) -> Problem:
         """Return the problem of a run whose noise, ``auto``, came to this one.
@@ -210,7 +210,7 @@ class Problem:
 
         Those of one record alone are called "training", those of several as their record is.
         """
-        training = self.posterior.alone(record).only.training
+        training = self.posterior.for_record(record).single_record.training
         name = "training" if len(self.records) == 1 else record
         return {name: training, **self.held_out(record)}
 
@@ -235,7 +235,7 @@ def resolve_config(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         fitted, stand = training_records(config, folder, in_memory)
-        config, fitted = joined(config, fitted)
+        config, fitted = join_records(config, fitted)
         training, held_out = windows_of(config, fitted)
         validations = validations_of(config, folder, fitted, held_out, in_memory)
     remarks = [text for source in config.records.values() for text in source.remarks or ()]

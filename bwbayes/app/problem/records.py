@@ -114,7 +114,7 @@ def training_records(
     return records, stand
 
 
-def joined(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[str, Record]]:
+def join_records(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[str, Record]]:
     """Join records that continue another to it; return the config that says the same of the whole.
 
     A whole has the name of its first record, and its start. Windows of the others are those of the

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from bwbayes.app.fit.fitted import Run, finished
+from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
@@ -33,7 +33,7 @@ from bwbayes.population.population import (
 from bwbayes.population.specimen import Specimen
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
-from bwbayes.report.figures import drawn
+from bwbayes.report.figures import draw_styled
 from bwbayes.report.report import (
     Banner,
     Block,
@@ -227,7 +227,7 @@ class Campaign(Product):
         InputError
             It has none.
         """
-        return finished(RunFolder.open(self.folder.run(name)))
+        return open_finished(RunFolder.open(self.folder.run(name)))
 
     def predict(
         self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float | None = None
@@ -263,7 +263,7 @@ class Campaign(Product):
         """
         if not self._units:
             raise InputError("campaign: no record has converged, so there is nothing to draw")
-        return drawn(self._draw)
+        return draw_styled(self._draw)
 
     def report(self) -> Report:
         """Return how the records of a campaign ended, and what they say together."""

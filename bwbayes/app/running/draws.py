@@ -10,7 +10,7 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.map_estimate import MAPEstimate
-from bwbayes.inference.voltage_noise import path_covariance, widened
+from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.sampling.chain import constrain_steps, draws, thinning
 from bwbayes.sampling.storage import ChainFile
 from bwbayes.watching import Watch, unwatched
@@ -40,7 +40,7 @@ def run_draws(problem: Problem, chain: ChainFile) -> FloatArray:
         return draws(problem.posterior, chain)
     more = np.array(json.loads(str(noted)))
     coordinates = chain.coordinates("sampling", thinning(chain.draws("sampling")))
-    wide = widened(coordinates, chain.point.covariance, more)
+    wide = widen_draws(coordinates, chain.point.covariance, more)
     _, log_prior = problem.posterior.prior.constrain(wide.reshape(-1, len(more)))
     possible = np.isfinite(log_prior).reshape(*wide.shape[:-1], 1)
     return constrain_steps(problem.posterior, np.where(possible, wide, coordinates))

@@ -43,7 +43,7 @@ from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 MAX_STAGES = 3
 
 
-def explained(
+def explain_record(
     problem: Problem,
     name: str,
     places: FloatArray,
@@ -61,7 +61,7 @@ def _scene(problem: Problem, name: str, places: FloatArray) -> ResidualAnalysis:
     """Return a training record as explanations see it."""
     posterior, record = problem.posterior, problem.records[name]
     return ResidualAnalysis.of(
-        posterior.alone(name),
+        posterior.for_record(name),
         posterior.select_draws(places, name),
         generator(problem.config.seed, f"explanations {record.sha256}"),
         [window for windows in problem.held_out(name).values() for window in windows],
@@ -95,7 +95,7 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     default, posterior = "discrepancy", problem.posterior
     rough = {
         name: climb(
-            posterior.alone(name), posterior.select_draws(point.optima, name), watch=of_record
+            posterior.for_record(name), posterior.select_draws(point.optima, name), watch=of_record
         )
         for name, of_record in parts([*problem.records], part(watch, 0.0, 1 / len(NOISES)))
     }
@@ -114,7 +114,7 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
         fits = [
             climb(
-                other.alone(name),
+                other.for_record(name),
                 other.select_draws(places, name),
                 least=fit.log_density,
                 watch=of_record,

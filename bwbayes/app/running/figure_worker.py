@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bwbayes.app.running.workers import processes
-from bwbayes.inference.engine import choose
+from bwbayes.inference.engine import resolve_engine
 from bwbayes.watching import Watch, unwatched, watched
 
-# All else is loaded where it is used: an artist begins before anything is loaded.
+# All else is loaded where it is used: a worker starts before anything is loaded.
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
     from bwbayes.report.page import PagePlots
@@ -39,7 +39,7 @@ class FigureWorker:
 
     def __init__(self, pool: Executor | None = None) -> None:
         self.pool = pool
-        self.begun: dict[str, Future[Any]] = {}
+        self.submitted: dict[str, Future[Any]] = {}
         if pool is not None:
             pool.submit(_begin)
 
@@ -58,10 +58,10 @@ class FigureWorker:
         if self.pool is None:
             return
         for name, work in _works(result).items():
-            if name not in self.begun:
-                self.begun[name] = self.pool.submit(work)
+            if name not in self.submitted:
+                self.submitted[name] = self.pool.submit(work)
 
-    def drawn(
+    def collect(
         self, result: Result, folder: Path, watch: Watch = unwatched
     ) -> tuple[dict[str, bytes], PagePlots]:
         """Wait until all is drawn; write pictures, PNG by name, to a folder; return all.
@@ -76,9 +76,9 @@ class FigureWorker:
         # From the last to the first: whatever is not begun by then is drawn here.
         drawn: dict[str, Any] = {}
         for name in watched([*reversed(works)], watch):
-            if name in self.begun and not self.begun[name].cancel():
+            if name in self.submitted and not self.submitted[name].cancel():
                 with suppress(BrokenProcessPool):  # nothing is lost that this process cannot draw
-                    drawn[name] = self.begun[name].result()
+                    drawn[name] = self.submitted[name].result()
             if name not in drawn:
                 drawn[name] = works[name]()
         images = {name: drawn[name] for name in works}
@@ -89,7 +89,7 @@ class FigureWorker:
 
 def _begin() -> None:
     """Compile what every likelihood needs; if that is there, load what draws."""
-    if choose() == "numba":
+    if resolve_engine() == "numba":
         from bwbayes.inference.compiled.kernels import compile_common  # noqa: PLC0415
 
         if not compile_common():
@@ -121,7 +121,7 @@ def _works(result: Result) -> dict[str, Callable[[], Any]]:
 
 
 @contextmanager
-def artist_of(workers: int | None) -> Iterator[FigureWorker]:
+def open_figure_worker(workers: int | None) -> Iterator[FigureWorker]:
     """Give who draws, in a process of its own if several workers may work."""
     if 1 in (workers, os.cpu_count()):
         yield FigureWorker()

@@ -45,7 +45,7 @@ from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.record.voltage_path import estimate_path
-from bwbayes.report.figures import drawn
+from bwbayes.report.figures import draw_styled
 from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
 from bwbayes.watching import Watch, part, unwatched
@@ -98,7 +98,7 @@ class Prediction(Shown, Bands):
         """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         from bwbayes.report.figures.series import draw_bands  # noqa: PLC0415  # slow to load
 
-        return drawn(draw_bands, self)
+        return draw_styled(draw_bands, self)
 
     def numbers(self) -> dict[str, object]:
         """Return what ``bwbayes predict`` writes beside the bands: scores, verdict, remarks."""
@@ -349,7 +349,7 @@ def _reaching(
     if any(finding.kind in ("slow", "duration") for finding in beyond):
         source = generator(problem.config.seed, f"creep {record.sha256}")
         posterior, draws = add_prior_creep(posterior, draws, record.duration, source)
-    return posterior.alone(of), posterior.select_draws(draws, of)
+    return posterior.for_record(of), posterior.select_draws(draws, of)
 
 
 def validate_predictions(

@@ -18,7 +18,7 @@ from functools import partial
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import Run, finished
+from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.draws import voltage_noise
@@ -29,7 +29,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
-from bwbayes.inference.engine import Engine, choose
+from bwbayes.inference.engine import Engine, resolve_engine
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import write_bands, write_summary
@@ -61,7 +61,7 @@ def resume(
     predict: bool = True,
     files: bool = True,
     executor: str | Executor | None = None,
-    artist: FigureWorker | None = None,
+    figure_worker: FigureWorker | None = None,
     problem: Problem | None = None,
     answer: Callable[[Run], None] | None = None,
 ) -> Run:
@@ -71,25 +71,25 @@ def resume(
     result does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or
     engine; another engine has the same posterior, but from here on not the same bits. Unless it is
     to ``predict``, it ends with the sampling. ``files`` are what a run leaves besides its config,
-    records and chain; the ``artist``, if any, draws them. The ``problem`` is the folder's, if it is
-    known already. ``answer`` is called with the fit before its files are written.
+    records and chain; the ``figure_worker``, if any, draws them. The ``problem`` is the folder's,
+    if it is known already. ``answer`` is called with the fit before its files are written.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     start_time = time.monotonic()
-    artist = artist or FigureWorker()
+    figure_worker = figure_worker or FigureWorker()
     with folder.locked(), one_thread():
         config = problem.config if problem else load(folder.config)
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
         sampling = config.sampling.model_copy(update=targets)
         # What computes is refused before anything is computed for it.
-        with open_executor(workers, choose(sampling.engine), executor) as pool:
+        with open_executor(workers, resolve_engine(sampling.engine), executor) as pool:
             if targets:
                 _rewrite(folder, config.model_copy(update={"sampling": sampling}))
             with ProgressLine(console, "reading the run ...", announced=False):
                 problem = problem or folder.problem()
-            artist.warm_up(problem.posterior)
+            figure_worker.warm_up(problem.posterior)
             problem, chain = _open_chain(folder, problem, console, engine)
             plan = problem.plan
             fit = Run(chain, folder).with_cache(problem=problem)
@@ -109,13 +109,13 @@ def resume(
             return fit
         if not fit.kept:
             with StepProgress(console, "computing predictions ...") as watch:
-                fit.compute(watch, artist)
+                fit.compute(watch, figure_worker)
         fit.seconds = time.monotonic() - start_time
         if answer is not None:
             answer(fit)
         if files and not folder.numbers():
             with StepProgress(console, "writing figures and files ...") as watch:
-                write_files(fit, folder, artist, watch)
+                write_files(fit, folder, figure_worker, watch)
     return fit
 
 
@@ -128,7 +128,7 @@ def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Run:
     """
     with folder.locked(), one_thread():
         folder.require_finished()
-        fit = finished(folder)
+        fit = open_finished(folder)
         write_files(fit, folder, FigureWorker(), watch)
     return fit
 
@@ -179,7 +179,7 @@ def _rewrite(folder: RunFolder, config: Config) -> None:
 
 
 def write_files(
-    fit: Run, folder: RunFolder, artist: FigureWorker, watch: WatchSteps = unwatched
+    fit: Run, folder: RunFolder, figure_worker: FigureWorker, watch: WatchSteps = unwatched
 ) -> None:
     """Write all files of a run into a folder; the summary last, as the sign that all is done.
 
@@ -189,7 +189,7 @@ def write_files(
     numbers = fit.with_cache(folder=folder).numbers
     figures = folder.path / "figures"
     shutil.rmtree(figures, ignore_errors=True)  # none of an earlier end, as of bands
-    artist.draw(result)
+    figure_worker.draw(result)
     files = partial(watch, "files")
     files(0.0)
     with draft_of(folder.path / "posterior.nc") as draft:
@@ -201,7 +201,7 @@ def write_files(
         write_bands(bands, result.predictions, part(files, 0.3, 0.9))
     fit.keep(folder)
     files(1.0)
-    pictures, plots = artist.drawn(result, figures, partial(watch, "figures"))
+    pictures, plots = figure_worker.collect(result, figures, partial(watch, "figures"))
     page = render(fit.report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

@@ -286,13 +286,13 @@ class Stages:
     @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
         """Return what may explain each record's readings better than the model, the best first."""
-        from bwbayes.app.running.explaining import explained
+        from bwbayes.app.running.explaining import explain_record
         from bwbayes.inference.map_estimate import distinct
 
         best = self.problem.posterior.prior.unconstrain(self.best)
         modes = distinct([*best, *self.chain.point.optima], self.chain.point.covariance)
         return {
-            name: explained(self.problem, name, modes, of_record)
+            name: explain_record(self.problem, name, modes, of_record)
             for name, of_record in parts([*self.problem.records], watch)
         }
 
@@ -378,17 +378,19 @@ class Stages:
         """What is computed by now, by stage."""
         return {name: vars(self)[name] for name in STAGES if name in vars(self)}
 
-    def compute(self, watch: WatchSteps = unwatched, artist: FigureWorker | None = None) -> Result:
+    def compute(
+        self, watch: WatchSteps = unwatched, figure_worker: FigureWorker | None = None
+    ) -> Result:
         """Compute all stages in turn; return the run as the report is made of it.
 
         ``watch`` is called with the name of a stage and the share of it that is done; the
-        ``artist`` draws what there is to see, after each of them.
+        ``figure_worker`` draws what there is to see, after each of them.
         """
         self.watch = watch
         result = self.sampled
         for name, stage in STAGES.items():
-            if artist is not None:
-                artist.draw(result)
+            if figure_worker is not None:
+                figure_worker.draw(result)
             if self.converged or stage.always:
                 getattr(self, name)
                 result = replace(self.sampled, **self._computed)

@@ -56,7 +56,7 @@ def prepared(
     if isinstance(step, RelaxingStep):
         group, plan_rows = relaxing.rows(step, state, voltage[0]), relaxing.planned(step)
         return CompiledDrive(step, group[:, 0], group, plan_rows)
-    equilibrium = step.go(state, np.full(len(state), voltage[0])).w
+    equilibrium = step.apply(state, np.full(len(state), voltage[0])).w
     group = np.column_stack([np.arange(equilibrium.size), equilibrium, state])
     return CompiledDrive(step, equilibrium, group, step.parameters)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values, normal, refuse, rounded
+from bwbayes.model.declaration import Declaration, Values, normal, refuse, round_to_scale
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
@@ -68,7 +68,7 @@ class Duhem(OneState):
             "growth of the hysteresis with the voltage's square",
             lambda context: Distribution(
                 "halfnormal",
-                {"scale": rounded(0.3 * context.ranges.slope / context.ranges.farthest**2)},
+                {"scale": round_to_scale(0.3 * context.ranges.slope / context.ranges.farthest**2)},
             ),
             floor=0.0,
             reaches_floor=True,

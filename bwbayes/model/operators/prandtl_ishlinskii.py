@@ -15,7 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, positive, rounded
+from bwbayes.model.declaration import Declaration, Values, positive, round_to_scale
 from bwbayes.model.elementwise import anywhere, gone, select
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
@@ -168,7 +168,7 @@ class Plays(RemembersExtrema):
             unit="V",
             label="U",
             description="voltage up to which the thresholds are spread",
-            default=lambda context: rounded(context.ranges.voltage),
+            default=lambda context: round_to_scale(context.ranges.voltage),
             floor=0.0,
             loop=True,
         )

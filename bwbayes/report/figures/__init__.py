@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from bwbayes.report.page import PagePlots
     from bwbayes.report.result import Result
 
-__all__ = ["drawn", "picture_of", "plots_of", "prepare", "save_pictures"]
+__all__ = ["draw_styled", "picture_of", "plots_of", "prepare", "save_pictures"]
 
 
-def drawn(draw: Callable[..., Figure], *shown: Any) -> Figure:
+def draw_styled(draw: Callable[..., Figure], *shown: Any) -> Figure:
     """Draw a figure with the look that all have."""
     import matplotlib as mpl  # noqa: PLC0415
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.prediction.bands import Bands, Kind, titled
+from bwbayes.prediction.bands import Bands, Kind, title_of
 from bwbayes.report.words import label_with_unit
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def axis_label(parameter: Parameter) -> str:
 
 def title(bands: Bands) -> str:
     """Return the bands' name, and what they are of."""
-    return titled(bands.name, training=bands.training, separate=bands.separate)
+    return title_of(bands.name, training=bands.training, separate=bands.separate)
 
 
 def time_label(offset: float) -> str:

@@ -25,14 +25,14 @@ from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton, Pinned
 from bwbayes.model.operators.scalar_memory import OneState
-from bwbayes.model.registry import HYSTERESIS, made
+from bwbayes.model.registry import HYSTERESIS, build_part
 from tests.inference.problems import decaying_sine, posterior_of
 from tests.model.operators.slow import RANGES, SPAN, drawn, run
 
 
 def has_step(name: str) -> bool:
     """Tell whether an operator brings a step of its own."""
-    return type(made("hysteresis", name, HYSTERESIS, {})).step is not Operator.step
+    return type(build_part("hysteresis", name, HYSTERESIS, {})).step is not Operator.step
 
 
 every_operator = pytest.mark.parametrize("name", HYSTERESIS)
@@ -46,7 +46,7 @@ def posterior(
     parts: bool = False,
 ) -> Posterior:
     """Return a posterior of a short record with an operator."""
-    operator = made("hysteresis", name, HYSTERESIS, options or {})
+    operator = build_part("hysteresis", name, HYSTERESIS, options or {})
     voltage = decaying_sine(300)[60:]
     nonlinearity = PolynomialNonlinearity() if parts else None
     creep = Creep((0.1, 1.0), growing=True) if parts else None
@@ -63,11 +63,11 @@ def drawn_from(of: Posterior, count: int) -> FloatArray:
 @every_operator
 def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
     of = posterior(name, parts=True)
-    actuator, theta = of.likelihood.actuator, of.only.table.actuator(drawn_from(of, 5))
-    whole = actuator.displacement(theta, of.only.voltage)
+    actuator, theta = of.likelihood.actuator, of.single_record.table.actuator(drawn_from(of, 5))
+    whole = actuator.displacement(theta, of.single_record.voltage)
     state, parts = None, []
     for first, last in ((0, 1), (1, 2), (2, 77), (77, 240)):
-        part, state = actuator.advance(theta, of.only.voltage[first:last], state)
+        part, state = actuator.advance(theta, of.single_record.voltage[first:last], state)
         parts.append(part)
     size = np.ptp(whole)
     np.testing.assert_allclose(np.concatenate(parts, axis=1), whole, atol=1e-9 * size)
@@ -75,7 +75,7 @@ def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
 
 def models(name: str, size: int, seed: int) -> tuple[Operator, dict[str, FloatArray]]:
     """Return an operator and some models that hold, drawn from its default priors."""
-    operator = made("hysteresis", name, HYSTERESIS, {})
+    operator = build_part("hysteresis", name, HYSTERESIS, {})
     return operator, drawn(operator, size, seed)
 
 
@@ -163,8 +163,8 @@ def test_states_that_are_reachable_are_inside_the_prior(name: str) -> None:
     column = of.table.columns(drawn_from(of, 40))
     (initial,) = (p for p in of.prior.parameters if p.name == "initial")
     low, high = initial.declared.limits(column)
-    least, most = of.only.actuator.hysteresis.reachable(
-        column, float(of.only.voltage[0]), Span(-100.0, 100.0)
+    least, most = of.single_record.actuator.hysteresis.reachable(
+        column, float(of.single_record.voltage[0]), Span(-100.0, 100.0)
     )
     assert (least <= most).all()
     slack = 1e-9 * (np.abs(least) + np.abs(most))
@@ -199,10 +199,10 @@ def test_the_slope_of_a_step_is_that_of_its_displacement(name: str) -> None:
     )
     operator.check({**column, "initial": np.zeros_like(column["d"])})
     step = operator.step(column)
-    turned = step.go(step.demagnetized(), np.linspace(-90.0, 90.0, column["d"].size))
+    turned = step.apply(step.demagnetized(), np.linspace(-90.0, 90.0, column["d"].size))
     for voltage in (59.0, 20.0, -40.0, -90.0):
         low, middle, high = (
-            step.go(turned.memory, np.full_like(turned.w, voltage + part))
+            step.apply(turned.memory, np.full_like(turned.w, voltage + part))
             for part in (-1e-4, 0.0, 1e-4)
         )
         off = np.abs((high.w - low.w) / 2e-4 - middle.slope) / np.abs(column["d"])
@@ -263,17 +263,17 @@ def test_sweeps_reach_what_they_say(name: str) -> None:
 
 def test_an_unknown_operator_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(InputError, match="did you mean preisach"):
-        made("hysteresis", "presach", HYSTERESIS, {})
+        build_part("hysteresis", "presach", HYSTERESIS, {})
     with pytest.raises(InputError, match="cannot import 'nowhere:Loop'"):
-        made("hysteresis", "nowhere:Loop", HYSTERESIS, {})
+        build_part("hysteresis", "nowhere:Loop", HYSTERESIS, {})
 
 
 def assert_fitted(of: Posterior) -> None:
     """Fit a simulated record: the mode is at least as probable as the truth."""
     generator = np.random.default_rng(4)
     free = of.prior.draw(generator, 1)
-    clean = of.only.actuator.displacement(
-        of.only.table.actuator(of.prior.theta(free)), of.only.voltage
+    clean = of.single_record.actuator.displacement(
+        of.single_record.table.actuator(of.prior.theta(free)), of.single_record.voltage
     )[0]
     noise = 0.01 * np.ptp(clean) * generator.standard_normal(clean.size)
     record = of.altered(displacement=clean + noise)
@@ -296,8 +296,8 @@ def test_every_operator_is_fitted(name: str) -> None:
 def assert_finite(name: str, draws: int) -> None:
     """Every draw of the default priors has a likelihood, on both engines."""
     of = posterior(name, parts=True)
-    voltage = of.only.voltage[::8].copy()
-    displacement = of.only.displacement[::8].copy()
+    voltage = of.single_record.voltage[::8].copy()
+    displacement = of.single_record.displacement[::8].copy()
     of = of.altered(voltage=voltage, displacement=displacement, training=(slice(0, voltage.size),))
     theta = drawn_from(of, draws)
     for engine in ("numpy", "numba"):
