@@ -70,9 +70,9 @@ class ColumnsError(InputError):
     ) -> None:
         self.problem, self.place, self.fs = problem, place, fs
         self.guess: dict[str, dict[str, Any]] = {"columns": dict(columns), "units": dict(units)}
-        said = [f"{key}={table!r}" for key, table in self.guess.items() if table]
-        said += [] if fs is None else [f"fs={_rate(fs)}"]
-        super().__init__(f"{problem}; say {', '.join(said)}")
+        stated = [f"{key}={table!r}" for key, table in self.guess.items() if table]
+        stated += [] if fs is None else [f"fs={_rate(fs)}"]
+        super().__init__(f"{problem}; say {', '.join(stated)}")
 
     def within(self, place: str) -> ColumnsError:
         """Return the error of a file that a table of a config names."""

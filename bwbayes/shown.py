@@ -23,9 +23,9 @@ WIDTH, VALUE = 96, 70
 FEW = 4
 
 
-def brief(thing: object) -> str:
+def brief(instance: object) -> str:
     """Return class and fields of an object, on one line or one each; long values by their size."""
-    name, parts = type(thing).__name__, [f"{n}={_value(v)}" for n, v in _fields(thing)]
+    name, parts = type(instance).__name__, [f"{n}={_value(v)}" for n, v in _fields(instance)]
     line = f"{name}({', '.join(parts)})"
     if len(line) <= WIDTH:
         return line
@@ -48,14 +48,14 @@ def head(text: str) -> str:
     return "\n".join([*shown, f"... {len(lines) - len(shown)} more lines: print it to see them"])
 
 
-def _fields(thing: object) -> Iterator[tuple[str, Any]]:
+def _fields(instance: object) -> Iterator[tuple[str, Any]]:
     """Yield names and values of an object's fields."""
-    names: Iterable[str] = vars(thing)
-    if is_dataclass(thing):
-        names = [field.name for field in fields(thing) if field.repr]
+    names: Iterable[str] = vars(instance)
+    if is_dataclass(instance):
+        names = [field.name for field in fields(instance) if field.repr]
     for name in names:
         if not name.startswith("_"):
-            yield name, getattr(thing, name)
+            yield name, getattr(instance, name)
 
 
 def _value(value: Any, *, nested: bool = True) -> str:

@@ -79,14 +79,14 @@ class Verb:
     @property
     def help(self) -> list[str]:
         """The paragraphs before the parameters, and the first command among the examples."""
-        found = re.search(r"^ *(bwbayes .*)", self._sections.get("Examples", ""), re.MULTILINE)
-        return [self._sections[""], *([f"Example: {found[1]}"] if found else [])]
+        match = re.search(r"^ *(bwbayes .*)", self._sections.get("Examples", ""), re.MULTILINE)
+        return [self._sections[""], *([f"Example: {match[1]}"] if match else [])]
 
     def sentences(self, parameter: str) -> list[str]:
         """Return what is said of a parameter."""
         lines = rf"^(?:.*, )?{parameter}(?:, .*| : .*)?\n((?: {{4}}.*(?:\n|$))+)"
-        found = re.search(lines, self._sections.get("Parameters", ""), re.MULTILINE)
-        return re.split(r"(?<=\.) (?=[A-Z])", " ".join(found[1].split()) if found else "")
+        match = re.search(lines, self._sections.get("Parameters", ""), re.MULTILINE)
+        return re.split(r"(?<=\.) (?=[A-Z])", " ".join(match[1].split()) if match else "")
 
     @property
     def product(self) -> str:

@@ -259,11 +259,11 @@ def smooth_power(count: int, level: float, width: float) -> float:
     mean = b @ weight
     sd = np.sqrt(((b - mean[:, np.newaxis]) ** 2) @ weight)
     # By symmetry b1 has no mean and both are uncorrelated: integrate over the mean of b1.
-    rest = np.sqrt(np.maximum(-2 * np.log(level) - (sd[0] * z) ** 2, 0))
+    radius = np.sqrt(np.maximum(-2 * np.log(level) - (sd[0] * z) ** 2, 0))
     shift = mean[1] * np.sqrt(count)
-    below, above = ((side - rest) / sd[1] for side in (shift, -shift))
+    below, above = ((side - radius) / sd[1] for side in (shift, -shift))
     beyond = scipy.special.ndtr(below) + scipy.special.ndtr(above)
-    return float(np.where(rest > 0, beyond, 1) @ weight)
+    return float(np.where(radius > 0, beyond, 1) @ weight)
 
 
 def holm(p: FloatArray) -> FloatArray:

@@ -95,10 +95,10 @@ def rank_designs(
     chosen = coordinates[
         generator.choice(len(coordinates), min(40, len(coordinates)), replace=False)
     ]
-    begun = chosen.copy()
-    begun[:, new] = generator.standard_normal((len(chosen), new.size))
-    possible = np.isfinite(prior.constrain(begun)[1])
-    chosen[possible] = begun[possible]
+    proposed = chosen.copy()
+    proposed[:, new] = generator.standard_normal((len(chosen), new.size))
+    possible = np.isfinite(prior.constrain(proposed)[1])
+    chosen[possible] = proposed[possible]
 
     def targeted(places: FloatArray) -> FloatArray:
         if isinstance(target, str):
@@ -109,7 +109,7 @@ def rank_designs(
         posterior, posterior.single_record.voltage if isinstance(target, str) else target
     )
     factor = np.linalg.cholesky(covariance)
-    gradients = [value_and_jacobian(targeted, place[np.newaxis], columns)[1][0] for place in chosen]
+    gradients = [value_and_jacobian(targeted, point[np.newaxis], columns)[1][0] for point in chosen]
     before = [_mean_sd(gradient, covariance) for gradient in gradients]
     scores, count = [], len(candidates)
     for number, (name, voltage) in enumerate(candidates.items()):

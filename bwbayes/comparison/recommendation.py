@@ -145,8 +145,8 @@ def _summarize(comparison: Comparison) -> Iterator[str]:
     screened = [candidate.name for candidate in comparison.candidates if candidate.screened]
     if tied:
         names = _listed([recommended.name, *tied])
-        known = all(_is_known(comparison[name]) for name in (recommended.name, *tied))
-        why = "most probable" if known else "simplest"
+        are_known = all(_is_known(comparison[name]) for name in (recommended.name, *tied))
+        why = "most probable" if are_known else "simplest"
         yield f"{names} are indistinguishable; {recommended.name} is the {why}"
     elif len(comparison.differences) > 1 or screened:
         yield f"{recommended.name} is recommended"

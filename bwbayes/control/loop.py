@@ -150,7 +150,7 @@ def plan_loops(
     for (desired, begins), *parts in zip(
         references, *(np.split(values, len(references)) for values in fed), strict=True
     ):
-        command, reached = (part[:, : desired.shape[1]] for part in parts)
+        command, reached = (series[:, : desired.shape[1]] for series in parts)
         linear = limits.middle + (desired - ends.middle) * limits.half / ends.half
         nothing = np.zeros_like(desired)
         yield LoopPlan(

@@ -229,9 +229,9 @@ class SampledModel:
         """Taps of the sections, (sections, 9, models)."""
         numerator, denominator, gains = (np.moveaxis(values, 0, -1) for values in self.sections)
         held = self.actuator.hold == "zero"
-        one, first = np.ones_like(gains), denominator[:, 1]
+        unity, first = np.ones_like(gains), denominator[:, 1]
         # A voltage that is held acts on the next sample; this one is out of reach.
-        reach = [numerator[:, 1], -first, one] if held else [numerator[:, 0], one, 0 * one]
+        reach = [numerator[:, 1], -first, unity] if held else [numerator[:, 0], unity, 0 * unity]
         rows = [*np.moveaxis(numerator, 1, 0), first, denominator[:, 2], gains, *reach]
         return np.stack(rows, axis=1)
 

@@ -127,14 +127,18 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     assert bands.measured is not None
     mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
     residual = bands.measured[rows] - mean
-    own, slow, whole = (float(np.mean(bands.sd(kind)[rows] ** 2)) for kind in KINDS)
+    parameter_variance, slow, total_variance = (
+        float(np.mean(bands.sd(kind)[rows] ** 2)) for kind in KINDS
+    )
     # No band is narrower than the resolution of floating-point numbers.
     largest = float(np.max(np.abs([bands.measured[rows], mean])))
-    floor = max(1e-12 * whole, max(np.spacing(largest), 1e-150) ** 2)
-    sds = np.sqrt(np.maximum([whole - slow, slow - own if memory > 0 else 0.0], floor))
+    floor = max(1e-12 * total_variance, max(np.spacing(largest), 1e-150) ** 2)
+    sds = np.sqrt(
+        np.maximum([total_variance - slow, slow - parameter_variance if memory > 0 else 0.0], floor)
+    )
     noise = np.array([[*sds, max(memory, interval)]])
     # The parameters' errors, each of an independent standard normal size.
-    varying = np.sqrt(max(own - bands.common_sd**2, 0.0)) * (mean - np.mean(mean))
+    varying = np.sqrt(max(parameter_variance - bands.common_sd**2, 0.0)) * (mean - np.mean(mean))
     errors = np.stack([np.full(rows.size, bands.common_sd), varying / (np.std(mean) or 1.0)])
     skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
 
@@ -162,26 +166,26 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     along = (time - time[0]) / max(float(np.ptp(time)), interval)
     shapes = _shapes(bands, rows, along)
     weighed = {kind: weigh(added) for kind, added in shapes.items()}
-    nats = {kind: each[0] - plain for kind, each in weighed.items()}
-    left = {kind: each[-1] for kind, each in weighed.items()}
+    nats = {kind: fit[0] - plain for kind, fit in weighed.items()}
+    left = {kind: fit[-1] for kind, fit in weighed.items()}
     # Twice the mean to the readings: then they are its opposite.
     log_density, _, _, left["sign"] = weigh(shapes["offset"], residual + 2 * mean)
     nats["sign"] = log_density - plain
     decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in DECAYS]
-    starts = [each[0] for each in decays]
+    starts = [fit[0] for fit in decays]
     left["start"] = decays[int(np.argmax(starts))][-1]
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
-    far = np.abs(white) > 5 * max(scatter(white), 1.0)
-    left["outliers"] = float(np.mean(np.where(far, 0.0, residual) ** 2))
+    outlying = np.abs(white) > 5 * max(scatter(white), 1.0)
+    left["outliers"] = float(np.mean(np.where(outlying, 0.0, residual) ** 2))
     size = float(shapes["offset"][0, 0])
     # At the largest innovation or, where nothing is remembered, where the means before and from
     # there on are farthest apart.
     order = np.arange(white.size)
     parted = np.cumsum(white) - white - np.mean(white) * order
-    apart = parted**2 / np.maximum(order * (white.size - order), 1)
+    contrast = parted**2 / np.maximum(order * (white.size - order), 1)
     steps = []
-    for later in (int(np.argmax(np.abs(white) * (order > 0))), int(np.argmax(apart))):
+    for later in (int(np.argmax(np.abs(white) * (order > 0))), int(np.argmax(contrast))):
         after = np.where(order >= later, size, 0.0)[np.newaxis]
         log_density, _, sizes, rest = weigh(after)
         steps.append((log_density, later, size * float(sizes[0]), rest))
@@ -214,7 +218,9 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
         for kind, (text, fix) in WORDS.items()
         # What is named takes away most of what the bands do not allow, if that is much. Of a model
         # that is too simple these loops are a sign, and no full account.
-        if kind == "loop" or missed < ODDS * whole or left[kind] - whole < 0.5 * (missed - whole)
+        if kind == "loop"
+        or missed < ODDS * total_variance
+        or left[kind] - total_variance < 0.5 * (missed - total_variance)
     ]
 
 
@@ -229,11 +235,12 @@ def _shapes(bands: Bands, rows: IntArray, along: FloatArray) -> dict[str, FloatA
     size = 0.1 * (float(np.ptp(mean)) or 1.0)
     level = (voltage - np.mean(voltage)) / (float(np.max(np.abs(voltage))) or 1.0)
     speed = rate(bands.voltage, bands.interval)[rows]
-    way = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
+    direction = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
     return {
         "drift": size * np.stack([along, along**2]),
         "offset": np.full((1, rows.size), size),
         "gain": 0.3 * (mean - np.mean(mean))[np.newaxis],
         "delay": 0.3 * np.std(mean) / (np.std(slope) or 1.0) * slope[np.newaxis],
-        "loop": size * np.stack([level, level**2, level**3, way, way * level, way * level**2]),
+        "loop": size
+        * np.stack([level, level**2, level**3, direction, direction * level, direction * level**2]),
     }

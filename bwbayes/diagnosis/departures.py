@@ -60,13 +60,13 @@ class StandardizedResiduals:
         assert bands.measured is not None
 
         rows = bands.scored(bands.measured)
-        own, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
+        parameter_sd, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
         # No band is narrower than a floating-point number's resolution.
         largest = float(np.max(np.abs([bands.measured[rows], bands.mean[rows]])))
         sensor = np.maximum(sensor, max(np.spacing(largest), 1e-150))
         z = (bands.measured - bands.mean)[rows] / sensor
         total = float(np.mean(sensor**2))
-        p = min(float(np.mean(own**2)) / total, 1.0)
+        p = min(float(np.mean(parameter_sd**2)) / total, 1.0)
         q = min(float(np.mean(slow**2)) / total, 1.0) - p
         q = max(q, 0.0) if memory > 0 else 0.0
         # Pairs of scored samples at each lag, those in either order.
@@ -134,7 +134,10 @@ class StandardizedResiduals:
             # As sure as the size of the noise is.
             biases.append((text, 2 * float(scipy.stats.t.sf(errors, self.noise_size))))
         departures = (self._coverage(), sizes, biases)
-        rarest = [min(found, key=lambda pair: pair[1], default=("", 1.0)) for found in departures]
+        rarest = [
+            min(candidates, key=lambda pair: pair[1], default=("", 1.0))
+            for candidates in departures
+        ]
         return [(text, chance) for text, chance in rarest if chance < DOUBT]
 
     def reasons(self, span: tuple[float, float], extent: float) -> list[str]:
@@ -205,11 +208,11 @@ class StandardizedResiduals:
 
         Such a band covers nearly anything that the drive of training does.
         """
-        whole, displacement = (
+        series, displacement = (
             float(np.mean(self.bands.sd(kind)[self.scored] ** 2))
             for kind in ("sensor", "displacement")
         )
-        ratio = np.sqrt(whole / max(whole - displacement, 1e-9 * whole))
+        ratio = np.sqrt(series / max(series - displacement, 1e-9 * series))
         if ratio < 3:
             return ""
         return (

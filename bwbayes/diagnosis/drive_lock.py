@@ -86,8 +86,8 @@ def drive_locks(
     posterior: Posterior, draws: FloatArray, rng: np.random.Generator
 ) -> dict[str, DriveLock]:
     """Tell of each record of a posterior whether what the model misses follows the drive."""
-    each = posterior.each(draws)
-    return {name: drive_lock(alone, own_draws, rng) for name, alone, own_draws in each}
+    samples = posterior.each(draws)
+    return {name: drive_lock(alone, own_draws, rng) for name, alone, own_draws in samples}
 
 
 def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator) -> DriveLock:
@@ -103,14 +103,14 @@ def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator
     missed = readings.values - np.mean(posterior.simulate(theta[:MEAN_OF], readings.rows), axis=0)
     if float(np.std(missed)) < rounding_sd(readings.values):
         return DriveLock(0.0, 1.0)  # it rounds, which follows the drive as well
-    every = -(-missed.size // READINGS)
-    rows, parameters = readings.rows[::every], record.table.noise(theta)
+    stride = -(-missed.size // READINGS)
+    rows, parameters = readings.rows[::stride], record.table.noise(theta)
     # On a grid as coarse as the readings.
     step = int(np.gcd.reduce(np.diff(rows)))
     places = (rows - rows[0]) // step
     noise = record.noise.at(step * record.actuator.interval)
     discrepancy, sensor = noise.draw_all(parameters, int(places[-1]) + 1, rng)
-    like = compare(missed[::every], (discrepancy + sensor)[:, places], record.voltage, rows)
+    like = compare(missed[::stride], (discrepancy + sensor)[:, places], record.voltage, rows)
     typical = np.median(parameters, axis=0, keepdims=True)
     series = np.concatenate([[missed], drive_features(record.voltage)[:, readings.rows]])
     white = posterior.likelihood.whiten(typical, series[np.newaxis])[0][0]
@@ -160,8 +160,8 @@ def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArr
     """
     sums = np.concatenate([[0.0], np.cumsum(voltage)])
     columns = [voltage[rows]]
-    for part in AVERAGES:
-        first = np.maximum(rows + 1 - max(round(part * turn_time), 1), 0)
+    for block in AVERAGES:
+        first = np.maximum(rows + 1 - max(round(block * turn_time), 1), 0)
         columns.append((sums[rows + 1] - sums[first]) / (rows + 1 - first))
     turns = np.concatenate([[0], turning_points(voltage)])
     columns.append(voltage[turns[np.searchsorted(turns, rows, side="right") - 1]])
@@ -174,8 +174,8 @@ def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArr
 
 def drive_features(voltage: FloatArray) -> FloatArray:
     """Return what a misfit may follow: 1, powers, plays and lags (features, samples) of a drive."""
-    turn_time, middle = time_between_turns(voltage, 1.0), (voltage.max() + voltage.min()) / 2
-    level = (voltage - middle) / max(float(np.ptp(voltage)) / 2, 1e-300)
+    turn_time, center = time_between_turns(voltage, 1.0), (voltage.max() + voltage.min()) / 2
+    level = (voltage - center) / max(float(np.ptp(voltage)) / 2, 1e-300)
     thresholds = np.array(PLAYS)[:, np.newaxis]
     plays = np.empty((thresholds.size, level.size))
     reached = np.full((thresholds.size, 1), level[0])
@@ -183,9 +183,10 @@ def drive_features(voltage: FloatArray) -> FloatArray:
         along = level[first : last + 1] - direction * thresholds
         plays[:, first : last + 1] = (np.maximum if direction > 0 else np.minimum)(reached, along)
         reached = plays[:, last : last + 1]
-    kept = np.exp(-1 / (np.array(LAGS) * turn_time))
+    decays = np.exp(-1 / (np.array(LAGS) * turn_time))
     lags = [
-        scipy.signal.lfilter([1 - a], [1.0, -a], level, zi=[a * level[0]])[0] for a in kept.tolist()
+        scipy.signal.lfilter([1 - a], [1.0, -a], level, zi=[a * level[0]])[0]
+        for a in decays.tolist()
     ]
     return np.stack([np.ones(level.size), level, level**2, level**3, *plays, *lags])
 
@@ -199,16 +200,16 @@ def predictability(white: FloatArray, features: FloatArray, rng: np.random.Gener
     basis, sizes, _ = np.linalg.svd(features.T, full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
     parts = np.array_split(basis, PARTS)
-    inside = np.stack([part.T @ part for part in parts])
+    inside = np.stack([block.T @ block for block in parts])
     scaled = np.array_split(white / np.std(white), PARTS)
-    found = np.stack([part.T @ values for part, values in zip(parts, scaled, strict=True)])
-    scores = rng.standard_normal((DRAWN, *found.shape))
+    products = np.stack([block.T @ values for block, values in zip(parts, scaled, strict=True)])
+    scores = rng.standard_normal((DRAWN, *products.shape))
     drawn = np.einsum("pji,dpj->dpi", root(inside), scores)
-    each = np.concatenate([found[np.newaxis], drawn])
-    others = each.sum(axis=1, keepdims=True) - each
+    samples = np.concatenate([products[np.newaxis], drawn])
+    others = samples.sum(axis=1, keepdims=True) - samples
     # The ridge is worth a part of the record.
     ridge = (1 + 1 / PARTS) * np.eye(basis.shape[1])
     weights = np.einsum("pij,dpj->dpi", np.linalg.inv(ridge - inside), others)
     spread = np.sqrt(np.einsum("dpi,pij,dpj->d", weights, inside, weights))
-    z, *chance = np.sum(weights * each, axis=(1, 2)) / spread
+    z, *chance = np.sum(weights * samples, axis=(1, 2)) / spread
     return float(scipy.stats.norm.sf((z - np.mean(chance)) / np.std(chance)))

@@ -60,8 +60,8 @@ def transient(scene: ResidualAnalysis) -> Iterator[Explanation]:
     until = time * np.log(max(abs(size) / (0.002 * scene.extent), 1.0))
     text = f"transient of {size:.2g} um at the start that decays within {time:.2g} s"
     window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
-    gone = int(np.searchsorted(scene.time[: scene.voltage.size], until))
-    fix = settle_fix(scene.voltage, gone, window)
+    settled = int(np.searchsorted(scene.time[: scene.voltage.size], until))
+    fix = settle_fix(scene.voltage, settled, window)
     yield scene.explained("transient", text, fix, fit, removes=True, foreign=True)
 
 
@@ -143,17 +143,19 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
     fit = scene.extended(Effect(np.array([[-1.0], [0.0], [1.0]]), drive=shifted))
     yield _late(scene, scale * float(fit.sizes[0]), fit)
     record, limit = scene.posterior.single_record, min(0.55 * scene.turn_time, 0.2 * scene.duration)
-    kept = np.full(record.displacement.size, np.nan)
+    displacement_kept = np.full(record.displacement.size, np.nan)
     for window in record.training:
-        kept[window] = record.displacement[window]
-    late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
+        displacement_kept[window] = record.displacement[window]
+    late, _ = find_delay(Record(record.voltage, displacement_kept, interval=scene.interval), limit)
     rows = round(late / scene.interval)
     if abs(late) < scale or not rows:
         return
-    kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
-    whole = (slice(0, kept.size),)
-    unmoved = scene.posterior.altered(displacement=kept, training=whole)
-    moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=whole)
+    displacement_kept[: max(rows, 0)] = displacement_kept[
+        displacement_kept.size + min(rows, 0) :
+    ] = np.nan
+    whole = (slice(0, displacement_kept.size),)
+    unmoved = scene.posterior.altered(displacement=displacement_kept, training=whole)
+    moved = scene.posterior.altered(displacement=np.roll(displacement_kept, -rows), training=whole)
     before = replace(scene, fit=climb(unmoved, scene.places), before=None, held_out=())
     fit = climb(moved, map_estimate.local_minima(moved, scene.generator))
     cost = scene.lead + float(np.log(2 * limit / scene.interval))

@@ -291,7 +291,7 @@ def information_gain(
     count = 4000  # draws of the prior, and of the posterior, that are looked at
     step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
-    before, after = (prior.unconstrain(every) for every in (prior.draw(generator, count), thin))
+    before, after = (prior.unconstrain(sample) for sample in (prior.draw(generator, count), thin))
     log_likelihood = log_density.ravel()[::step] - prior.constrain(after)[1]
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
     watch(0.5)
@@ -314,8 +314,8 @@ def information_gain(
     # The three directions that keep most of their prior sd, in coordinates, whose spread the
     # constraints may have changed: the eigenvectors of the posterior's covariance relative to the
     # prior's.
-    given, left = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
-    variances, directions = scipy.linalg.eigh(left, given)
+    prior_covariance, left = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
+    variances, directions = scipy.linalg.eigh(left, prior_covariance)
     combinations = []
     for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
         sd = float(np.sqrt(max(variances[i], 0.0)))

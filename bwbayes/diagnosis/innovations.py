@@ -88,7 +88,7 @@ class Innovations:
         octaves = max(int(np.log2(max(amplitude.size, 1) / 6)), 0)
         cuts = 8 * 2 ** np.arange(octaves)
         parts = np.split(np.stack([amplitude.real, amplitude.imag]), cuts, axis=1)
-        power = np.array([np.mean(part**2) for part in parts])
+        power = np.array([np.mean(block**2) for block in parts])
         edges = np.array([0, *cuts, amplitude.size]) / (count * self.interval)
         total = np.mean(amplitude.real**2 + amplitude.imag**2) / 2
         test = scipy.stats.bartlett(*map(np.ravel, parts)) if octaves else None

@@ -161,8 +161,8 @@ def _statistics(
     # ∮ y du, by trapezes; turns of either direction count with their sign.
     area = np.sum(0.5 * (readings[:, 1:] + readings[:, :-1]) * np.diff(voltage), axis=1)
 
-    def share(part: FloatArray, of: FloatArray) -> FloatArray:
-        return np.divide(part, of, out=np.zeros_like(part), where=of > 0)
+    def share(selected: FloatArray, of: FloatArray) -> FloatArray:
+        return np.divide(selected, of, out=np.zeros_like(selected), where=of > 0)
 
     columns = (
         np.ptp(readings, axis=1),

@@ -141,17 +141,17 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     of all others away from their middle.
     """
     rows, readings = np.flatnonzero(record.has_reading), _readings(record)
-    kept = np.ones(rows.size, dtype=np.bool_)
-    while (retained := np.flatnonzero(kept)).size >= 0.95 * rows.size:
-        displacement, voltage = readings[kept], record.voltage[rows[kept]]
+    is_kept = np.ones(rows.size, dtype=np.bool_)
+    while (retained := np.flatnonzero(is_kept)).size >= 0.95 * rows.size:
+        displacement, voltage = readings[is_kept], record.voltage[rows[is_kept]]
         near = spikes(displacement, *_driven(displacement, voltage))
         if not ends:
             others = np.delete(displacement, near)
-            far = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
-            near = near[far | ((near > 0) & (near < retained.size - 1))]
+            outlying = np.abs(displacement[near] - np.median(others)) > 2 * np.ptp(others)
+            near = near[outlying | ((near > 0) & (near < retained.size - 1))]
         if not near.size:
-            return rows[~kept]
-        kept[retained[near]] = False
+            return rows[~is_kept]
+        is_kept[retained[near]] = False
     return rows[:0]
 
 
@@ -162,9 +162,9 @@ def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, 
     """
     extent, levels = _extent(displacement), np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
-    gain, middle = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
-    if middle > 0:  # no outlier makes this one larger
-        gain = min(gain, scatter(displacement) / middle)
+    gain, noise = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
+    if noise > 0:  # no outlier makes this one larger
+        gain = min(gain, scatter(displacement) / noise)
     return gain * voltage, max(0.01 * extent, 6 * resolution)
 
 
@@ -175,9 +175,9 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     more than five windows none is left out.
     """
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
-    drive, least = _driven(displacement, record.voltage[rows])
+    drive, threshold = _driven(displacement, record.voltage[rows])
     gaps = np.diff(rows)
-    at = lasting_jumps(displacement, drive, gaps <= np.median(gaps), least)
+    at = lasting_jumps(displacement, drive, gaps <= np.median(gaps), threshold)
     if not at.size:
         return None
     # Less what the voltage moves meanwhile.
@@ -251,9 +251,9 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
     if np.var(loop.residual) < gain * missed or not 0.5 * record.interval < abs(delay):
         return None
     time = record.time[record.has_reading] - delay
-    known = (time >= record.time[0]) & (time <= record.time[-1])
-    voltage = np.interp(time[known], record.time, record.voltage)
-    if _leads(voltage, _readings(record)[known]):
+    inside = (time >= record.time[0]) & (time <= record.time[-1])
+    voltage = np.interp(time[inside], record.time, record.voltage)
+    if _leads(voltage, _readings(record)[inside]):
         return None
     name = "displacement" if delay > 0 else "voltage"
     text = f"the {name} is late by {1e3 * abs(delay):.3g} ms"
@@ -321,11 +321,11 @@ def _stuck(record: Record) -> Iterator[Finding]:
         text = f"every sample is written {times} times"
         yield _whole(record, "repeated samples", text, f"decimate = {times} under [record]")
     elif repeats is not None:
-        seen = f"samples {jump.format(', voltage and displacement,', '')}"
-        yield _where(record, rows, "repeated samples", seen, repeats)
+        description = f"samples {jump.format(', voltage and displacement,', '')}"
+        yield _where(record, rows, "repeated samples", description, repeats)
     elif (holds := find_held(voltage, displacement)) is not None:
-        seen = f"readings {jump.format('', ', while the voltage moves')}"
-        yield _where(record, rows, "held readings", seen, holds)
+        description = f"readings {jump.format('', ', while the voltage moves')}"
+        yield _where(record, rows, "held readings", description, holds)
     limits: list[str] = []
     stays: list[tuple[float, float, str]] = []
     for side, sign in (("smallest", -1.0), ("largest", 1.0)):
@@ -333,8 +333,10 @@ def _stuck(record: Record) -> Iterator[Finding]:
         if ends is not None:
             limits.append(repr(float(f"{displacement[ends.first[0]]:.12g}")))
             start, stop = record.time[rows[[ends.first[0], ends.last[-1]]]].tolist()
-            seen = f"{ends.samples} readings stay at the {side} value, {float(limits[-1]):g} um"
-            stays.append((start, stop + record.interval, seen))
+            description = (
+                f"{ends.samples} readings stay at the {side} value, {float(limits[-1]):g} um"
+            )
+            stays.append((start, stop + record.interval, description))
     if stays:
         starts, stops, texts = zip(*stays, strict=True)
         first = record.clock(min(starts))
@@ -360,7 +362,9 @@ def _coarse(record: Record) -> Iterator[Finding]:
             yield _whole(record, "coarse resolution", text, fix)
 
 
-def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: FrozenRun) -> Finding:
+def _where(
+    record: Record, rows: IntArray, kind: str, description: str, stuck: FrozenRun
+) -> Finding:
     """Return a finding about stuck samples, with the windows to leave out if these are few."""
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval
@@ -368,7 +372,7 @@ def _where(record: Record, rows: IntArray, kind: str, seen: str, stuck: FrozenRu
         fix = _exclude(record, rows, stuck)
     else:
         fix = f"decimate = {stuck.length} under [record], or record at the sensor's own rate"
-    text = f"{stuck.samples} {seen}, first at {record.clock(starts[0])} s"
+    text = f"{stuck.samples} {description}, first at {record.clock(starts[0])} s"
     return Finding(kind, text, fix, float(starts[0]), float(stops[-1]))
 
 
@@ -407,18 +411,18 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         f"the displacement starts {abs(size):.3g} um {'above' if size > 0 else 'below'} where the "
         f"voltage would have it, and settles with a time constant of {time:.2g} s"
     )
-    gone = int(np.searchsorted(record.time, over))
-    fix = settle_fix(record.voltage, gone, f"start = {record.clock(over)} under [record]")
+    settled = int(np.searchsorted(record.time, over))
+    fix = settle_fix(record.voltage, settled, f"start = {record.clock(over)} under [record]")
     yield Finding("switch-on transient", text, fix, begin, over)
 
 
-def settle_fix(voltage: FloatArray, gone: int, leave_out: str) -> str:
-    """Return the line that leaves a start of ``gone`` samples out, unless it is too dear.
+def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:
+    """Return the line that leaves a start of ``settled`` samples out, unless it is too dear.
 
     A start that holds more than a twentieth of the drive's path is not left out.
     """
     steps = np.abs(np.diff(voltage, prepend=voltage[0]))
-    if steps[:gone].sum() > 0.05 * steps.sum():
+    if steps[:settled].sum() > 0.05 * steps.sum():
         return "measure again once the displacement has settled"
     return leave_out
 
@@ -428,8 +432,8 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     size = loop.trend
     share = max(loop.trend_share, 1e-12)
-    least = max(10 * spread / np.sqrt(share), 0.05 * extent, 2 * loop.driven_trend)
-    if share > 0.03 and abs(size) > least:
+    threshold = max(10 * spread / np.sqrt(share), 0.05 * extent, 2 * loop.driven_trend)
+    if share > 0.03 and abs(size) > threshold:
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
         yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")

@@ -149,8 +149,8 @@ class ResidualAnalysis:
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
         places = optima
         try:
-            rest = posterior.altered(training=later)
-            best = climb(rest, map_estimate.local_minima(rest, generator))
+            shorter = posterior.altered(training=later)
+            best = climb(shorter, map_estimate.local_minima(shorter, generator))
             places = np.concatenate([optima, best.coordinates[np.newaxis]])
         except InputError:
             pass  # the rest has too few readings for these priors
@@ -299,12 +299,12 @@ class ResidualAnalysis:
 
     def confirmed(self, explanation: Explanation) -> Explanation:
         """Weigh another model on all readings, if the scene looked at some of them."""
-        few = (
+        is_short = (
             self.posterior.single_record.readings.rows.size
             < self.whole.single_record.readings.rows.size
         )
         spec, coordinates = explanation.spec, explanation.coordinates
-        if not few or self.study is None or spec is None or coordinates is None:
+        if not is_short or self.study is None or spec is None or coordinates is None:
             return explanation
         other = self.study.with_model(spec, explanation.stated).posterior
         fit, before = climb(other, coordinates), self._on_all

@@ -56,11 +56,11 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
 
     Each starts at what it has in common with the model, and at its own valley.
     """
-    whole = study.posterior
-    place = map_estimate.local_minima(whole, rng, 1)[0]
-    theta = whole.prior.theta(whole.prior.constrain(place[np.newaxis])[0])
-    stride = stride_of(thin_posterior(whole, theta, READINGS), whole)
-    known = dict(zip(whole.names, place.tolist(), strict=True))
+    posterior_full = study.posterior
+    place = map_estimate.local_minima(posterior_full, rng, 1)[0]
+    theta = posterior_full.prior.theta(posterior_full.prior.constrain(place[np.newaxis])[0])
+    stride = stride_of(thin_posterior(posterior_full, theta, READINGS), posterior_full)
+    known = dict(zip(posterior_full.names, place.tolist(), strict=True))
     fits = []
     for spec in families(study.spec):
         # One that needs a prior that is not stated is no rival.
@@ -102,18 +102,18 @@ def disagreement(
     theta = posterior.prior.theta(draws)
     fitted = np.mean(posterior.simulate(theta), axis=0)
     missed = trained.readings.values - fitted[trained.readings.rows]
-    most = MISSES * min([float(np.std(missed)), *(rival.rmse for rival in rivals)])
+    limit = MISSES * min([float(np.std(missed)), *(rival.rmse for rival in rivals)])
     predicted = predict_record(posterior, draws, record, start, rng)
     scored = slice(predicted.scored_from, None)
     excess = []
     for rival in rivals:
-        if rival.rmse > most:
+        if rival.rmse > limit:
             continue
         rows = rival.posterior.single_record.readings.rows * stride_of(rival.posterior, posterior)
         training = np.mean((rival.displacement - fitted[rows]) ** 2)
         other = predict_record(rival.posterior, _laplace(rival, rng), record, start, rng)
-        apart = other.mean[scored] - predicted.mean[scored]
-        excess.append(np.mean(apart**2) - training)
+        difference = other.mean[scored] - predicted.mean[scored]
+        excess.append(np.mean(difference**2) - training)
     return float(np.sqrt(max(np.mean(excess), 0.0))) if excess else 0.0
 
 

@@ -31,41 +31,43 @@ def scatter(values: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def spikes(values: FloatArray, drive: FloatArray, least: float) -> IntArray:
+def spikes(values: FloatArray, drive: FloatArray, threshold: float) -> IntArray:
     """Return the samples of isolated outliers in values (samples,).
 
     A spike is one or two samples that lie off the median of their neighborhood by eight times what
     is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
     unit, has a spike of its own nearby, the values may have one of twice its size.
     """
-    off, own = (
+    off, own_scatter = (
         series - scipy.ndimage.median_filter(series, NEIGHBORS, mode="mirror")
         for series in (values, drive)
     )
-    allowed = 2 * scipy.ndimage.maximum_filter1d(np.abs(own), 2 * NEIGHBORS + 1)
+    allowed = 2 * scipy.ndimage.maximum_filter1d(np.abs(own_scatter), 2 * NEIGHBORS + 1)
     spread = scatter(off[off != 0]) if np.any(off) else 0.0
-    limit = max(8 * spread, least) + allowed
+    limit = max(8 * spread, threshold) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
     # A spike moves its neighbors' medians too. The largest comes first, and a straight line takes
     # its place before the next is judged.
     half = NEIGHBORS // 2
-    rest = np.pad(values, half, mode="reflect")
-    isolated = np.zeros(rest.size, dtype=np.bool_)
+    padded = np.pad(values, half, mode="reflect")
+    isolated = np.zeros(padded.size, dtype=np.bool_)
     for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
-        middle = np.sort(rest[at - half : at + half + 1])[half]
-        if abs(rest[at] - middle) > limit[at - half]:
+        middle = np.sort(padded[at - half : at + half + 1])[half]
+        if abs(padded[at] - middle) > limit[at - half]:
             isolated[at] = True
             before = after = at
             while isolated[before]:
                 before -= 1
             while isolated[after]:
                 after += 1
-            rest[before : after + 1] = np.linspace(rest[before], rest[after], after - before + 1)
+            padded[before : after + 1] = np.linspace(
+                padded[before], padded[after], after - before + 1
+            )
     return np.flatnonzero(isolated[half:])
 
 
 def lasting_jumps(
-    values: FloatArray, drive: FloatArray, adjacent: BoolArray, least: float
+    values: FloatArray, drive: FloatArray, adjacent: BoolArray, threshold: float
 ) -> IntArray:
     """Return the samples at which values (samples,) jump, and stay for longer than a spike does.
 
@@ -75,8 +77,8 @@ def lasting_jumps(
     """
     moved, pushed = (np.where(adjacent, np.diff(series), 0.0) for series in (values, drive))
     pushed -= scipy.ndimage.median_filter(pushed, NEIGHBORS, mode="mirror")
-    least = max(least, 2 * float(np.max(np.abs(pushed))))
-    at = spikes(moved, np.zeros(moved.size), least) + 1
+    threshold = max(threshold, 2 * float(np.max(np.abs(pushed))))
+    at = spikes(moved, np.zeros(moved.size), threshold) + 1
     half = NEIGHBORS // 2
     # With as many samples on either side as a median takes.
     at = at[(at >= NEIGHBORS) & (at <= values.size - NEIGHBORS)]

@@ -172,18 +172,18 @@ class ValidationSummary:
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> Self:
         """Return what a converged run's ``summary.json`` says."""
-        every = (summary.get("validation") or {}).items()
-        if any("passed" not in entry for _, entry in every):
+        entries = (summary.get("validation") or {}).items()
+        if any("passed" not in entry for _, entry in entries):
             raise InputError(
                 "summary.json: is an earlier version's; remove it and write it by `bwbayes resume`"
             )
-        return cls._of((entry["passed"], entry.get("message", name)) for name, entry in every)
+        return cls._of((entry["passed"], entry.get("message", name)) for name, entry in entries)
 
     @classmethod
     def _of(cls, answers: Iterable[tuple[bool | None, str]]) -> Self:
-        every = list(answers)
+        entries = list(answers)
         for passed in (False, None):
-            lines = tuple(line for answer, line in every if answer is passed)
+            lines = tuple(line for answer, line in entries if answer is passed)
             if lines:
                 return cls(passed, lines)
         return cls()
@@ -254,7 +254,7 @@ def validate_bands(
         doubted = replace(verdict, notes=(note, *width))
     if reasons:
         missed = any(reason.startswith("NRMSE") for reason in reasons)
-        mending = [each for each in explanations if each.mends or not missed]
+        mending = [explanation for explanation in explanations if explanation.mends or not missed]
         why = join_findings(likely_causes(mending)) or (
             REVERSED_SIGN
             if reasons[0].startswith("the readings fall")
@@ -273,16 +273,16 @@ def validate_bands(
             f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
         )
     elif better is not None:
-        parts = any(each.spec is not None for each in better_models(explanations))
-        way = "; --improve adds it" if parts else ", which no key of [model] adds"
-        doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){way}")
+        parts = any(explanation.spec is not None for explanation in better_models(explanations))
+        remedy = "; --improve adds it" if parts else ", which no key of [model] adds"
+        doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){remedy}")
     if standard.idle and not bands.training:
         doubts.append(standard.idle)
-    least = 5.0  # worth fewer independent readings a record cannot show that bands hold
-    if standard.effective_size < least:
+    minimum = 5.0  # worth fewer independent readings a record cannot show that bands hold
+    if standard.effective_size < minimum:
         doubts.append(
             f"effective sample size {standard.effective_size:.1f} is too small to validate the "
-            f"bands; use a record {least / standard.effective_size:.2g} times as long"
+            f"bands; use a record {minimum / standard.effective_size:.2g} times as long"
         )
     return (
         replace(doubted, passed=None, reasons=tuple(doubts), cause=followed or better)

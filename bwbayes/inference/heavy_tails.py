@@ -134,8 +134,8 @@ def run(steps: Steps, mean: FloatArray, covariance: FloatArray) -> tuple[FloatAr
         mean += gain * error[:, t, np.newaxis]
         # Joseph's form, (1 − G c) P (1 − G c)ᵀ + R G Gᵀ, whose rounding is that of what is left.
         covariance -= _outer(gain, shared)
-        left = _times(covariance, row)
-        covariance += _outer(sensor[:, t, np.newaxis] * gain - left, gain)
+        cross = _times(covariance, row)
+        covariance += _outer(sensor[:, t, np.newaxis] * gain - cross, gain)
         covariance += _outer(doubt[:, np.newaxis] * shared, shared)
         covariance[:] = (covariance + covariance.swapaxes(1, 2)) / 2
     return log_density, error, spread, sensor
@@ -218,9 +218,9 @@ def quantiles(inverse_df: FloatArray, scores: FloatArray) -> FloatArray:
     )
 
 
-def _outer(one: FloatArray, other: FloatArray) -> FloatArray:
+def _outer(first_vector: FloatArray, other: FloatArray) -> FloatArray:
     """Return the products (models, states, states) of each two numbers of (models, states)."""
-    return one[:, :, np.newaxis] * other[:, np.newaxis]
+    return first_vector[:, :, np.newaxis] * other[:, np.newaxis]
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -160,13 +160,13 @@ class Likelihood:
         :mod:`~bwbayes.inference.heavy_tails`, to which the start is a state.
         """
         if self.noise.tailed:
-            found, states = self._followed(theta), self.noise.states
-            scores = heavy_tails.normal_scores(self.spaced, self.table.noise(theta), found)
+            followed, states = self._followed(theta), self.noise.states
+            scores = heavy_tails.normal_scores(self.spaced, self.table.noise(theta), followed)
             return LinearStart(
-                found.log_density,
+                followed.log_density,
                 np.sum(scores**2, axis=1),
-                found.mean[:, states:],
-                found.covariance[:, states:, states:],
+                followed.mean[:, states:],
+                followed.covariance[:, states:, states:],
             )
         if self.engine == "numpy":
             products = self.products_of_series(theta, np.empty((0, self.readings.rows.size)))
@@ -294,8 +294,8 @@ class Likelihood:
         for rows, noise, series in self._series(theta, shapes, displacement):
             sensor = None
             if self.noise.tailed:
-                known = series[:, : 1 + self.unknowns]
-                sensor = self.follow(noise, known, self.start_sd(theta[rows])).sensor
+                fixed_part = series[:, : 1 + self.unknowns]
+                sensor = self.follow(noise, fixed_part, self.start_sd(theta[rows])).sensor
             white, log_determinant = self.whiten(noise, series, sensor)
             # Sums, not dot products: a linear algebra library may split those over threads.
             results.append((np.einsum("mit,mjt->mij", white, white), log_determinant))
@@ -310,7 +310,7 @@ class Likelihood:
         # Shapes are many: NumPy is to have a model's series in the cache. Compiled code takes many
         # models in the time of one.
         elements = 1 << 16 if shapes.size and self.engine == "numpy" else 1 << 23
-        every = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
+        shapes_of_models = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:
@@ -323,7 +323,7 @@ class Likelihood:
             if not self.from_rest:
                 sections = self.actuator.sections(self.actuator.columns(model))
                 parts.append(sections.free_responses(readings.samples)[..., readings.where])
-            parts.append(every[batch])
+            parts.append(shapes_of_models[batch])
             yield batch, noise, np.concatenate(parts, axis=1)
 
     def whiten(
@@ -351,8 +351,8 @@ class Likelihood:
         """
         series = residual[:, np.newaxis]
         if self.noise.tailed:
-            found = self.follow(noise, series, np.empty((len(noise), 0)))
-            return heavy_tails.normal_scores(self.spaced, noise, found)
+            followed = self.follow(noise, series, np.empty((len(noise), 0)))
+            return heavy_tails.normal_scores(self.spaced, noise, followed)
         return self.whiten(noise, series)[0][:, 0]
 
     def follow(self, noise: FloatArray, series: FloatArray, start_sd: FloatArray) -> Followed:
@@ -368,11 +368,11 @@ class Likelihood:
     def _followed(self, theta: FloatArray, displacement: FloatArray | None = None) -> Followed:
         """Filter the readings at θ (models, parameters); ``displacement`` as in :meth:`score`."""
         nothing = np.empty((0, self.readings.rows.size))
-        found = [
+        followed = [
             self.follow(noise, series, self.start_sd(theta[rows]))
             for rows, noise, series in self._series(theta, nothing, displacement)
         ]
-        return Followed(*map(np.concatenate, zip(*found, strict=True)))
+        return Followed(*map(np.concatenate, zip(*followed, strict=True)))
 
 
 def _solved(matrices: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -77,15 +77,15 @@ def fit(
     modes: list[Mode] = []
     if short is posterior:
         places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))
-        for place in watched(places, part(watch, 0.5, 0.9)):
-            _add_mode(posterior, modes, place)
-        for place in _zero_noise_starts(posterior, modes[0].coordinates, noise):
-            _add_mode(posterior, modes, place)
+        for start_point in watched(places, part(watch, 0.5, 0.9)):
+            _add_mode(posterior, modes, start_point)
+        for start_point in _zero_noise_starts(posterior, modes[0].coordinates, noise):
+            _add_mode(posterior, modes, start_point)
     else:
         point = fit(short, generator, part(watch, 0.0, 0.5))
         spread = point.prior_covariance
-        for place in watched([*point.optima], part(watch, 0.5, 1.0)):
-            _add_mode(posterior, modes, place, point.covariance)
+        for start_point in watched([*point.optima], part(watch, 0.5, 1.0)):
+            _add_mode(posterior, modes, start_point, point.covariance)
     watch(1.0)
     best = modes[0]
     worth = [m.coordinates for m in modes if m.log_density > best.log_density - NEGLIGIBLE]
@@ -106,12 +106,12 @@ def local_minima(
     InputError
         As :func:`fit`.
     """
-    known = posterior.single_record
-    covered = np.maximum.accumulate(known.voltage) - np.minimum.accumulate(known.voltage)
+    data = posterior.single_record
+    covered = np.maximum.accumulate(data.voltage) - np.minimum.accumulate(data.voltage)
     everywhere = int(np.searchsorted(covered, 0.9 * covered[-1]))
-    last = max(everywhere, int(known.readings.rows[0])) + SAMPLES
-    if known.readings.samples > last:
-        windows = (slice(w.start, min(w.stop, last)) for w in known.training if w.start < last)
+    last = max(everywhere, int(data.readings.rows[0])) + SAMPLES
+    if data.readings.samples > last:
+        windows = (slice(w.start, min(w.stop, last)) for w in data.training if w.start < last)
         posterior = posterior.altered(training=tuple(windows))
     return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
 
@@ -124,7 +124,7 @@ def mode_weights(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, 
     if len(point.optima) == 1:
         return point.covariance[np.newaxis], np.ones(1)
     # Climbed to once more: a chain's file keeps the covariance of the best alone.
-    modes = [refine(posterior, place, point.covariance) for place in point.optima]
+    modes = [refine(posterior, start_point, point.covariance) for start_point in point.optima]
     covariances = np.stack([mode.covariance for mode in modes])
     log_evidence = np.array([mode.log_density for mode in modes])
     log_evidence += np.linalg.slogdet(covariances)[1] / 2
@@ -189,26 +189,28 @@ def _add_mode(
     modes.sort(key=lambda mode: -mode.log_density)
 
 
-def _zero_noise_starts(posterior: Posterior, place: FloatArray, noise: FloatArray) -> FloatArray:
+def _zero_noise_starts(
+    posterior: Posterior, start_point: FloatArray, noise: FloatArray
+) -> FloatArray:
     """Return starts (noise, free), each with one noise parameter at its prior's center.
 
     Few readings may leave open whether a discrepancy is there at all. Where it is next to nothing,
     as its prior's center is, all is the sensor's noise: another mode, which no step from the first
     one finds. The other noise parameters are the most probable of prior draws (draws, noise).
     """
-    starts = np.empty((noise.shape[1], place.size))
+    starts = np.empty((noise.shape[1], start_point.size))
     for column, start in enumerate(starts):
         resting = noise.copy()
         resting[:, column] = 0.0
-        places = _beside(place, resting)
+        places = _beside(start_point, resting)
         start[:] = places[int(np.argmax(posterior.log_density(places)))]
     return starts
 
 
-def _beside(place: FloatArray, noise: FloatArray) -> FloatArray:
+def _beside(start_point: FloatArray, noise: FloatArray) -> FloatArray:
     """Return a place (free,) with each of some noise parameters (draws, noise)."""
-    places = np.tile(place, (len(noise), 1))
-    places[:, place.size - noise.shape[1] :] = noise
+    places = np.tile(start_point, (len(noise), 1))
+    places[:, start_point.size - noise.shape[1] :] = noise
     return places
 
 

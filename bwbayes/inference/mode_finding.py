@@ -163,14 +163,14 @@ class Target:
         informations = linear.fisher_information + np.eye(self.physical.size)
         steps = np.zeros_like(coordinates)
         steps[:, self.physical] = np.linalg.solve(informations, gradients[..., np.newaxis])[..., 0]
-        left = [*range(len(states))]
+        remaining = [*range(len(states))]
         for fraction in FRACTIONS:
-            tried = np.stack([states[i].coordinates + fraction * steps[i] for i in left])
-            for i, ahead in zip([*left], self.at(tried), strict=True):
+            tried = np.stack([states[i].coordinates + fraction * steps[i] for i in remaining])
+            for i, ahead in zip([*remaining], self.at(tried), strict=True):
                 if ahead.density > states[i].density:
                     states[i] = ahead
-                    left.remove(i)
-            if not left:
+                    remaining.remove(i)
+            if not remaining:
                 break
         return states
 
@@ -267,8 +267,8 @@ def climb(
     coordinates while there are several. Where no start is possible, that is the state. ``watch``
     is called with the share of the most rounds that is done.
     """
-    begun = target.at(starts)
-    states = [state for state in begun if np.isfinite(state.density)]
+    initial_states = target.at(starts)
+    states = [state for state in initial_states if np.isfinite(state.density)]
     for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch) if states else ():
         ahead = target.round(states, many_steps if len(states) > 1 else NOISE_STEPS)
         best = int(np.argmax([state.density for state in ahead]))
@@ -277,7 +277,7 @@ def climb(
         missing = least - ahead[best].density
         if len(states) == 1 and gain < max(GAIN, missing / AHEAD):
             break
-    return max(states or begun, key=lambda state: state.density)
+    return max(states or initial_states, key=lambda state: state.density)
 
 
 def refine(posterior: Posterior, coordinates: FloatArray, covariance: FloatArray) -> Mode:
@@ -307,8 +307,8 @@ def refine(posterior: Posterior, coordinates: FloatArray, covariance: FloatArray
             coordinates = coordinates + axes @ steps[best]
             log_density += float(gained[best])
         axes = axes @ (vectors / np.sqrt(np.maximum(values, FLATTEST)))
-        there = gained[best] <= 0 or np.linalg.norm(step) < 1e-2
-        if there and np.allclose(values, 1.0, atol=0.2):
+        is_converged = gained[best] <= 0 or np.linalg.norm(step) < 1e-2
+        if is_converged and np.allclose(values, 1.0, atol=0.2):
             break
     return Mode(coordinates, axes @ axes.T, log_density)
 

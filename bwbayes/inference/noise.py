@@ -269,8 +269,8 @@ class SmoothNoise(Noise):
         quality = np.maximum(quality, LEAST_QUALITY)
         fast = (1 + np.sqrt(np.maximum(1 - 4 * quality**2, 0))) / (2 * time * quality**2)
         fast = np.maximum(fast, 1 / (time * quality))
-        kept, passed = self.transition(theta, readings), readings * self.interval
-        gained = np.eye(2) - kept @ np.swapaxes(kept, 1, 2)
+        transitions, passed = self.transition(theta, readings), readings * self.interval
+        gained = np.eye(2) - transitions @ np.swapaxes(transitions, 1, 2)
         short = fast * passed < 1
         if short.any():
             pushed = _oscillation(theta[short], passed * (1 + NODES) / 2)[..., 1]
@@ -287,20 +287,20 @@ def _oscillation(theta: FloatArray, time: float | FloatArray) -> FloatArray:
     memory, quality = (theta[:, column].reshape(shape) for column in (2, 3))
     quality = np.maximum(quality, LEAST_QUALITY)
     frequency = 1 / (memory * quality)
-    middle = frequency / (2 * quality)
+    mean_rate = frequency / (2 * quality)
     # At Q = 1/2 both rates are the same.
-    apart = np.maximum(np.sqrt(np.abs(1 - 4 * quality**2)) * middle, 1e-150)
-    fast = middle + apart
+    rate_difference = np.maximum(np.sqrt(np.abs(1 - 4 * quality**2)) * mean_rate, 1e-150)
+    fast = mean_rate + rate_difference
     slow = frequency * (frequency / fast)
     lasting = np.exp(-slow * time)
-    swelled = -lasting * np.expm1(-2 * apart * time) / (2 * apart)
+    swelled = -lasting * np.expm1(-2 * rate_difference * time) / (2 * rate_difference)
     first, last = lasting + slow * swelled, np.exp(-fast * time) - slow * swelled
     swings = quality > 0.5
     if swings.any():
-        decay, angle = np.exp(-middle * time), apart * time
-        sine, cosine = decay * np.sin(angle) / apart, decay * np.cos(angle)
-        first = np.where(swings, cosine + middle * sine, first)
-        last = np.where(swings, cosine - middle * sine, last)
+        decay, angle = np.exp(-mean_rate * time), rate_difference * time
+        sine, cosine = decay * np.sin(angle) / rate_difference, decay * np.cos(angle)
+        first = np.where(swings, cosine + mean_rate * sine, first)
+        last = np.where(swings, cosine - mean_rate * sine, last)
         swelled = np.where(swings, sine, swelled)
     across = frequency * swelled
     rows = np.stack([first, across, -across, last], axis=-1)

@@ -124,16 +124,16 @@ def surprise(
         forward[missing] = noise.transition(parameters, 1 + missing)[0]
         backward[missing] = np.linalg.solve(stationary, forward[missing] @ stationary).T
     turned = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    known = stationary, observe, sensor
-    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *known)
-    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *known)
+    covariance_now = stationary, observe, sensor
+    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *covariance_now)
+    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *covariance_now)
     m_2, p_2 = after[0][::-1], after[1][::-1]
-    one, other = np.linalg.inv(p_1), np.linalg.inv(p_2)
-    joined = np.linalg.inv(one + other - np.linalg.inv(stationary))
-    pull = np.einsum("tij,tj->ti", one, m_1) + np.einsum("tij,tj->ti", other, m_2)
-    seen = joined @ observe
-    distance: FloatArray = residual - np.sum(seen * pull, axis=1)
-    return distance / np.sqrt(seen @ observe + sensor)
+    inverse_1, inverse_2 = np.linalg.inv(p_1), np.linalg.inv(p_2)
+    joined = np.linalg.inv(inverse_1 + inverse_2 - np.linalg.inv(stationary))
+    pull = np.einsum("tij,tj->ti", inverse_1, m_1) + np.einsum("tij,tj->ti", inverse_2, m_2)
+    projected = joined @ observe
+    distance: FloatArray = residual - np.sum(projected * pull, axis=1)
+    return distance / np.sqrt(projected @ observe + sensor)
 
 
 def _predicted(
@@ -153,16 +153,19 @@ def _predicted(
     means = np.empty((residual.size, observe.size))
     covariances = np.empty((residual.size, *stationary.shape))
     # What is known already is taken from the covariance, which stays stationary otherwise.
-    mean, known = np.zeros(observe.size), np.zeros_like(stationary)
+    mean, covariance_now = np.zeros(observe.size), np.zeros_like(stationary)
     series = zip(residual.tolist(), skipped.tolist(), fitted.tolist(), strict=True)
     for t, (reading, missing, is_fitted) in enumerate(series):
         if t:
-            kept = steps[missing]
-            mean, known = kept @ mean, kept @ known @ kept.T
-        means[t], covariances[t] = mean, stationary - known
+            transition_gap = steps[missing]
+            mean, covariance_now = (
+                transition_gap @ mean,
+                transition_gap @ covariance_now @ transition_gap.T,
+            )
+        means[t], covariances[t] = mean, stationary - covariance_now
         if is_fitted:
             shared = covariances[t] @ observe
             gain = shared / (shared @ observe + sensor)
             mean = mean + gain * (reading - observe @ mean)
-            known = known + np.outer(gain, shared)
+            covariance_now = covariance_now + np.outer(gain, shared)
     return means, covariances

@@ -74,13 +74,13 @@ class ParameterTable:
                 f"model.per_record: {repeated[0]!r} is in model.shared too; "
                 "remove it from one of them"
             )
-        every = {name: np.ones(1) for name in plain}
+        unit_values = {name: np.ones(1) for name in plain}
         for declaration in self.declarations:
             if declaration.bounds is None:
                 continue
             try:
                 with np.errstate(all="ignore"):
-                    declaration.bounds(every)
+                    declaration.bounds(unit_values)
             except KeyError as unknown:
                 raise InputError(
                     f"model: the bounds of {declaration.name} ask for {unknown}, which no part "

@@ -109,8 +109,8 @@ class Noise(ABC):
         InputError
             Q is no covariance: P is not stationary under F.
         """
-        stationary, kept = self.stationary(theta), self.transition(theta, readings)
-        gained = stationary - kept @ stationary @ np.swapaxes(kept, 1, 2)
+        stationary, transitions = self.stationary(theta), self.transition(theta, readings)
+        gained = stationary - transitions @ stationary @ np.swapaxes(transitions, 1, 2)
         gained = (gained + np.swapaxes(gained, 1, 2)) / 2
         # Each state in its own unit.
         scale = np.sqrt(np.maximum(np.diagonal(stationary, axis1=1, axis2=2), 1e-300))
@@ -234,19 +234,21 @@ class Noise(ABC):
                 white[..., t] = innovation / np.sqrt(variance)[:, np.newaxis]
                 log_determinant += np.log(variance)
                 t += 1
-                kept, gained = between
+                transitions, gained = between
                 if t == readings:
                     # Nothing is left to be predicted.
-                    kept, gained = np.eye(self.states)[np.newaxis], np.zeros_like(gained)
+                    transitions, gained = np.eye(self.states)[np.newaxis], np.zeros_like(gained)
                 elif t == last and skipped is not None:
                     over = 1.0 + float(skipped[t])
-                    kept = self.transition(theta, over)
+                    transitions = self.transition(theta, over)
                     gained = self.process_covariance(theta, over)
-                forced = (shared / variance[:, np.newaxis])[:, np.newaxis] @ kept.swapaxes(1, 2)
-                mean = mean @ kept.swapaxes(1, 2) + innovation[..., np.newaxis] * forced
+                forced = (shared / variance[:, np.newaxis])[:, np.newaxis] @ transitions.swapaxes(
+                    1, 2
+                )
+                mean = mean @ transitions.swapaxes(1, 2) + innovation[..., np.newaxis] * forced
                 # Joseph's form, which has no negative eigenvalue however it is rounded.
                 forced = forced.swapaxes(1, 2)
-                onwards = kept - forced * observe
+                onwards = transitions - forced * observe
                 forced = forced * sd[:, np.newaxis, np.newaxis]
                 before, predicted = predicted, onwards @ predicted @ onwards.swapaxes(1, 2)
                 predicted += forced * forced.swapaxes(1, 2) + gained
@@ -258,9 +260,9 @@ class Noise(ABC):
 
         √(2 Δ (g Q g* + s²)), g = h (z − F)⁻¹ with z = exp(2π i f Δ).
         """
-        (kept,), (gained,) = self.transition(theta), self.process_covariance(theta)
+        (transitions,), (gained,) = self.transition(theta), self.process_covariance(theta)
         z = np.exp(2j * np.pi * frequency * self.interval)[:, np.newaxis, np.newaxis]
-        row = self.observe @ np.linalg.inv(z * np.eye(self.states) - kept)
+        row = self.observe @ np.linalg.inv(z * np.eye(self.states) - transitions)
         power = np.einsum("fi,ij,fj->f", row, gained, row.conj()).real
         density: FloatArray = np.sqrt(2 * self.interval * (power + theta[0, 0] ** 2))
         return density
@@ -276,15 +278,15 @@ class Noise(ABC):
         self, theta: FloatArray, samples: int, generator: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Draw the same at each θ (models, parameters), (models, samples), as one by one."""
-        kept = self.transition(theta)
+        transitions = self.transition(theta)
         scores = generator.standard_normal((len(theta), self.states + 1, samples))
         states = np.swapaxes(scores[:, :-1], 1, 2) @ root(self.process_covariance(theta))
         states[:, 0] = (scores[:, np.newaxis, :-1, 0] @ root(self.stationary(theta)))[:, 0]
         if self.states == 1:
-            for model, (a,) in enumerate(kept[:, 0]):
+            for model, (a,) in enumerate(transitions[:, 0]):
                 states[model, :, 0] = scipy.signal.lfilter((1.0,), (1.0, -a), states[model, :, 0])
             return states @ self.observe, self.sensor_noise(theta, scores[:, -1])
-        for model, matrix in enumerate(kept):
+        for model, matrix in enumerate(transitions):
             # F = U T U* with T triangular: from the last one on, each is a recursion by itself.
             triangle, basis = scipy.linalg.schur(matrix, output="complex")
             parts = states[model] @ basis.conj()
@@ -317,7 +319,7 @@ class SumNoise(Noise):
         """Those of the first term, then all but the sensor's of the others."""
         declared = list(self.terms[0].declarations)
         for number, term in enumerate(self.terms[1:], start=2):
-            taken = {declaration.name for declaration in declared}
+            names_taken = {declaration.name for declaration in declared}
             for declaration in term.declarations[1:]:
                 renamed = replace(
                     declaration,
@@ -326,7 +328,7 @@ class SumNoise(Noise):
                     description=f"{declaration.description}, term {number}",
                     aliases=(),
                 )
-                declared.append(renamed if declaration.name in taken else declaration)
+                declared.append(renamed if declaration.name in names_taken else declaration)
         return tuple(declared)
 
     @property
@@ -336,8 +338,12 @@ class SumNoise(Noise):
 
     def inverse_df(self, theta: FloatArray) -> FloatArray:
         """Return that of the term that has heavy tails, if any."""
-        found = [term.inverse_df(own) for term, own in self._split(theta) if term.tailed]
-        return found[0] if found else np.zeros(len(theta))
+        degrees = [
+            term.inverse_df(columns_of_term)
+            for term, columns_of_term in self._split(theta)
+            if term.tailed
+        ]
+        return degrees[0] if degrees else np.zeros(len(theta))
 
     @property
     def observe(self) -> FloatArray:
@@ -346,24 +352,34 @@ class SumNoise(Noise):
 
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return the covariances of all terms along the diagonal."""
-        return _along_diagonal([term.stationary(own) for term, own in self._split(theta)])
+        return _along_diagonal(
+            [term.stationary(columns_of_term) for term, columns_of_term in self._split(theta)]
+        )
 
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
         """Return the transitions of all terms along the diagonal."""
-        return _along_diagonal([term.transition(own, readings) for term, own in self._split(theta)])
+        return _along_diagonal(
+            [
+                term.transition(columns_of_term, readings)
+                for term, columns_of_term in self._split(theta)
+            ]
+        )
 
     def process_covariance(self, theta: FloatArray, readings: float = 1.0) -> FloatArray:
         """Return the process covariances of all terms along the diagonal."""
         return _along_diagonal(
-            [term.process_covariance(own, readings) for term, own in self._split(theta)]
+            [
+                term.process_covariance(columns_of_term, readings)
+                for term, columns_of_term in self._split(theta)
+            ]
         )
 
     def correlation_time(self, theta: FloatArray) -> FloatArray:
         """Return the mean of those of all terms, by their variances (models,), s."""
         times, variances = np.zeros(len(theta)), np.zeros(len(theta))
-        for term, own in self._split(theta):
-            variance = term.marginal_sd(own)[0] ** 2
-            times += variance * term.correlation_time(own)
+        for term, columns_of_term in self._split(theta):
+            variance = term.marginal_sd(columns_of_term)[0] ** 2
+            times += variance * term.correlation_time(columns_of_term)
             variances += variance
         return times / np.maximum(variances, np.finfo(float).tiny)
 
@@ -408,7 +424,11 @@ def _stays(before: FloatArray, after: FloatArray) -> bool:
 
 
 def _filter_settled(
-    kept: FloatArray, gain: FloatArray, observe: FloatArray, mean: FloatArray, series: FloatArray
+    transitions: FloatArray,
+    gain: FloatArray,
+    observe: FloatArray,
+    mean: FloatArray,
+    series: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Filter series (models, series, readings) whose gain K stays, a block of readings at once.
 
@@ -422,8 +442,8 @@ def _filter_settled(
     models, n_series, readings = series.shape
     size = min(BLOCK, readings)
     n_blocks = readings // size
-    forced = (kept @ gain[..., np.newaxis])[..., 0]
-    onwards = kept - forced[..., np.newaxis] * observe
+    forced = (transitions @ gain[..., np.newaxis])[..., 0]
+    onwards = transitions - forced[..., np.newaxis] * observe
     # A^j F K and h A^j, (models, size, states).
     responses, rows = np.empty((2, models, size, observe.size))
     responses[:, 0], rows[:, 0] = forced, observe
@@ -443,7 +463,7 @@ def _filter_settled(
     innovations = blocks - expected @ np.swapaxes(rows, 1, 2) - blocks @ np.swapaxes(weights, 1, 2)
     innovations = innovations.reshape(models, n_series, n_blocks * size)
     if n_blocks * size < readings:
-        rest = series[..., n_blocks * size :]
-        mean, last = _filter_settled(kept, gain, observe, mean, rest)
+        tail = series[..., n_blocks * size :]
+        mean, last = _filter_settled(transitions, gain, observe, mean, tail)
         innovations = np.concatenate([innovations, last], axis=2)
     return mean, innovations

@@ -98,8 +98,8 @@ def _with_reversals(voltage: FloatArray, stride: int) -> FloatArray:
     """Take every ``stride``-th voltage; where these turn, the extreme of all voltages nearby."""
     result = voltage[::stride].copy()
     for branch in list(monotone_stretches(result))[:-1] if stride > 1 else ():
-        middle = stride * branch.last
-        nearby = voltage[max(middle - stride + 1, 0) : middle + stride]
+        position = stride * branch.last
+        nearby = voltage[max(position - stride + 1, 0) : position + stride]
         result[branch.last] = nearby.max() if branch.direction > 0 else nearby.min()
     return result
 

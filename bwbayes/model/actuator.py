@@ -124,7 +124,10 @@ class Actuator:
     def declarations(self) -> tuple[Declaration, ...]:
         """The parameters that the parts declare, in the order of θ's columns."""
         parts = (self.hysteresis, self.nonlinearity, self.filter, self.creep, *self.stages)
-        return (*(d for part in parts if part is not None for d in part.parameters), OFFSET)
+        return (
+            *(d for component in parts if component is not None for d in component.parameters),
+            OFFSET,
+        )
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -321,8 +324,8 @@ class Actuator:
         """
         if not self.inputs:
             return path, ()
-        every = np.broadcast_to(path, (column["offset"].size, path.size))
-        return pass_stages(self.inputs, column, every, memories, self.timing, advance)
+        paths = np.broadcast_to(path, (column["offset"].size, path.size))
+        return pass_stages(self.inputs, column, paths, memories, self.timing, advance)
 
     def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
         """Return what hysteresis and nonlinearity make of a path, V, (models, samples), um.
@@ -332,8 +335,10 @@ class Actuator:
         """
         if path.ndim == 2:
             parts = [
-                self.drive(values, own, before)
-                for values, own, before in zip(each_model(column), path, memory, strict=True)
+                self.drive(values, path_of_model, before)
+                for values, path_of_model, before in zip(
+                    each_model(column), path, memory, strict=True
+                )
             ]
             drives, memories = zip(*parts, strict=True)
             return np.concatenate(drives), memories
@@ -361,8 +366,8 @@ class Actuator:
         span = span or self.range_of(path)
         if path.ndim == 2:
             return tuple(
-                self.begin(values, own, from_rest=from_rest, span=span)
-                for values, own in zip(each_model(column), path, strict=True)
+                self.begin(values, path_of_model, from_rest=from_rest, span=span)
+                for values, path_of_model in zip(each_model(column), path, strict=True)
             )
         return self.hysteresis.begin(column, float(path[0]), span, from_rest=from_rest)
 
@@ -378,8 +383,8 @@ class Actuator:
         """Raise an InputError where a model is outside of the domain of a part."""
         self.hysteresis.check(column)
         self.filter.check(column)
-        for part in (self.nonlinearity, self.creep):
-            check(part.parameters if part else (), column, ("creep_growth",))
+        for component in (self.nonlinearity, self.creep):
+            check(component.parameters if component else (), column, ("creep_growth",))
         for stage in self.stages:
             stage.check(column)
         check((OFFSET,), column)

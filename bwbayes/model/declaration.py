@@ -187,11 +187,11 @@ def check(
         values, floor = column[parameter.name], parameter.floor
         refuse(parameter.name, ~np.isfinite(values), values, "must be finite")
         if parameter.reaches_floor or parameter.name in may_be_zero:
-            least = "must not be negative" if floor == 0 else f"must be at least {floor:g}"
-            refuse(parameter.name, values < floor, values, least)
+            requirement = "must not be negative" if floor == 0 else f"must be at least {floor:g}"
+            refuse(parameter.name, values < floor, values, requirement)
         else:
-            least = "must be positive" if floor == 0 else f"must be above {floor:g}"
-            refuse(parameter.name, values <= floor, values, least)
+            requirement = "must be positive" if floor == 0 else f"must be above {floor:g}"
+            refuse(parameter.name, values <= floor, values, requirement)
 
 
 def refuse(name: str, wrong: BoolArray, values: FloatArray, demand: str) -> None:

@@ -30,8 +30,8 @@ class Filter(ABC):
 
     def unknowns(self, hold: Hold) -> int:
         """Return how many numbers say in which state it is at a record's first sample."""
-        ones = {parameter.name: np.ones(1) for parameter in self.parameters}
-        return self.recursion(ones, 1, 1.0, hold).unknowns
+        values = {parameter.name: np.ones(1) for parameter in self.parameters}
+        return self.recursion(values, 1, 1.0, hold).unknowns
 
     @abstractmethod
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:

@@ -316,16 +316,16 @@ def solve_branch(
 
     latest = low
     for _ in range(60):
-        middle = (low + high) / 2
-        between = excess(middle)
+        midpoint = (low + high) / 2
+        between = excess(midpoint)
         root = np.sqrt(np.maximum(between**2 - below * beyond, 0.0))
         step = np.divide(between, root, out=np.zeros_like(root), where=root > 0)
-        before, latest = latest, np.clip(middle - (middle - low) * step, low, high)
+        before, latest = latest, np.clip(midpoint - (midpoint - low) * step, low, high)
         value = excess(latest)
-        for place, height in ((middle, between), (latest, value)):
+        for voltage_tried, height in ((midpoint, between), (latest, value)):
             under = height < 0
-            low, below = np.where(under, place, low), np.where(under, height, below)
-            high, beyond = np.where(under, high, place), np.where(under, beyond, height)
+            low, below = np.where(under, voltage_tried, low), np.where(under, height, below)
+            high, beyond = np.where(under, high, voltage_tried), np.where(under, beyond, height)
         settled = np.abs(latest - before) <= resolution
         if (settled | (value == 0) | (high - low <= resolution)).all():
             break

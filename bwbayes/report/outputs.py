@@ -97,9 +97,9 @@ def write_bands(path: Path, bands: Sequence[Bands], watch: Watch = unwatched) ->
             for name, column in zip(names, columns, strict=True):
                 values = column[np.isfinite(column)]
                 span = float(np.ptp(values)) if values.size else 0.0
-                far = float(np.max(np.abs(values))) / span if span > 0 else 1.0
+                ratio = float(np.max(np.abs(values))) / span if span > 0 else 1.0
                 # A float has no more than 17 digits.
-                extra = math.ceil(math.log10(min(max(far, 1.0), 1e10)))
+                extra = math.ceil(math.log10(min(max(ratio, 1.0), 1e10)))
                 formats.append(f"%.{min((9 if name.endswith('time_s') else 7) + extra, 17)}g")
             row = f"{prefix}{','.join(formats)}\n"
             for rows in batched(zip(*columns, strict=True), 10_000):

@@ -282,24 +282,24 @@ def _grids(table: Table, width: int) -> Iterator[Grid]:
     columns, rows = table.cells("screen")
     titles = [f"{c.group}: {c.title}" if c.group else c.title for c in columns]
     texts = [[_plain(text) for text in column] for column in zip(titles, *rows, strict=True)]
-    wanted = [max(map(len, column)) for column in texts]
-    least = []
+    widths = [max(map(len, column)) for column in texts]
+    minimum_widths = []
     for number, (title, *cells) in enumerate(texts):
-        whole = number == 0 or max(map(len, cells)) <= 24
-        words = [*title.split(), *(cells if whole else " ".join(cells).split())]
-        least.append(min(max(map(len, words), default=1), width // 2))
+        is_whole = number == 0 or max(map(len, cells)) <= 24
+        words = [*title.split(), *(cells if is_whole else " ".join(cells).split())]
+        minimum_widths.append(min(max(map(len, words), default=1), width // 2))
     parts = [[0]]
     for i in range(1, len(texts)):
-        if len(parts[-1]) > 1 and sum(least[n] + 2 for n in [*parts[-1], i]) > width:
+        if len(parts[-1]) > 1 and sum(minimum_widths[n] + 2 for n in [*parts[-1], i]) > width:
             parts.append([0])
         parts[-1].append(i)
     for shown in parts:
-        spare = width - sum(least[i] + 2 for i in shown)
+        spare = width - sum(minimum_widths[i] + 2 for i in shown)
         grid = Grid(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
         for i in shown:
-            more = max(min(wanted[i] - least[i], spare), 0)
+            more = max(min(widths[i] - minimum_widths[i], spare), 0)
             spare -= more
-            grid.add_column(escape(texts[i][0]), width=least[i] + more, overflow="fold")
+            grid.add_column(escape(texts[i][0]), width=minimum_widths[i] + more, overflow="fold")
         for row in zip(*(texts[i][1:] for i in shown), strict=True):
             grid.add_row(*map(escape, row))
         yield grid

@@ -80,8 +80,8 @@ def _words(verb: Verb) -> list[click.Parameter]:
     words: list[click.Parameter] = []
     for name, hint in verb.words.items():
         kind = type_of(name, hint)
-        for way, text in zip(verb.either or [name], verb.sentences(name), strict=False):
-            flag, _, value = way.partition(" ")
+        for usage, text in zip(verb.either or [name], verb.sentences(name), strict=False):
+            flag, _, value = usage.partition(" ")
             if flag.startswith("--"):
                 words.append(click.Option([flag], type=FILE if value else str, help=text))
             else:
@@ -151,8 +151,8 @@ def predict(
             f"{record}: has no displacement that is recognized, so the bands are not validated; if "
             "a column is one, say --column displacement=NAME"
         )
-    known = options["from_rest"] or options["after"]
-    if unmeasured and not (known or any("--from-rest" in remark for remark in bands.remarks)):
+    is_known = options["from_rest"] or options["after"]
+    if unmeasured and not (is_known or any("--from-rest" in remark for remark in bands.remarks)):
         width = bands.upper["sensor", 95] - bands.lower["sensor", 95]
         remarks.append(
             "the state that the actuator starts from is unknown: the 95% sensor band is "

@@ -94,9 +94,9 @@ class Config(ConfigTable):
         for name in self.records if len(self.records) > 1 else ():
             if re.fullmatch(r"record|training(-\d+)?", name):
                 raise ValueError(f"the name {name!r} of a record is taken; choose another")
-        taken = "|".join(map(re.escape, (ALONE, "training", *self.records)))
+        reserved = "|".join(map(re.escape, (ALONE, "training", *self.records)))
         for name, validation in self.validation.items():
-            if re.fullmatch(rf"({taken})(-\d+)?", name):
+            if re.fullmatch(rf"({reserved})(-\d+)?", name):
                 raise ValueError(f"validation: the name {name!r} is taken by a training record")
             if validation.of is not None and validation.of not in self.records:
                 hint = suggestion(validation.of, list(self.records))

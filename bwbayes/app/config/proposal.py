@@ -124,8 +124,8 @@ def _text(
     quoted = partial(json.dumps, ensure_ascii=False)
 
     def relative(file: Path) -> str:
-        place = Path(os.path.relpath(file.absolute(), where.absolute()))
-        return quoted(path_text(place.as_posix()))
+        location = Path(os.path.relpath(file.absolute(), where.absolute()))
+        return quoted(path_text(location.as_posix()))
 
     source = f"file = {relative(path)}"
     if naming.displacement_file is not None:
@@ -185,8 +185,8 @@ def _start(record: Record) -> str:
     if not record.starts_at_zero:
         unknown = "the initial state is unknown and will be estimated"
         return f"# from_rest = false  # {record.beginning}; {unknown}"
-    said = "say so if the actuator was demagnetized and nothing moved"
-    return f"# from_rest = true  # {record.beginning}; {said}"
+    advice = "say so if the actuator was demagnetized and nothing moved"
+    return f"# from_rest = true  # {record.beginning}; {advice}"
 
 
 def _held_out(record: Record) -> list[slice]:

@@ -71,13 +71,13 @@ def config_reference(requested: str | None) -> str:
         shown = [key for key in documented if not key.path.startswith(repeated)]
         return "\n\n".join([_wrapped(head), *map(_entry, shown)])
     path = requested.split(".")
-    found = [key for key in documented if _ends_with(key, path)]
-    if not found:
+    matches = [key for key in documented if _ends_with(key, path)]
+    if not matches:
         names = list(dict.fromkeys(key.name for key in documented))
         hint = suggestion(path[-1], names, synonyms(Config))
         raise InputError(f"config: no key {requested!r}; {hint}")
-    inside = tuple(f"{key.path}." for key in found if key.table is not None)
-    shown = [key for key in documented if key in found or key.path.startswith(inside)]
+    inside = tuple(f"{key.path}." for key in matches if key.table is not None)
+    shown = [key for key in documented if key in matches or key.path.startswith(inside)]
     return "\n\n".join(map(_entry, shown))
 
 
@@ -118,15 +118,15 @@ def parts_reference(requested: str | None) -> str:
     Raises InputError: there is no such part.
     """
     if requested is not None:
-        found = [
+        matches = [
             (kind, makers[requested]()) for kind, makers in PARTS.items() if requested in makers
         ]
-        if not found:
+        if not matches:
             registered = {
                 name: maker for makers in PARTS.values() for name, maker in makers.items()
             }
-            found = [("from outside", build_part("models", requested, registered, {}))]
-        return "\n\n".join(_part(kind, requested, component) for kind, component in found)
+            matches = [("from outside", build_part("models", requested, registered, {}))]
+        return "\n\n".join(_part(kind, requested, component) for kind, component in matches)
     lines = ["The parts of a model, by the key of [model] that chooses them.", ""]
     for kind, makers in PARTS.items():
         lines.append(f"{kind}:")

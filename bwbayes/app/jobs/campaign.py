@@ -87,9 +87,9 @@ def start(
     Raises InputError: no records, or a folder of something else.
     """
     records_in(records)
-    said = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
-    Naming(**said)  # what cannot be is refused before any record is
-    origin = Origin(str(records.absolute()), str(where.absolute()), pictures, said)
+    stated = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    Naming(**stated)  # what cannot be is refused before any record is
+    origin = Origin(str(records.absolute()), str(where.absolute()), pictures, stated)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
 
@@ -194,11 +194,11 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
         try:
             existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            found = existing.problem()
-            expected = problem.with_noise(found.config.model.noise)
-            same_posterior = fingerprint(found) == fingerprint(expected)
-            if same_posterior and found.digests == problem.digests:
-                return existing, found
+            problem_found = existing.problem()
+            expected = problem.with_noise(problem_found.config.model.noise)
+            same_posterior = fingerprint(problem_found) == fingerprint(expected)
+            if same_posterior and problem_found.digests == problem.digests:
+                return existing, problem_found
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)

@@ -305,10 +305,10 @@ def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
     """Make a model's folder, or take the one that is there, if it is the same run's."""
     if path.exists() and not overwrite:
         folder = RunFolder.open(path)
-        found = folder.problem()
-        expected = problem.with_noise(found.config.model.noise)
+        stored = folder.problem()
+        expected = problem.with_noise(stored.config.model.noise)
         # A config has no more of its records than their ranges and names.
-        if found.config != expected.config or found.digests != expected.digests:
+        if stored.config != expected.config or stored.digests != expected.digests:
             raise InputError(
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )

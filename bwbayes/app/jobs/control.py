@@ -227,9 +227,9 @@ def _reference(
         if isinstance(requested, str) and not path.suffix and not path.exists():
             hint = suggestion(requested, SHAPES)
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
-        alike = column_options_from(path, read_as, reading)
-        alike.pop("voltage_is", None)
-        values, interval = read_reference(path, Naming(**alike))
+        options_of_record = column_options_from(path, read_as, reading)
+        options_of_record.pop("voltage_is", None)
+        values, interval = read_reference(path, Naming(**options_of_record))
         return Reference(values, interval, path.stem, smoothed)
     try:
         values = np.asarray(requested, dtype=np.float64)

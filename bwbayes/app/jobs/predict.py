@@ -123,8 +123,8 @@ def predict(
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
         reading = {**(reading or {}), "table": table, "displacement_file": displacement_file}
-        alike = column_options_from(record, problem.config.records[of].read_as, reading)
-        record = read_record(record, need_displacement=False, **alike)
+        reading_options = column_options_from(record, problem.config.records[of].read_as, reading)
+        record = read_record(record, need_displacement=False, **reading_options)
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold

@@ -60,12 +60,12 @@ def simulate(
     truth_file = out.with_name(f"{out.stem}.truth{out.suffix}")
     refuse_existing([out, truth_file, parameters], overwrite=overwrite)
     sine = {"amplitude": amplitude, "frequency": frequency, "duration": duration}
-    given = {name: value for name, value in sine.items() if value is not None}
+    arguments = {name: value for name, value in sine.items() if value is not None}
     if signal == "sine":
-        options = {"amplitude": 100.0, "frequency": 1.0, "duration": 16.0} | given
+        options = {"amplitude": 100.0, "frequency": 1.0, "duration": 16.0} | arguments
         waveform = Waveform(Sine(options["amplitude"], options["frequency"]), options["duration"])
-    elif given:
-        raise InputError(f"simulate: {', '.join(given)} need --signal sine")
+    elif arguments:
+        raise InputError(f"simulate: {', '.join(arguments)} need --signal sine")
     else:
         waveform = named(signal)
     stand = VirtualTestStand(discrepancy, rate)

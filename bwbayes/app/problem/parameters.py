@@ -128,7 +128,7 @@ def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
     other = set[str]()
     parts = stand.actuator.hysteresis, fitted.hysteresis
     # Whether Bouc-Wen hysteresis is passive says where its parameters may lie, not what they mean.
-    if parts[0] != parts[1] and not all(isinstance(part, BoucWen) for part in parts):
+    if parts[0] != parts[1] and not all(isinstance(operator, BoucWen) for operator in parts):
         other |= {declared.name for declared in fitted.hysteresis.parameters}
     if fitted.creep and stand.actuator.creep and fitted.creep.times != stand.actuator.creep.times:
         other |= {declared.name for declared in fitted.creep.parameters}

@@ -177,8 +177,8 @@ class Problem:
             voltage = record.path.voltage
             beyond = beyond_training(self.posterior, voltage, record.interval, window)
             # A held-out part goes on with the loops of the rest, and its readings test them.
-            part = validation.record is None
-            found[name] = [each for each in beyond if not (part and each.kind == "reversals")]
+            is_window = validation.record is None
+            found[name] = [each for each in beyond if not (is_window and each.kind == "reversals")]
         return found
 
     @cached_property
@@ -281,8 +281,8 @@ def _start(record: Record, from_rest: bool) -> str:
     if from_rest:
         return f"{record.beginning}, demagnetized and at rest, as from_rest declares"
     unknown = "; the hysteresis's state and how the dynamics move then are estimated"
-    known = "; if it was demagnetized and nothing moved, from_rest = true makes them known"
-    return f"{record.beginning}{unknown}{known * record.starts_at_zero}"
+    hint_from_rest = "; if it was demagnetized and nothing moved, from_rest = true makes them known"
+    return f"{record.beginning}{unknown}{hint_from_rest * record.starts_at_zero}"
 
 
 def _outliers(

@@ -245,8 +245,10 @@ class Campaign(Product):
         first = self.fit(self.population.names[0])
         problem = first.problem
         if not isinstance(record, Record):
-            alike = column_options_from(record, next(iter(problem.config.records.values())).read_as)
-            record = read_record(record, need_displacement=False, **alike)
+            options = column_options_from(
+                record, next(iter(problem.config.records.values())).read_as
+            )
+            record = read_record(record, need_displacement=False, **options)
         source = generator(problem.config.seed, "next specimen")
         draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
         start, like = InitialConditions(from_rest, True, lead_in), next(iter(problem.records))

@@ -104,8 +104,8 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
     # That outliers spoil a record is an explanation, which has its own evidence.
-    known = {*evidence, "student"}
-    others = [n for n in NOISES if n not in known and (n == "white" or p < colored)]
+    candidates = {*evidence, "student"}
+    others = [n for n in NOISES if n not in candidates and (n == "white" or p < colored)]
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
         other = problem.study.with_model(replace(problem.study.spec, noise=noise)).posterior
         # What only the other noise has starts at its prior's median.
@@ -179,21 +179,21 @@ def improve_model(
             scene = _scene(problem, name, point.optima)
             found = explain(scene, partial(watch, "explanations"))
             # The last one has just been weighed.
-            needless = [each for each in without(scene, [*notes][:-1]) if each.nats >= 0]
+            needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
         parts = likely_causes([cause for cause in found if cause.spec is not None])
         if needless:
-            chosen = max(needless, key=lambda each: each.nats)
+            chosen = max(needless, key=lambda removal: removal.nats)
             del notes[chosen.kind]
-            said = f"left out again: {chosen.kind}"
+            note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(found)):
             chosen, chain = parts[0], problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
             notes[added] = f"model improved: {chosen.text} ({chosen.worth})"
-            said = f"added: {chosen.text}"
+            note = f"added: {chosen.text}"
         else:
             break
-        console.print(said, highlight=False, soft_wrap=True)
+        console.print(note, highlight=False, soft_wrap=True)
         assert chosen.spec is not None
         config = with_model(config, chosen.spec, problem.records, chosen.stated)
     if not notes:

@@ -128,7 +128,7 @@ def save(path: Path, state: str, values: Mapping[str, object]) -> None:
 def load(path: Path, state: str) -> dict[str, Any] | None:
     """Return what was kept of a run in that state; None if there is none, or it is damaged."""
     try:
-        digest, content = (whole := path.read_bytes())[:32], whole[32:]
+        digest, content = (file_bytes := path.read_bytes())[:32], file_bytes[32:]
     except OSError:
         return None
     if sha256(content).digest() != digest:

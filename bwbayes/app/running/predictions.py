@@ -165,13 +165,13 @@ def predict_another(
     background = ValidationContext.of(posterior, flat)
     verdict = validate_bands(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
-    rest = _from_rest_remark(problem, subset, other, bands, beyond)
+    from_rest_note = _from_rest_remark(problem, subset, other, bands, beyond)
     watch(1.0)
     noise = path.remark or planned_noise(other.record)
     held = _held_lead_in_remark(problem, other, bands)
     remarks = (
         *[noise] * bool(noise),
-        *[rest] * bool(rest),
+        *[from_rest_note] * bool(from_rest_note),
         *[held] * bool(held),
         *[bands.model_error_note] * bool(bands.model_error_note),
         *(finding.note for finding in beyond),

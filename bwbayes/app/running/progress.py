@@ -119,12 +119,12 @@ class Progress(ProgressLine):
         elapsed = max(time.monotonic() - self.started_at, 1e-9)
         rate = self.steps * self.plan.ensembles * self.plan.walkers / elapsed
         if self.check is None:
-            most = self.plan.max_pilot_steps
-            share = min(self.steps / most, 1.0)
+            limit = self.plan.max_pilot_steps
+            share = min(self.steps / limit, 1.0)
             remaining = _minutes(elapsed * (1 - share) / share) if share else "unknown"
             return (
                 f"{phase:9} {self.steps:6.0f} steps   {rate:6.0f} evaluations/s   "
-                f"burn-in {share:.0%} of at most {most} steps   ETA at most {remaining}"
+                f"burn-in {share:.0%} of at most {limit} steps   ETA at most {remaining}"
             )
         check = self.check
         # It counts down to the end that was forecast at the last check.

@@ -29,8 +29,8 @@ def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
     group[:, 0] = np.arange(models)
     group[:, 1] = group[:, 2] = memory.displacement
     group[:, 3], group[:, 4] = memory.direction, len(extrema)
-    for slot, (level, displacement, own) in enumerate(extrema, FIXED):
-        group[:, slot] = level if own is None else own
+    for slot, (level, displacement, weight) in enumerate(extrema, FIXED):
+        group[:, slot] = level if weight is None else weight
         group[:, slots + slot] = displacement
     return group
 
@@ -146,7 +146,7 @@ def _branch(
 ) -> None:
     """Write w along a branch from an extremum on; along the first one it moves half as far."""
     first = depth == 1
-    part = 0.5 * s if first else s
+    half_step = 0.5 * s if first else s
     for t in range(voltage.size):
         u = voltage[t]
-        w[t] = level + part * formula(operator, numbers, -u if first else turned, u)
+        w[t] = level + half_step * formula(operator, numbers, -u if first else turned, u)

@@ -94,8 +94,8 @@ def _fold(
     for k in range(count):
         at, rho = series[k] * LANES, decays[k]
         for i in range(LANES):
-            part, _ = _parts(state, second, i, rho)
-            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - part)
+            share, _ = _parts(state, second, i, rho)
+            state[VALUE + at + i] = state[RESPONSE + at + i] * (1.0 - share)
         row = PRODUCTS + (series[k] * (series[k] + 1) // 2) * LANES
         for i in range(LANES):
             pull = state[VALUE + at + i] * state[INNOVATION + at + i]
@@ -113,9 +113,9 @@ def _fold(
         for i in range(LANES):
             response = state[RESPONSE + at + i] * weight[k]
             state[RESPONSE + at + i] = response
-            part, part_2 = _parts(state, second, i, decays[k])
+            share, part_2 = _parts(state, second, i, decays[k])
             state[ESTIMATE + at + i], state[ESTIMATE_2 + at + i] = (
-                response * part,
+                response * share,
                 response * part_2,
             )
 
@@ -141,8 +141,8 @@ def is_tracked(
         at = series[k] * LANES
         for i in range(LANES):
             response = state[RESPONSE + at + i]
-            part, part_2 = _parts(state, second, i, decays[k])
-            gap = abs(state[ESTIMATE + at + i] - response * part)
+            share, part_2 = _parts(state, second, i, decays[k])
+            gap = abs(state[ESTIMATE + at + i] - response * share)
             gap_2 = abs(state[ESTIMATE_2 + at + i] - response * part_2) / (1.0 + abs(part_2))
             size = 1e-13 * abs(response)
             if not (gap <= size and gap_2 <= size):
@@ -248,11 +248,11 @@ def _advance(state: FloatArray, second: bool | None) -> None:
             state[GAIN + i] = state[F + i] * (p * inverse)
             state[COVARIANCE + i] = p * (sensor * inverse)
         else:
-            across, rest = state[COVARIANCE_12 + i], sensor * inverse
+            across, remainder = state[COVARIANCE_12 + i], sensor * inverse
             g, g_2 = p * inverse, across * inverse
             state[GAIN + i] = state[F + i] * g + state[F_12 + i] * g_2
             state[GAIN_2 + i] = state[F_22 + i] * g_2 + state[F_21 + i] * g
-            state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * rest, across * rest
+            state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * remainder, across * remainder
             state[COVARIANCE_22 + i] -= across * g_2
         # What it was, to be held against.
         state[CHANGE + i] = p

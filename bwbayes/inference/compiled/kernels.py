@@ -127,16 +127,16 @@ def _is_heard(state: FloatArray, series: int) -> bool:
     nothing from now on: numbers that decay for ever come below the normal ones, with which a
     processor takes ten times as long.
     """
-    heard = False
+    has_reading = False
     for i in range(series * LANES, (series + 1) * LANES):
         response = max(abs(state[RESPONSE + i]), abs(state[RESPONSE_2 + i]))
         estimate = max(abs(state[ESTIMATE + i]), abs(state[ESTIMATE_2 + i]))
         if max(response, estimate) > 1e-18:
-            heard = True
+            has_reading = True
         else:
             state[RESPONSE + i] = state[RESPONSE_2 + i] = 0.0
             state[ESTIMATE + i] = state[ESTIMATE_2 + i] = 0.0
-    return heard
+    return has_reading
 
 
 @inner()

@@ -108,9 +108,9 @@ def _straight(group: FloatArray, s: float, u: float, v: float, short: bool) -> i
     for i in range(LANES):
         g = s * group[H + i]
         # All are read first: a compiler does not make vectors of what is read on a condition.
-        slow, fast, known = group[AGAINST + i], group[AHEAD + i], group[PHI_1 + i]
+        slow, fast, phi = group[AGAINST + i], group[AHEAD + i], group[PHI_1 + i]
         rate = slow if g < 0.0 else fast
-        new = relax(g, v, group[ALPHA + i], rate, series(rate * v) if short else known)
+        new = relax(g, v, group[ALPHA + i], rate, series(rate * v) if short else phi)
         passed += (g < 0.0) & (new > 0.0)
         group[BEFORE + i] = g
         group[H + i] = s * new

@@ -43,7 +43,7 @@ def _run(
     """Add to the log densities, and write what else is found; arguments as of :class:`Steps`."""
     models, count, readings = series.shape
     states, size = observe.size, means.shape[1]
-    row, gain, left = np.zeros(size), np.empty(size), np.empty(size)
+    row, gain, cross = np.zeros(size), np.empty(size), np.empty(size)
     row[:states] = observe
     after, product = np.empty(size), np.empty((size, size))
     work = np.empty((3, variances.shape[1]))
@@ -65,7 +65,7 @@ def _run(
             log, rate, doubt, sensor = _weigh(spread, error, variances[model], logs[model], work)
             log_densities[model] += log
             errors[model, t], spreads[model, t], sensors[model, t] = error, spread, sensor
-            _update(covariance, mean, row, after, (error, rate, doubt, sensor), gain, left)
+            _update(covariance, mean, row, after, (error, rate, doubt, sensor), gain, cross)
 
 
 @inner(error_model="numpy")
@@ -105,7 +105,7 @@ def _update(
     shared: FloatArray,
     reading: tuple[float, float, float, float],
     gain: FloatArray,
-    left: FloatArray,
+    cross: FloatArray,
 ) -> None:
     """Take a reading into the states, as in NumPy; ``shared`` is P c."""
     size, (error, rate, doubt, sensor) = row.size, reading
@@ -114,15 +114,15 @@ def _update(
         mean[i] += gain[i] * error
         for j in range(size):
             covariance[i, j] -= gain[i] * shared[j]
-    _times(covariance, row, left)
+    _times(covariance, row, cross)
     for i in range(size):
         for j in range(size):
-            covariance[i, j] += (sensor * gain[i] - left[i]) * gain[j]
+            covariance[i, j] += (sensor * gain[i] - cross[i]) * gain[j]
             covariance[i, j] += doubt * shared[i] * shared[j]
     for i in range(size):
         for j in range(i):
-            both = (covariance[i, j] + covariance[j, i]) / 2
-            covariance[i, j] = covariance[j, i] = both
+            mean_of_two = (covariance[i, j] + covariance[j, i]) / 2
+            covariance[i, j] = covariance[j, i] = mean_of_two
 
 
 @inner(error_model="numpy")
@@ -165,11 +165,11 @@ def _weigh(
         work[2, k] = x * math.sqrt(work[0, k])
     total = rate = second = sensor = 0.0
     for k in range(count):
-        part, inverse = work[2, k], work[0, k]
-        total += part
-        rate += part * inverse
-        second += part * inverse * inverse
-        sensor += part * inverse * variances[k]
+        share, inverse = work[2, k], work[0, k]
+        total += share
+        rate += share * inverse
+        second += share * inverse * inverse
+        sensor += share * inverse * variances[k]
     rate, second, sensor = rate / total, second / total, sensor / total
     doubt = squares * max(second - rate * rate, 0.0)
     return top + math.log(total), rate, doubt, sensor / rate

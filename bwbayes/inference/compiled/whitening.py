@@ -91,11 +91,11 @@ def _whiten(
                     )
                     log_variance[model] = math.log(variance[model])
                 if not settled[model] or step != before:
-                    own = slice(model * count, (model + 1) * count)
-                    scale[own] = 1.0 / math.sqrt(variance[model])
+                    weight = slice(model * count, (model + 1) * count)
+                    scale[weight] = 1.0 / math.sqrt(variance[model])
                     _set_gain(
-                        transitions[step, model], shared[model], variance[model], kept[..., own],
-                        gain[:, own],
+                        transitions[step, model], shared[model], variance[model], kept[..., weight],
+                        gain[:, weight],
                     )  # fmt: skip
                 logs[model] += log_variance[model]
             before = step
@@ -128,11 +128,11 @@ def _set_gain(
     """
     states = shared.size
     for i in range(states):
-        own = 0.0
+        weight = 0.0
         for j in range(states):
-            own += transition[i, j] * shared[j]
+            weight += transition[i, j] * shared[j]
             kept[i, j] = transition[i, j]
-        gain[i] = own / variance
+        gain[i] = weight / variance
 
 
 @inner(error_model="numpy")
@@ -194,20 +194,22 @@ def _advance(
     F ((1 − K h) P (1 − K h)ᵀ + s² K Kᵀ) Fᵀ + Q.
     """
     states = observe.size
-    rest, updated = work[0], work[1]
+    reduced, updated = work[0], work[1]
     for i in range(states):
         for j in range(states):
-            rest[i, j] = (1.0 if i == j else 0.0) - shared[i] / variance * observe[j]
-    _between(rest, covariance, updated, work[2])
+            reduced[i, j] = (1.0 if i == j else 0.0) - shared[i] / variance * observe[j]
+    _between(reduced, covariance, updated, work[2])
     for i in range(states):
         for j in range(states):
             updated[i, j] += sensor * (shared[i] / variance) * (shared[j] / variance)
-    _between(kept, updated, rest, work[2])
+    _between(kept, updated, reduced, work[2])
     stays = True
     for i in range(states):
         for j in range(states):
-            after = rest[i, j] + gained[i, j]
-            size = math.sqrt(max((rest[i, i] + gained[i, i]) * (rest[j, j] + gained[j, j]), 0.0))
+            after = reduced[i, j] + gained[i, j]
+            size = math.sqrt(
+                max((reduced[i, i] + gained[i, i]) * (reduced[j, j] + gained[j, j]), 0.0)
+            )
             stays &= abs(after - covariance[i, j]) <= 2e-15 * size
             covariance[i, j] = after
     return stays

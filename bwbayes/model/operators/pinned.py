@@ -131,8 +131,8 @@ class Pinned(OneState):
         walls, behind = self.walls(column), column["initial"]
         reversible = walls._replace(reversible=np.ones_like(behind))
         elsewhere = voltage - walls.coupling * (1 - walls.reversible) * behind
-        whole = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
-        return np.asarray(whole - behind)
+        total = at_rest(self.spins, reversible, np.zeros_like(behind), elsewhere)
+        return np.asarray(total - behind)
 
     def left(self, column: Values, voltage: float, span: Span) -> FloatArray:
         """Return how far behind (2, models) sweeps through the span leave the walls, um."""

@@ -71,8 +71,8 @@ def curve(spins: bool, y: Any) -> tuple[Any, Any]:
         inverse = 1.0 / np.maximum(size, 1.0)
         ratio = 2.0 * decay / np.maximum(1.0 - decay, 0.5)
         level = select(size < 1.0, level, 1.0 + ratio - inverse)
-        far = inverse * inverse - 2.0 * ratio / np.maximum(1.0 - decay, 0.5)
-        slope = select(size < 1.0, slope, far)
+        far_slope = inverse * inverse - 2.0 * ratio / np.maximum(1.0 - decay, 0.5)
+        slope = select(size < 1.0, slope, far_slope)
     return np.copysign(level, y), slope
 
 
@@ -194,8 +194,8 @@ def integrate(
         second = weighted(BETWEEN[1], stages, STAGES)
         third = weighted(BETWEEN[2], stages, STAGES)
         # In between it is as good as the slope in the middle says that it is.
-        middle = p + 0.5 * change + 0.25 * (first + 0.5 * (second + 0.5 * third))
-        slope, _, _ = slopes(spins, walls, u + 0.5 * h, middle)
+        halfway = p + 0.5 * change + 0.25 * (first + 0.5 * (second + 0.5 * third))
+        slope, _, _ = slopes(spins, walls, u + 0.5 * h, halfway)
         off = np.abs((slope - (change + 0.25 * (second + third)) / h) / shifted)
         error = np.maximum(np.abs(stages[STAGES - 1]), off) / (1e-8 * scale)
         good = active & (error <= 1.0)

@@ -29,8 +29,8 @@ class _Lag(Stage):
 
     def describe(self, values: Mapping[str, float]) -> str:
         """Say how slow it is."""
-        what = self.name.partition("-")[0]
-        return f"{what} with a lag of {1000 * values[self.parameters[0].name]:.2g} ms"
+        subject = self.name.partition("-")[0]
+        return f"{subject} with a lag of {1000 * values[self.parameters[0].name]:.2g} ms"
 
     def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return the coefficients of x, of x before and of y before, (models, 6).

@@ -65,5 +65,5 @@ class Saturation(Stage):
     def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
         """Return x; of what is beyond reach, that of a millionth before the end."""
         middle, reach = parameters[0], parameters[1]
-        part = np.minimum(np.maximum((value - middle) / reach, -0.999999), 0.999999)
-        return middle + reach * np.arctanh(part)
+        fraction = np.minimum(np.maximum((value - middle) / reach, -0.999999), 0.999999)
+        return middle + reach * np.arctanh(fraction)

@@ -208,7 +208,7 @@ def draw_loops(loops: Loops) -> Figure:
 
     On the scale of the whole loop its band is a line's width; less the line it can be seen.
     """
-    figure, ((whole, tilted),) = style.new_figure(11, 4.8, 1, 2)
+    figure, ((loop_axes, tilted),) = style.new_figure(11, 4.8, 1, 2)
     major, minor = loops.major, loops.minor
     branches = (
         ("major loop", 0, "-", major.voltage, major.rising),
@@ -219,7 +219,7 @@ def draw_loops(loops: Loops) -> Figure:
     )
     ends = major.falling.mean[0], major.rising.mean[-1]
     line = np.polyfit(major.voltage[[0, -1]], ends, 1)
-    for panel, subtracted in ((whole, 0 * line), (tilted, line)):
+    for panel, subtracted in ((loop_axes, 0 * line), (tilted, line)):
         for label, color, dashes, voltage, curve in branches:
             mean, *edges = (
                 values - np.polyval(subtracted, voltage)
@@ -227,7 +227,7 @@ def draw_loops(loops: Loops) -> Figure:
             )
             style.draw_band(panel, voltage, mean, edges, label, style.COLORS[color], dashes)
         panel.set_xlabel("voltage (V)")
-    whole.set(ylabel="displacement (µm)", title="driven slowly, without offset")
+    loop_axes.set(ylabel="displacement (µm)", title="driven slowly, without offset")
     tilted.set(ylabel="displacement − straight line (µm)")
     tilted.set(title="less the line between the major loop's turns")
     style.share_legend(figure, band=BAND)

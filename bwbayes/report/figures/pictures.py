@@ -41,13 +41,13 @@ def pictures(result: Result) -> Pictures:
         shown["corner"] = (result,)
     shown |= {"trace": (result,), "ranks": (result,)}
     known: Pictures = {}
-    for name, what in shown.items():
+    for name, content in shown.items():
         kind, _, record = name.partition("_")
         _, title, caption, alt = PICTURES[kind]
         if record:
             title, alt = f"{title}: {record}", f"{alt} ({record})"
-        if what[0]:
-            known[name] = Picture(name, title, caption, partial(draw_kind, kind, *what), alt)
+        if content[0]:
+            known[name] = Picture(name, title, caption, partial(draw_kind, kind, *content), alt)
     return known
 
 

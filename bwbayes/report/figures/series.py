@@ -117,9 +117,9 @@ def draw_loop(predictions: Sequence[Bands]) -> Figure:
         voltage = bands.voltage[inside]
         lower, upper = bands.lower["sensor", 95][inside], bands.upper["sensor", 95][inside]
         at = int(np.argmax(voltage))
-        whole = float(np.max(upper) - np.min(lower))
-        height = min(4.0 * float(np.mean(upper - lower)), whole / 2)
-        width = (float(np.ptp(voltage)) or 1.0) * height / whole
+        height_of_band = float(np.max(upper) - np.min(lower))
+        height = min(4.0 * float(np.mean(upper - lower)), height_of_band / 2)
+        width = (float(np.ptp(voltage)) or 1.0) * height / height_of_band
         left, bottom = float(voltage[at]) - 0.9 * width, float(upper[at]) - 0.9 * height
         tip.set(xlim=(left, left + width), ylim=(bottom, bottom + height))
         outline: style.Look = {"edgecolor": style.Color.ZOOM, "alpha": 1.0, "linewidth": 1.5}
@@ -173,7 +173,7 @@ def polygons(bands: Bands, kind: Kind) -> Iterator[FloatArray]:
     rising = np.diff(voltage) > 0
     turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
     for start, stop in itertools.pairwise([0, *turns.tolist(), voltage.size - 1]):
-        there = np.arange(start, stop + 1)
-        back = there[::-1]
-        edges = np.append(lower[there], upper[back])
-        yield np.stack([voltage[np.append(there, back)], edges], 1)
+        indices = np.arange(start, stop + 1)
+        back = indices[::-1]
+        edges = np.append(lower[indices], upper[back])
+        yield np.stack([voltage[np.append(indices, back)], edges], 1)
