@@ -32,7 +32,9 @@ def brief(instance: object) -> str:
     room = MOST_LINES - 2
     if len(parts) > room:
         parts = [*parts[: room - 1], f"... {len(parts) - room + 1} more"]
-    return "\n".join([f"{name}(", *(f"    {part[: WIDTH - 5]}," for part in parts), ")"])
+    return "\n".join(
+        [f"{name}(", *(f"    {field_line[: WIDTH - 5]}," for field_line in parts), ")"]
+    )
 
 
 def head(text: str) -> str:

@@ -211,16 +211,16 @@ class Comparison(Product):
     def _differences_table(self) -> Table:
         parts = tuple(self[self.best].parts) if self.best else ()
         rows = []
-        for name, apart in list(self.differences.items())[1:]:  # the first is the best
+        for name, margin in list(self.differences.items())[1:]:  # the first is the best
             model, best = self[name], self[str(self.best)]
-            sign = "+" if apart.value > 0 else ""
-            texts = [f"{sign}{with_error(apart.value, apart.error)}"]
-            for part in parts:
-                if part not in model.parts:
+            sign = "+" if margin.value > 0 else ""
+            texts = [f"{sign}{with_error(margin.value, margin.error)}"]
+            for part_name in parts:
+                if part_name not in model.parts:
                     texts.append(UNKNOWN)
                     continue
-                gain = f"{model.log_score([part]) - best.log_score([part]):+.3g}"
-                texts.append(gain if part in self.voting else f"({gain})")
+                gain = f"{model.log_score([part_name]) - best.log_score([part_name]):+.3g}"
+                texts.append(gain if part_name in self.voting else f"({gain})")
             advantage = model.log_evidence - best.log_evidence
             texts.append(f"{advantage:+.3g}" if np.isfinite(advantage) else UNKNOWN)
             rows.append((name, *texts))

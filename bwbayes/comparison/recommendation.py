@@ -61,9 +61,11 @@ def recommend(candidates: Sequence[Candidate], facts: Sequence[tuple[str, str]] 
     counted = []
     for candidate in usable:
         parts = {
-            name: replace(part, log_scores=part.log_scores * sizes[name] / part.readings)
-            for name, part in candidate.parts.items()
-            if name in sizes and not part.joint
+            name: replace(
+                scored_part, log_scores=scored_part.log_scores * sizes[name] / scored_part.readings
+            )
+            for name, scored_part in candidate.parts.items()
+            if name in sizes and not scored_part.joint
         }
         counted.append(replace(candidate, parts={**candidate.parts, **parts}))
     ordered = sorted(counted, key=lambda candidate: -value(candidate))

@@ -65,14 +65,16 @@ class LoopNoise(NamedTuple):
     ) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield discrepancy and sensor noise, (draws,) each, um, sample by sample without end."""
         model, theta = self.model.at(interval), self.parameters
-        kept, shocks = model.transition(theta), root(model.process_covariance(theta))
+        decay_matrix, shocks = model.transition(theta), root(model.process_covariance(theta))
         scores = generator.standard_normal((len(theta), model.states))
         state = np.einsum("dj,dji->di", scores, root(model.stationary(theta)))
         while True:
             sensor = model.sensor_noise(theta, generator.standard_normal((len(theta), 1)))
             yield state @ model.observe, sensor[:, 0]
             scores = generator.standard_normal(state.shape)
-            state = np.einsum("dij,dj->di", kept, state) + np.einsum("dj,dji->di", scores, shocks)
+            state = np.einsum("dij,dj->di", decay_matrix, state) + np.einsum(
+                "dj,dji->di", scores, shocks
+            )
 
 
 class LoopPlan(NamedTuple):

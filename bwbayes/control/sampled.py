@@ -126,7 +126,7 @@ class SteppedState(NamedTuple):
 
     memory: FloatArray
     voltage: FloatArray
-    rest: FloatArray
+    equilibrium: FloatArray
     filters: FloatArray
     inputs: tuple[FloatArray, ...] = ()
     outputs: tuple[FloatArray, ...] = ()
@@ -283,7 +283,7 @@ class SampledModel:
 
     def displacement(self, state: SteppedState) -> FloatArray:
         """Return the displacement (models,), um, that a held voltage has led to."""
-        moved = np.sum(self.taps[:, 5] * (state.rest + state.filters[:, 0]), axis=0)
+        moved = np.sum(self.taps[:, 5] * (state.equilibrium + state.filters[:, 0]), axis=0)
         return _passed(self.outputs[0], state.outputs, moved)[0] - self.zero
 
     def forward(self, state: SteppedState, voltage: FloatArray) -> tuple[FloatArray, SteppedState]:

@@ -366,8 +366,8 @@ def _frequencies(mean: SampledModel, frequencies: Sequence[float] | None) -> tup
             raise InputError("frequencies: none is given; give some in Hz")
         return tuple(frequencies)
     decades = range(-1, math.ceil(math.log10(fastest)) + 1)
-    every = [round(digit * 10.0**decade, 12) for decade in decades for digit in (1, 2, 5)]
-    allowed = np.array([frequency for frequency in every if frequency <= fastest])
+    steps_of_rate = [round(digit * 10.0**decade, 12) for decade in decades for digit in (1, 2, 5)]
+    allowed = np.array([frequency for frequency in steps_of_rate if frequency <= fastest])
     response = np.abs(mean.frequency_response(2 * np.pi * interval * allowed))[0]
     # The first one at which the dynamics matter is the last.
     return tuple(allowed[: 1 + np.count_nonzero(np.cumprod(response >= LEFT))].tolist())

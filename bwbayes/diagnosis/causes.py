@@ -159,25 +159,25 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
         squares = float(white[0] @ white[0] - pull @ sizes)
         log_volume = float(np.linalg.slogdet(precision)[1])
         log_density = -0.5 * (squares + log_volume)
-        left = float(np.mean((residual - sizes @ series[1:]) ** 2))
-        return log_density, white[0] - sizes @ white[1:], sizes[len(errors) :], left
+        unexplained = float(np.mean((residual - sizes @ series[1:]) ** 2))
+        return log_density, white[0] - sizes @ white[1:], sizes[len(errors) :], unexplained
 
     plain, white, _, missed = weigh(np.empty((0, rows.size)))
     along = (time - time[0]) / max(float(np.ptp(time)), interval)
     shapes = _shapes(bands, rows, along)
     weighed = {kind: weigh(added) for kind, added in shapes.items()}
     nats = {kind: fit[0] - plain for kind, fit in weighed.items()}
-    left = {kind: fit[-1] for kind, fit in weighed.items()}
+    unexplained = {kind: fit[-1] for kind, fit in weighed.items()}
     # Twice the mean to the readings: then they are its opposite.
-    log_density, _, _, left["sign"] = weigh(shapes["offset"], residual + 2 * mean)
+    log_density, _, _, unexplained["sign"] = weigh(shapes["offset"], residual + 2 * mean)
     nats["sign"] = log_density - plain
     decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in DECAYS]
     starts = [fit[0] for fit in decays]
-    left["start"] = decays[int(np.argmax(starts))][-1]
+    unexplained["start"] = decays[int(np.argmax(starts))][-1]
     nats["start"] = float(scipy.special.logsumexp(starts)) - np.log(len(DECAYS)) - plain
     nats["outliers"] = tail_nats(white)
     outlying = np.abs(white) > 5 * max(scatter(white), 1.0)
-    left["outliers"] = float(np.mean(np.where(outlying, 0.0, residual) ** 2))
+    unexplained["outliers"] = float(np.mean(np.where(outlying, 0.0, residual) ** 2))
     size = float(shapes["offset"][0, 0])
     # At the largest innovation or, where nothing is remembered, where the means before and from
     # there on are farthest apart.
@@ -189,16 +189,16 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
         after = np.where(order >= later, size, 0.0)[np.newaxis]
         log_density, _, sizes, rest = weigh(after)
         steps.append((log_density, later, size * float(sizes[0]), rest))
-    log_density, later, jump, left["step"] = max(steps)
+    log_density, later, jump, unexplained["step"] = max(steps)
     nats["step"] = log_density - plain - np.log(rows.size)
     line = strongest_line(white, bands.voltage[rows], rows - rows[0], interval) or Line(0.0, "")
     phase = 2 * np.pi * line.frequency * time
     waves = size / 10 * np.stack([np.sin(phase), np.cos(phase)])
-    log_density, _, swing, left["oscillation"] = weigh(waves)
+    log_density, _, swing, unexplained["oscillation"] = weigh(waves)
     nats["oscillation"] = log_density - plain - np.log(rows.size / 2)
     square = float(np.mean(white**2))
     nats["noise"] = 0.5 * (white.size * (square - 1 - np.log(square)) - np.log(white.size))
-    left["noise"] = missed / square
+    unexplained["noise"] = missed / square
     settled = time[0] + 3 * DECAYS[int(np.argmax(starts))] * float(np.ptp(time))
     words = {
         "name": bands.name,
@@ -220,7 +220,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
         # that is too simple these loops are a sign, and no full account.
         if kind == "loop"
         or missed < ODDS * total_variance
-        or left[kind] - total_variance < 0.5 * (missed - total_variance)
+        or unexplained[kind] - total_variance < 0.5 * (missed - total_variance)
     ]
 
 
@@ -235,12 +235,21 @@ def _shapes(bands: Bands, rows: IntArray, along: FloatArray) -> dict[str, FloatA
     size = 0.1 * (float(np.ptp(mean)) or 1.0)
     level = (voltage - np.mean(voltage)) / (float(np.max(np.abs(voltage))) or 1.0)
     speed = rate(bands.voltage, bands.interval)[rows]
-    direction = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
+    sign_of_speed = np.tanh(3 * speed / (float(np.sqrt(np.mean(speed**2))) or 1.0))
     return {
         "drift": size * np.stack([along, along**2]),
         "offset": np.full((1, rows.size), size),
         "gain": 0.3 * (mean - np.mean(mean))[np.newaxis],
         "delay": 0.3 * np.std(mean) / (np.std(slope) or 1.0) * slope[np.newaxis],
         "loop": size
-        * np.stack([level, level**2, level**3, direction, direction * level, direction * level**2]),
+        * np.stack(
+            [
+                level,
+                level**2,
+                level**3,
+                sign_of_speed,
+                sign_of_speed * level,
+                sign_of_speed * level**2,
+            ]
+        ),
     }

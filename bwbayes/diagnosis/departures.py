@@ -208,11 +208,11 @@ class StandardizedResiduals:
 
         Such a band covers nearly anything that the drive of training does.
         """
-        series, displacement = (
+        total, displacement = (
             float(np.mean(self.bands.sd(kind)[self.scored] ** 2))
             for kind in ("sensor", "displacement")
         )
-        ratio = np.sqrt(series / max(series - displacement, 1e-9 * series))
+        ratio = np.sqrt(total / max(total - displacement, 1e-9 * total))
         if ratio < 3:
             return ""
         return (

@@ -86,8 +86,8 @@ def drive_locks(
     posterior: Posterior, draws: FloatArray, rng: np.random.Generator
 ) -> dict[str, DriveLock]:
     """Tell of each record of a posterior whether what the model misses follows the drive."""
-    samples = posterior.each(draws)
-    return {name: drive_lock(alone, own_draws, rng) for name, alone, own_draws in samples}
+    views = posterior.each(draws)
+    return {name: drive_lock(alone, own_draws, rng) for name, alone, own_draws in views}
 
 
 def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator) -> DriveLock:

@@ -153,9 +153,11 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
     displacement_kept[: max(rows, 0)] = displacement_kept[
         displacement_kept.size + min(rows, 0) :
     ] = np.nan
-    whole = (slice(0, displacement_kept.size),)
-    unmoved = scene.posterior.altered(displacement=displacement_kept, training=whole)
-    moved = scene.posterior.altered(displacement=np.roll(displacement_kept, -rows), training=whole)
+    all_samples = (slice(0, displacement_kept.size),)
+    unmoved = scene.posterior.altered(displacement=displacement_kept, training=all_samples)
+    moved = scene.posterior.altered(
+        displacement=np.roll(displacement_kept, -rows), training=all_samples
+    )
     before = replace(scene, fit=climb(unmoved, scene.places), before=None, held_out=())
     fit = climb(moved, map_estimate.local_minima(moved, scene.generator))
     cost = scene.lead + float(np.log(2 * limit / scene.interval))

@@ -155,7 +155,11 @@ def beyond_training(
 
 def _fitted_range(posterior: Posterior) -> tuple[float, float]:
     """Lowest and highest voltage that was fitted, V."""
-    windows = [data.voltage[part] for data in posterior.datasets for part in data.training]
+    windows = [
+        data.voltage[training_window]
+        for data in posterior.datasets
+        for training_window in data.training
+    ]
     return min(float(np.min(w)) for w in windows), max(float(np.max(w)) for w in windows)
 
 
@@ -169,9 +173,9 @@ def _distance(
     extent = span[1] - span[0]
     fitted = np.concatenate(
         [
-            _branches(data.voltage, part, RETURN * extent)
+            _branches(data.voltage, training_window, RETURN * extent)
             for data in posterior.datasets
-            for part in data.training
+            for training_window in data.training
         ]
     )
     # What is beyond the range is said by itself; a drive without a reversal has no loop.

@@ -208,10 +208,10 @@ def _white(residual: FloatArray) -> float:
 
 def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
     """Return the samples to look at: the voltage's extremes all along, and readings, more early."""
-    most = 3000  # of each kind
-    evenly = readings[:: -(-readings.size // most)]
+    max_terms = 3000  # of each kind
+    evenly = readings[:: -(-readings.size // max_terms)]
     early = readings[np.geomspace(1, readings.size, 400).astype(np.int64) - 1]
-    size = -(-2 * voltage.size // most)
+    size = -(-2 * voltage.size // max_terms)
     blocks = voltage[: voltage.size // size * size].reshape(-1, size)
     first = size * np.arange(len(blocks))
     extremes = np.concatenate([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)])

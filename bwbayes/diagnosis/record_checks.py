@@ -162,9 +162,9 @@ def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, 
     """
     extent, levels = _extent(displacement), np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
-    gain, noise = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
-    if noise > 0:  # no outlier makes this one larger
-        gain = min(gain, scatter(displacement) / noise)
+    gain, voltage_scatter = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
+    if voltage_scatter > 0:  # no outlier makes this one larger
+        gain = min(gain, scatter(displacement) / voltage_scatter)
     return gain * voltage, max(0.01 * extent, 6 * resolution)
 
 

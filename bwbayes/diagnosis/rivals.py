@@ -57,17 +57,17 @@ def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
     Each starts at what it has in common with the model, and at its own valley.
     """
     posterior_full = study.posterior
-    place = map_estimate.local_minima(posterior_full, rng, 1)[0]
-    theta = posterior_full.prior.theta(posterior_full.prior.constrain(place[np.newaxis])[0])
+    origin = map_estimate.local_minima(posterior_full, rng, 1)[0]
+    theta = posterior_full.prior.theta(posterior_full.prior.constrain(origin[np.newaxis])[0])
     stride = stride_of(thin_posterior(posterior_full, theta, READINGS), posterior_full)
-    known = dict(zip(posterior_full.names, place.tolist(), strict=True))
+    known_values = dict(zip(posterior_full.names, origin.tolist(), strict=True))
     fits = []
     for spec in families(study.spec):
         # One that needs a prior that is not stated is no rival.
         with suppress(InputError):
             posterior = study.with_model(spec).posterior
             posterior = replace(posterior, datasets=(thin(posterior.single_record, stride),))
-            start = np.array([[known.get(name, 0.0) for name in posterior.names]])
+            start = np.array([[known_values.get(name, 0.0) for name in posterior.names]])
             places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
             fits.append(climb(posterior, places))
     return tuple(fit for fit in fits if fit.follows)

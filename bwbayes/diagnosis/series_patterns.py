@@ -52,8 +52,8 @@ def spikes(values: FloatArray, drive: FloatArray, threshold: float) -> IntArray:
     padded = np.pad(values, half, mode="reflect")
     isolated = np.zeros(padded.size, dtype=np.bool_)
     for at in suspects[np.argsort(-np.abs(off[suspects]), kind="stable")] + half:
-        middle = np.sort(padded[at - half : at + half + 1])[half]
-        if abs(padded[at] - middle) > limit[at - half]:
+        local_median = np.sort(padded[at - half : at + half + 1])[half]
+        if abs(padded[at] - local_median) > limit[at - half]:
             isolated[at] = True
             before = after = at
             while isolated[before]:

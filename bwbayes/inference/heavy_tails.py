@@ -111,9 +111,11 @@ def run(steps: Steps, mean: FloatArray, covariance: FloatArray) -> tuple[FloatAr
     row = np.tile(np.append(steps.observe, np.zeros(count - 1)), (models, 1))
     for t in range(readings):
         if t:
-            kept = steps.transitions[steps.gaps[t]]
-            mean[:] = _times(kept, mean)
-            covariance[:] = kept @ covariance @ kept.swapaxes(1, 2) + steps.gained[steps.gaps[t]]
+            f_matrix = steps.transitions[steps.gaps[t]]
+            mean[:] = _times(f_matrix, mean)
+            covariance[:] = (
+                f_matrix @ covariance @ f_matrix.swapaxes(1, 2) + steps.gained[steps.gaps[t]]
+            )
         row[:, steps.observe.size :] = steps.series[:, 1:, t]
         shared = _times(covariance, row)
         spread[:, t] = np.sum(row * shared, axis=1)

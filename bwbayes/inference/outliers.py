@@ -124,9 +124,9 @@ def surprise(
         forward[missing] = noise.transition(parameters, 1 + missing)[0]
         backward[missing] = np.linalg.solve(stationary, forward[missing] @ stationary).T
     turned = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    covariance_now = stationary, observe, sensor
-    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *covariance_now)
-    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *covariance_now)
+    noise_model = stationary, observe, sensor
+    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *noise_model)
+    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *noise_model)
     m_2, p_2 = after[0][::-1], after[1][::-1]
     inverse_1, inverse_2 = np.linalg.inv(p_1), np.linalg.inv(p_2)
     joined = np.linalg.inv(inverse_1 + inverse_2 - np.linalg.inv(stationary))

@@ -61,8 +61,8 @@ def add_prior_creep(
     target = Target(extended)
     moving = target.physical
     crept = np.array([moving.tolist().index(extended.names.index(n)) for n in creep.names])
-    rest = np.setdiff1d(np.arange(moving.size), crept)
-    strengths, others = moving[crept], moving[rest]
+    unmoved = np.setdiff1d(np.arange(moving.size), crept)
+    strengths, others = moving[crept], moving[unmoved]
     # Creep goes with the logarithm of the time: strengths a decade of it apart are alike.
     decades = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
     prior = np.eye(moving.size)
@@ -74,8 +74,8 @@ def add_prior_creep(
         linear = target.linearize(mode[np.newaxis])
         hessian = linear.fisher_information[0] + prior
         mode[moving] += np.linalg.solve(hessian, linear.gradient[0] - prior @ mode[moving])
-    across = hessian[np.ix_(rest, crept)]
-    follow = np.linalg.solve(hessian[np.ix_(rest, rest)], across)
+    across = hessian[np.ix_(unmoved, crept)]
+    follow = np.linalg.solve(hessian[np.ix_(unmoved, unmoved)], across)
     precision = hessian[np.ix_(crept, crept)] - across.T @ follow
     covariance = np.linalg.inv((precision + precision.T) / 2)
     drawn = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))

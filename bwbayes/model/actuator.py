@@ -58,7 +58,7 @@ class State:
     __repr__ = brief
 
     hysteresis: Any
-    rest: tuple[FloatArray, ...]
+    equilibrium: tuple[FloatArray, ...]
     filter: tuple[FloatArray, ...]
     inputs: tuple[FloatArray, ...] = ()
     outputs: tuple[FloatArray, ...] = ()
@@ -240,7 +240,10 @@ class Actuator:
                 sections.begin(initial_transient),
             )
         else:
-            equilibrium, filtered = state.rest, tuple(carried.copy() for carried in state.filter)
+            equilibrium, filtered = (
+                state.equilibrium,
+                tuple(carried.copy() for carried in state.filter),
+            )
         # The recursions see the drives' distance from rest, so that they start at zero exactly.
         for driven, before in zip(drives, equilibrium, strict=True):
             np.subtract(driven, before[:, np.newaxis], out=driven)
@@ -279,8 +282,8 @@ class Actuator:
     ) -> tuple[FloatArray, ...]:
         """Return the memories of the stages before the hysteresis at a record's first voltage."""
         models = column["offset"].size
-        rest = np.zeros(models) if from_rest else None
-        return begin_stages(self.inputs, column, np.full(models, path[0]), self.timing, rest)
+        equilibrium = np.zeros(models) if from_rest else None
+        return begin_stages(self.inputs, column, np.full(models, path[0]), self.timing, equilibrium)
 
     def begin_outputs(
         self, column: Values, first: FloatArray, *, from_rest: bool
@@ -289,8 +292,8 @@ class Actuator:
 
         Displacements are in um, without the offset.
         """
-        rest = self.level_at_rest(column) if from_rest else None
-        return begin_stages(self.outputs, column, first, self.timing, rest)
+        equilibrium = self.level_at_rest(column) if from_rest else None
+        return begin_stages(self.outputs, column, first, self.timing, equilibrium)
 
     def level_at_rest(self, column: Values) -> FloatArray:
         """Return the displacement (models,), um, of demagnetized models at rest at zero volts.
@@ -299,10 +302,10 @@ class Actuator:
         """
         zero, driven = np.zeros(1), np.zeros(1)
         if self.inputs:
-            rest = np.zeros(column["offset"].size)
+            equilibrium = np.zeros(column["offset"].size)
             for stage in self.inputs:
-                rest, _ = stage.settled(stage.numbers(column, self.timing), rest)
-            driven = rest[:, np.newaxis]
+                equilibrium, _ = stage.settled(stage.numbers(column, self.timing), equilibrium)
+            driven = equilibrium[:, np.newaxis]
         memory = self.begin(column, driven, from_rest=True, span=self.range_of(zero))
         drive, _ = self.drive(column, driven, memory)
         level: FloatArray = drive[:, 0].copy()

@@ -126,9 +126,9 @@ class _Single:
     def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
         """Return the voltage (samples,) for a displacement."""
         actuator, interval = self.actuator, self.actuator.interval
-        rest = actuator.level_at_rest(self.column) if self.from_rest else None
+        rest_value = actuator.level_at_rest(self.column) if self.from_rest else None
         drive = (displacement - self.column["offset"][0])[np.newaxis]
-        drive = undo_stages(actuator.outputs, self.column, drive, actuator.timing, rest)[0]
+        drive = undo_stages(actuator.outputs, self.column, drive, actuator.timing, rest_value)[0]
         span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
         size = peak / self.slope if self.slope > 0 else 1.0
         # Beyond so many times what a straight line would need no voltage is looked for.
@@ -154,9 +154,9 @@ class _Single:
 
     def _command(self, voltage: FloatArray) -> FloatArray:
         """Return the command (samples,), V, that makes a voltage at the hysteresis."""
-        rest = np.zeros(1) if self.from_rest else None
+        rest_value = np.zeros(1) if self.from_rest else None
         actuator, path = self.actuator, voltage[np.newaxis]
-        command = undo_stages(actuator.inputs, self.column, path, actuator.timing, rest)
+        command = undo_stages(actuator.inputs, self.column, path, actuator.timing, rest_value)
         return np.asarray(command[0])
 
     def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:

@@ -95,8 +95,8 @@ class ModelSpec:
                 raise InputError(f"model: {place!r} is there twice; leave one out")
 
         def position(stage: StageSpec) -> tuple[int, int]:
-            known = stage.name in names
-            return slots.index(stage.slot), names.index(stage.name) if known else len(names)
+            is_known = stage.name in names
+            return slots.index(stage.slot), names.index(stage.name) if is_known else len(names)
 
         chain = sorted((stage for stage in self.stages if stage.name != "none"), key=position)
         object.__setattr__(self, "stages", tuple(chain))

@@ -164,23 +164,23 @@ def begin_stages(
     column: Values,
     first: FloatArray,
     timing: Timing,
-    rest: FloatArray | None = None,
+    rest_value: FloatArray | None = None,
 ) -> tuple[FloatArray, ...]:
     """Return the memories of stages in a row just before a record's first value (models,).
 
-    ``rest`` (models,) is the value at zero volts, where the actuator was at rest, if it came
+    ``rest_value`` (models,) is the value at zero volts, where the actuator was at rest, if it came
     straight from there; otherwise what was before is not known.
     """
     memories = []
     for stage in stages:
         numbers = stage.numbers(column, timing)
-        if rest is None:
+        if rest_value is None:
             memory = stage.begin(column, numbers, first, timing)
         else:
-            rested, at_rest = stage.settled(numbers, rest)
+            rested, at_rest = stage.settled(numbers, rest_value)
             # What has no pace has come along the whole path from there.
             memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
-            rest = rested
+            rest_value = rested
         memories.append(memory)
         first = stage.advance(numbers, memory, first[:, np.newaxis])[0][:, 0]
     return tuple(memories)
@@ -191,11 +191,11 @@ def undo_stages(
     column: Values,
     values: FloatArray,
     timing: Timing,
-    rest: FloatArray | None = None,
+    rest_value: FloatArray | None = None,
 ) -> FloatArray:
     """Return the values (models, samples) with which these come out behind stages in a row.
 
-    ``rest`` as in :func:`begin_stages`.
+    ``rest_value`` as in :func:`begin_stages`.
 
     Raises
     ------
@@ -205,9 +205,9 @@ def undo_stages(
     at_rest = []
     for stage in stages:
         stage.require_inverse()
-        at_rest.append(rest)
-        if rest is not None:
-            rest = stage.settled(stage.numbers(column, timing), rest)[0]
+        at_rest.append(rest_value)
+        if rest_value is not None:
+            rest_value = stage.settled(stage.numbers(column, timing), rest_value)[0]
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
         numbers, first = stage.numbers(column, timing), values[:, 0].copy()
         memories = begin_stages((stage,), column, first, timing, rested)

@@ -184,13 +184,13 @@ def _from_rest_remark(waited: Compensation, rested: Compensation) -> list[str]:
 
     Otherwise say nothing: it hardly matters.
     """
-    unknown, known = (float(np.mean(one.compensated.largest)) for one in (waited, rested))
-    if known > 0.5 * unknown:
+    unknown, error_from_rest = (float(np.mean(one.compensated.largest)) for one in (waited, rested))
+    if error_from_rest > 0.5 * unknown:
         return []
     return [
         f"the command starts at 0 V after any drive: the largest error is {unknown:.3g} um in the "
-        f"mean, but {known:.3g} um if the actuator is demagnetized, which from_rest (--from-rest) "
-        "declares"
+        f"mean, but {error_from_rest:.3g} um if the actuator is demagnetized, which "
+        "from_rest (--from-rest) declares"
     ]
 
 
@@ -236,9 +236,9 @@ def _reference(
     except (TypeError, ValueError):
         values = np.empty(())
     if values.ndim == 0:
-        given = type(requested).__name__
+        type_name = type(requested).__name__
         raise InputError(
-            f"reference: {given} is none; give one of {shapes}, a file, or displacements in um"
+            f"reference: {type_name} is none; give one of {shapes}, a file, or displacements in um"
         )
     return Reference(values, options.get("interval", interval), smoothed=smoothed)
 

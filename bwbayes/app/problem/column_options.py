@@ -51,15 +51,15 @@ def column_options_from(
 
     Raises InputError: the file cannot be read.
     """
-    said = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
-    if noted is None or said.keys() & {"columns", "units", "fs"}:
-        return said
-    names = {item.name for item in _content(Path(path), said.get("table")).series}
+    as_stated = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    if noted is None or as_stated.keys() & {"columns", "units", "fs"}:
+        return as_stated
+    names = {item.name for item in _content(Path(path), as_stated.get("table")).series}
     if not names <= {*noted.get("all_columns", ())}:
-        return said
+        return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
     options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
-    return options | said | {"columns": columns}
+    return options | as_stated | {"columns": columns}
 
 
 def _content(path: Path, table: int | str | None) -> Source:

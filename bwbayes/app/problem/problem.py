@@ -170,7 +170,7 @@ class Problem:
     @cached_property
     def extrapolations(self) -> dict[str, list[Finding]]:
         """In what the drive of each validation leaves the training data, by its name."""
-        found = {}
+        beyond_by_name = {}
         for name, validation in self.validations.items():
             record, windows = validation.record or self.records[validation.of], validation.windows
             window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
@@ -178,8 +178,10 @@ class Problem:
             beyond = beyond_training(self.posterior, voltage, record.interval, window)
             # A held-out part goes on with the loops of the rest, and its readings test them.
             is_window = validation.record is None
-            found[name] = [each for each in beyond if not (is_window and each.kind == "reversals")]
-        return found
+            beyond_by_name[name] = [
+                each for each in beyond if not (is_window and each.kind == "reversals")
+            ]
+        return beyond_by_name
 
     @cached_property
     def rivals(self) -> dict[str, tuple[LocalFit, ...]]:

@@ -67,7 +67,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     together, make = shared(core, voltage), simulated if actuator.stages else physics
     for rows, stage in _staged(likelihood, column, voltage):
         equilibrium = np.zeros(len(theta))
-        equilibrium[rows] = stage.rest
+        equilibrium[rows] = stage.equilibrium
         named = make(actuator, sections, column, equilibrium, voltage) | filtering
         result = kernels.sums(
             *record, lanes.in_lanes(lanes.by_rows(named)[rows]), _over_gaps(steps[rows]), second,
@@ -126,12 +126,12 @@ def _filtering(
         """Return the rows of a step over so many readings, (STEP, models)."""
         values = np.zeros((lanes.STEP, len(theta)))
         if states:
-            kept, gained = _step(noise, theta, readings)
+            f_matrices, gained = _step(noise, theta, readings)
             if turned is not None:
-                kept = turned @ kept @ np.linalg.inv(turned)
+                f_matrices = turned @ f_matrices @ np.linalg.inv(turned)
                 gained = turned @ gained @ np.swapaxes(turned, 1, 2)
             wide = np.zeros((2, len(theta), 2, 2))
-            wide[0, :, :states, :states], wide[1, :, :states, :states] = kept, gained
+            wide[0, :, :states, :states], wide[1, :, :states, :states] = f_matrices, gained
             values[:4] = wide[0].reshape(-1, 4).T
             values[4:] = wide[1, :, [0, 0, 1], [0, 1, 1]]
         return values

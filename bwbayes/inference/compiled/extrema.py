@@ -29,8 +29,8 @@ def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
     group[:, 0] = np.arange(models)
     group[:, 1] = group[:, 2] = memory.displacement
     group[:, 3], group[:, 4] = memory.direction, len(extrema)
-    for slot, (level, displacement, weight) in enumerate(extrema, FIXED):
-        group[:, slot] = level if weight is None else weight
+    for slot, (level, displacement, voltage_of_model) in enumerate(extrema, FIXED):
+        group[:, slot] = level if voltage_of_model is None else voltage_of_model
         group[:, slots + slot] = displacement
     return group
 

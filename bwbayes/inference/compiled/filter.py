@@ -106,8 +106,8 @@ def _fold(
             if product < 1.0:
                 total = (1.0 - weight[k] * weight[j]) / (1.0 - product)
             for i in range(LANES):
-                both = state[VALUE + at + i] * state[VALUE + other + i]
-                state[row + other + i] += both * total * state[INVERSE + i]
+                cross_product = state[VALUE + at + i] * state[VALUE + other + i]
+                state[row + other + i] += cross_product * total * state[INVERSE + i]
     for k in range(count):
         at = series[k] * LANES
         for i in range(LANES):

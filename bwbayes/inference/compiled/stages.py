@@ -37,7 +37,7 @@ class CompiledDrive(NamedTuple):
     """
 
     kind: Kind
-    rest: FloatArray
+    equilibrium: FloatArray
     group: FloatArray
     plan: FloatArray
 

@@ -70,7 +70,7 @@ def _run(
 
 @inner(error_model="numpy")
 def _go_on(
-    kept: FloatArray,
+    f_matrices: FloatArray,
     gained: FloatArray,
     states: int,
     mean: FloatArray,
@@ -82,11 +82,11 @@ def _go_on(
     for i in range(states):
         after[i] = 0.0
         for k in range(states):
-            after[i] += kept[i, k] * mean[k]
+            after[i] += f_matrices[i, k] * mean[k]
         for j in range(mean.size):
             product[i, j] = 0.0
             for k in range(states):
-                product[i, j] += kept[i, k] * covariance[k, j]
+                product[i, j] += f_matrices[i, k] * covariance[k, j]
     for i in range(states):
         mean[i] = after[i]
         for j in range(states, mean.size):
@@ -94,7 +94,7 @@ def _go_on(
         for j in range(states):
             covariance[i, j] = gained[i, j]
             for k in range(states):
-                covariance[i, j] += product[i, k] * kept[j, k]
+                covariance[i, j] += product[i, k] * f_matrices[j, k]
 
 
 @inner(error_model="numpy")
@@ -121,8 +121,8 @@ def _update(
             covariance[i, j] += doubt * shared[i] * shared[j]
     for i in range(size):
         for j in range(i):
-            mean_of_two = (covariance[i, j] + covariance[j, i]) / 2
-            covariance[i, j] = covariance[j, i] = mean_of_two
+            symmetric = (covariance[i, j] + covariance[j, i]) / 2
+            covariance[i, j] = covariance[j, i] = symmetric
 
 
 @inner(error_model="numpy")

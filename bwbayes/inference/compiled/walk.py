@@ -83,15 +83,15 @@ def _walk_core(
         compiled = prepared(operator, column, voltage, memory)
     stage = compiled or given(advance(voltage[:1], memory)[0])
     sections = actuator.sections(column)
-    named = physics(actuator, sections, column, stage.rest, voltage)
+    named = physics(actuator, sections, column, stage.equilibrium, voltage)
     models = by_rows(named, STATE // LANES)
     moving, *crept = sections.begin(initial_transient)
     models[:, X1 // LANES : X1 // LANES + moving.shape[1]] = moving
     for row, lag in enumerate(crept, LAG // LANES):
         models[:, row] = lag[:, 0]
     groups, state, now = in_lanes(stage.group), in_lanes(models), 0
-    # Not to be written to, whatever it was: of one type, for which one walk is compiled.
-    known = np.broadcast_to(voltage, voltage.shape)
+    # A read-only view, so that numba compiles only one signature.
+    read_only = np.broadcast_to(voltage, voltage.shape)
     curve, lags, growth = shared(actuator, voltage)
 
     def onwards(last: int) -> FloatArray:
@@ -104,8 +104,8 @@ def _walk_core(
             drive, memory = advance(voltage[piece], memory)
             plan = np.ascontiguousarray(drive)
         _walk(
-            stage.kind, groups, plan, curve[piece], lags, growth[piece], state, known[piece], begin,
-            begin + last - now, displacement,
+            stage.kind, groups, plan, curve[piece], lags, growth[piece], state, read_only[piece],
+            begin, begin + last - now, displacement,
         )  # fmt: skip
         now = last
         return displacement

@@ -74,7 +74,7 @@ def _whiten(
     settled, before = np.zeros(models, np.bool_), -1
     # Of each series: what is expected of its states, its model's F and gain, one over its sd.
     mean, after = np.zeros((states, columns)), np.zeros((states, columns))
-    kept, gain = np.empty((states, states, columns)), np.empty((states, columns))
+    f_matrix, gain = np.empty((states, states, columns)), np.empty((states, columns))
     scale, values = np.empty(columns), np.empty((PIECE, columns))
     for first in range(0, readings, PIECE):
         size = min(PIECE, readings - first)
@@ -91,15 +91,15 @@ def _whiten(
                     )
                     log_variance[model] = math.log(variance[model])
                 if not settled[model] or step != before:
-                    weight = slice(model * count, (model + 1) * count)
-                    scale[weight] = 1.0 / math.sqrt(variance[model])
+                    block = slice(model * count, (model + 1) * count)
+                    scale[block] = 1.0 / math.sqrt(variance[model])
                     _set_gain(
-                        transitions[step, model], shared[model], variance[model], kept[..., weight],
-                        gain[:, weight],
+                        transitions[step, model], shared[model], variance[model],
+                        f_matrix[..., block], gain[:, block],
                     )  # fmt: skip
                 logs[model] += log_variance[model]
             before = step
-            _innovate(values[t], mean, after, kept, gain, observe, scale)
+            _innovate(values[t], mean, after, f_matrix, gain, observe, scale)
             mean, after = after, mean
             for model in range(models):
                 if not settled[model] or step > 0:
@@ -119,7 +119,7 @@ def _set_gain(
     transition: FloatArray,
     shared: FloatArray,
     variance: float,
-    kept: FloatArray,
+    f_matrix: FloatArray,
     gain: FloatArray,
 ) -> None:
     """Write F and F P h / S for the series of a model, (states, states, series), (states, series).
@@ -131,7 +131,7 @@ def _set_gain(
         weight = 0.0
         for j in range(states):
             weight += transition[i, j] * shared[j]
-            kept[i, j] = transition[i, j]
+            f_matrix[i, j] = transition[i, j]
         gain[i] = weight / variance
 
 
@@ -140,7 +140,7 @@ def _innovate(
     values: FloatArray,
     mean: FloatArray,
     after: FloatArray,
-    kept: FloatArray,
+    f_matrix: FloatArray,
     gain: FloatArray,
     observe: FloatArray,
     scale: FloatArray,
@@ -158,7 +158,7 @@ def _innovate(
             after[i, k] = gain[i, k] * values[k]
         for j in range(states):
             for k in range(count):
-                after[i, k] += kept[i, j, k] * mean[j, k]
+                after[i, k] += f_matrix[i, j, k] * mean[j, k]
     for k in range(count):
         values[k] *= scale[k]
 
@@ -180,7 +180,7 @@ def _observe(
 @inner(error_model="numpy")
 def _advance(
     covariance: FloatArray,
-    kept: FloatArray,
+    f_matrix: FloatArray,
     gained: FloatArray,
     shared: FloatArray,
     observe: FloatArray,
@@ -202,7 +202,7 @@ def _advance(
     for i in range(states):
         for j in range(states):
             updated[i, j] += sensor * (shared[i] / variance) * (shared[j] / variance)
-    _between(kept, updated, reduced, work[2])
+    _between(f_matrix, updated, reduced, work[2])
     stays = True
     for i in range(states):
         for j in range(states):

@@ -40,15 +40,17 @@ def pictures(result: Result) -> Pictures:
             shown[f"spectrum_{name}" if several else "spectrum"] = residual, noise
         shown["corner"] = (result,)
     shown |= {"trace": (result,), "ranks": (result,)}
-    known: Pictures = {}
+    pictures_by_name: Pictures = {}
     for name, content in shown.items():
         kind, _, record = name.partition("_")
         _, title, caption, alt = PICTURES[kind]
         if record:
             title, alt = f"{title}: {record}", f"{alt} ({record})"
         if content[0]:
-            known[name] = Picture(name, title, caption, partial(draw_kind, kind, *content), alt)
-    return known
+            pictures_by_name[name] = Picture(
+                name, title, caption, partial(draw_kind, kind, *content), alt
+            )
+    return pictures_by_name
 
 
 def draw_kind(kind: str, *shown: Any) -> Figure:
