@@ -1,4 +1,4 @@
-"""What can go wrong for a user, and how it is said: in one line.
+"""Errors and warnings for users, one line each.
 
 An error that a person can fix (a broken record, a misspelled key, a parameter outside its domain)
 is an :class:`InputError`; its text says where, what, and what to do. The command line prints that

@@ -1,4 +1,4 @@
-"""What an object shows of itself at a prompt: its fields, or the head of its text, never a flood.
+"""Text of an object at a prompt: its fields, or the head of its text, never a flood.
 
 A class shows its fields by ``__repr__ = brief`` in its body. One that has a text of its own for
 ``print`` shows the beginning of it: ``return head(str(self))``.

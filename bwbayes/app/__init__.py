@@ -1,1 +1,1 @@
-"""What a user touches: the config, the command line, the pictures and the report."""
+"""The user's side: config, command line, figures and report."""

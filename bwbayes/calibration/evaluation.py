@@ -79,7 +79,7 @@ class Calibration:
     power
         Probability that the smooth test finds a posterior sd that is wrong by so much.
     name, parameters, facts, provenance
-        What was calibrated, and what its numbers depend on: seed, digest of the data, versions.
+        The calibrated problem, facts about it, and seed, digest of the data and versions.
     """
 
     __repr__ = brief

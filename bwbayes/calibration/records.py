@@ -64,10 +64,10 @@ class OtherRecord:
     Parameters
     ----------
     record
-        Its voltage and times. Of its displacement only counts where there are readings; without
+        Its voltage and times. Its displacement only marks where there are readings; without
         any it is a planned voltage, whose start nothing tells.
     start
-        What is known of its start.
+        Its initial conditions.
     window
         Part of it (start, stop) that is predicted, s; by default all.
     like

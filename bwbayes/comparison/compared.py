@@ -82,7 +82,7 @@ class Comparison(Product):
     lines, caveats
         The recommendation in words, and what speaks against it, a line each.
     facts
-        What was compared: subjects, and what is said of each.
+        Facts about the comparison, by subject.
     """
 
     NAME: ClassVar[str] = "comparison"

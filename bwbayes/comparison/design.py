@@ -1,4 +1,4 @@
-"""What to measure next: which drive would teach most about a parameter, or narrow a band most.
+"""Experimental design: the drive that would most reduce a parameter's SD or a band's width.
 
 Each candidate is a voltage that the amplifier can make. At some posterior draws the model is made
 linear in its parameters: the Fisher information of the readings that the candidate would bring,
@@ -64,7 +64,7 @@ def rank_designs(
         The name of a free parameter of the actuator, or a drive (samples,), V, whose parameter band
         is to be narrow.
     amplifier
-        What can be driven.
+        Limits of the amplifier.
     generator
         Chooses draws, and draws the starts of the candidates' records.
     watch

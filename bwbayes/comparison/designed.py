@@ -66,9 +66,9 @@ class Design(Product, Sequence[DesignScore]):
     run
         The name of the run that is started from.
     parameter, drive
-        What is to be known better: a parameter, or the band along a drive of that name.
+        Target: a parameter, or the band along a drive of that name.
     amplifier
-        What can be driven.
+        Limits of the amplifier.
     signals
         The candidates' voltages (samples,) by name, V.
     interval
@@ -156,7 +156,7 @@ class Design(Product, Sequence[DesignScore]):
         rate = f", at most {amplifier.rate:.4g} V/s" if np.isfinite(amplifier.rate) else ""
         facts = [
             ("Run", self.run),
-            ("To be known better", self.quantity.replace(" left", "")),
+            ("Target", self.quantity.replace(" left", "")),
             ("Amplifier", "{:.4g} to {:.4g} V".format(*limits) + rate),
             ("Sampling interval", f"{self.interval:g} s"),
         ]

@@ -48,7 +48,7 @@ class Evidence:
     effective
         Effective draws at the bridge's posterior end.
     prior_share
-        What the evidence pays for the priors' width, nats: the mean log likelihood of the draws
+        Cost of the priors' width in the evidence, nats: the mean log likelihood of the draws
         less the log evidence, which is how far the posterior is from the prior (Kullback-Leibler).
     max_log_likelihood
         The largest among the draws, nats.

@@ -82,7 +82,7 @@ def leave_future_out(
     Parameters
     ----------
     posterior, plan, flat
-        What was fitted, and how; its draws (draws, free), parameters in their own units.
+        The fitted posterior, its sampling plan and draws (draws, free), in the parameters' units.
     held_out
         Windows by their names, by the names of the training records.
     rng, executor

@@ -40,7 +40,7 @@ def c_functions(
     prefix
         Beginning of the functions' names.
     bindings
-        What arguments stand for that are functions: C has these by their names.
+        Functions that arguments stand for: C has these by their names.
 
     Raises
     ------

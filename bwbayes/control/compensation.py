@@ -141,7 +141,7 @@ def compensate(
     posterior, draws
         The posterior of one record, and draws (draws, free) from it, parameters in their own units.
     reference
-        What the displacement is to be.
+        Reference of the displacement.
     generator
         Draws the starts and the discrepancy.
     command
@@ -156,7 +156,7 @@ def compensate(
         As of :func:`~bwbayes.model.inverse.inverse`. Otherwise the actuator has waited at
         zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
-        Of the tracking error, um.
+        Limit of the tracking error, um.
     watch
         Called with the share that is done.
 

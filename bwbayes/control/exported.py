@@ -52,7 +52,7 @@ class Exported(Product):
     Parameters
     ----------
     name
-        What it is called.
+        Its name.
     model
         The one model, a sample at a time.
     limits

@@ -43,9 +43,9 @@ class Stand:
     delay
         Whole samples from a reading to the command that answers it.
     amplifier
-        Of it are the DAC's step and the slew.
+        The stand's amplifier, with the DAC's step and the slew rate.
     sensor
-        Of it is the ADC's step.
+        The stand's sensor, with the ADC's step.
     """
 
     limits: Span
@@ -180,12 +180,12 @@ def follow(
     plan
         Controllers and signals.
     gains
-        Of those controllers that look.
+        Gains of the controllers with feedback.
     draws
         The actuators, whose voltage is held between samples; a row for every controller, signal
         and draw, in this order.
     noise
-        Of the draws.
+        Noise parameters of the draws.
     stand
         The test stand.
     generator

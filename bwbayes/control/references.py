@@ -61,7 +61,7 @@ class Reference:
     displacement, interval
         As above.
     name
-        What it is called.
+        Its name.
     smoothed
         Sd of the Gaussian that smooths it, s; zero leaves it as it is.
     approach

@@ -127,7 +127,7 @@ def compare(
     Parameters
     ----------
     residual
-        What the model misses, um.
+        Residual of the model, um.
     drawn
         Residuals (draws, readings) of noise that knows nothing of the drive.
     voltage

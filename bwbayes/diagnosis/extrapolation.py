@@ -44,7 +44,7 @@ class Drive:
     low, high
         Lowest and highest voltage, V.
     frequency
-        Of the fastest swing, Hz; 0 without any.
+        Frequency of the fastest swing, Hz; 0 without any.
     depths
         Smallest and largest swing between two reversals, V; none without any.
     """

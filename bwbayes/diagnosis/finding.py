@@ -17,11 +17,11 @@ class Finding:
     Parameters
     ----------
     kind : str
-        What it is, in a word or two: "clipping", for instance.
+        Kind of the issue, in a word or two: "clipping", for instance.
     text : str
-        What was seen, in one line.
+        Observation, in one line.
     fix : str
-        What to do: a line of config, or what to change in the file or the measurement.
+        Remedy: a line of config, or a change of the file or the measurement.
     start, stop : float, s
         Where it is: start <= time < stop; by default everywhere.
     nats : float

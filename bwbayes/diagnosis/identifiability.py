@@ -1,4 +1,4 @@
-"""What a record cannot tell, before it is sampled and after: combinations that keep their prior.
+"""Parameters and combinations that a record does not identify, before and after sampling.
 
 Before, by Fisher's information at a point fit (:func:`undetermined`). Every fit leaves a
 discrepancy of a percent of the range or so, and it comes back whenever the voltage takes the same

@@ -1,4 +1,4 @@
-"""What the voltage alone says about the displacement: a quick regression that knows of loops.
+"""Regression of the displacement on the voltage alone, loops included.
 
 A displacement follows the voltage with a lag and along hysteresis loops. :func:`fit_loop` fits a
 sum of play operators of the lagged voltage (any loop that closes is one, nearly) by least squares:
@@ -35,13 +35,13 @@ class LoopFit:
     rows : array (rows,)
         The samples that were looked at, all with readings.
     residual : array (rows,), um
-        What the loops, the decay and the trend do not explain.
+        Residual of loops, decay and trend.
     gain : float, um/V
         Displacement per volt of a large, slow drive.
     lag : float, s
         Time constant with which the displacement follows.
     decay, decay_time : float, um and s
-        What dies out from the first reading on, whatever the voltage does.
+        Transient that decays from the first reading on, whatever the voltage does.
     start : float, um
         How far off the displacement starts in all: the decay, and what another state of the plays
         would change.

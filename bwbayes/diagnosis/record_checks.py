@@ -1,4 +1,4 @@
-"""What is wrong with a record, as far as the record itself shows.
+"""Issues of a record that the record itself shows.
 
 :func:`inspect` looks at a record before any model is fitted and returns a :class:`Finding` for
 everything that a fit would stumble over, with the line of config that deals with it. It says

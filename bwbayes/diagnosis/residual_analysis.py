@@ -103,7 +103,7 @@ class ResidualAnalysis:
     study
         The study of the record, which gives other models, if these are asked.
     before
-        What explanations are compared with, if it is another fit.
+        Fit that explanations are compared with, if it is another one.
     kinds
         Kinds of other models that are fitted; all of them if None.
     """

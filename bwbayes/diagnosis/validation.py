@@ -1,4 +1,4 @@
-"""Whether bands hold on a record: the verdict that stands first on screen and report.
+"""Validation of bands on a record: the outcome that stands first on screen and report.
 
 Bands are held against the readings in three ways: how many readings they cover, how large the
 residuals are, and whether the residuals lean to one side (:mod:`bwbayes.diagnosis.departures`).
@@ -15,7 +15,7 @@ outliers: parameters that have followed it are others. Nor has it where a better
 held-out readings have the drive of those that were fitted, and a discrepancy takes up there what
 the model misses; along another drive its size is another one.
 
-What everything carries along that builds on a run is its :class:`ValidationSummary`: it goes first
+Every product of a run carries the run's :class:`ValidationSummary`: it goes first
 on every page, into every file of numbers, and decides the exit status of every command.
 """
 
@@ -42,7 +42,7 @@ from bwbayes.shown import brief
 
 @dataclass(frozen=True)
 class ValidationContext:
-    """What a verdict needs to know of the fit, besides the bands.
+    """Facts about the fit that a validation needs besides the bands.
 
     Parameters
     ----------
@@ -102,12 +102,12 @@ class BandValidation:
         False if the bands fail one of the tests; None if luck may have passed or failed them, or
         the record is too short to tell.
     reasons
-        What is off and by how much, one line each, the most telling first; of None, why nothing can
+        Departures and their sizes, one line each, the most telling first; of None, why nothing can
         be told.
     cause
         The likely cause with its fix, if the bands do not hold, or the fit has followed a drift.
     notes
-        What else is to be known of the record, and decides nothing.
+        Further notes on the record, which decide nothing.
     """
 
     __repr__ = brief
@@ -158,7 +158,7 @@ class ValidationSummary:
     passed
         False if they fail anywhere; else None if validation is inconclusive anywhere.
     lines
-        What is off, a line for each record or window that fails, or that is inconclusive.
+        A line for each record or window that fails, or that is inconclusive.
     """
 
     passed: bool | None = True
@@ -232,9 +232,9 @@ def validate_bands(
     bands
         Bands with readings.
     background
-        What is known of the fit.
+        Facts about the fit.
     explanations
-        Of a fitted record, what may explain it better, the best first.
+        Explanations that may describe a fitted record better, the best first.
     beyond
         In what the record's drive leaves the one that was fitted.
     """

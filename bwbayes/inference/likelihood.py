@@ -87,12 +87,12 @@ class Likelihood:
     inputs
         From the record's first sample on.
     readings
-        What was read of the displacement, and when.
+        Readings of the displacement and their samples.
     actuator, noise
         The model; θ has the actuator's parameters, then the noise's. ``actuator.interval`` is that
         of the samples.
     engine
-        What computes it; see :mod:`bwbayes.inference.engine`.
+        Engine; see :mod:`bwbayes.inference.engine`.
     from_rest
         The actuator is demagnetized and at rest when the record starts: nothing is unknown, and
         the initial state of θ is the one at zero volts before.

@@ -45,7 +45,7 @@ def outliers(
         Returns the posterior, with the priors that its readings lead to, without the readings of
         some samples of each record, by name.
     generator
-        Of the fits.
+        Random generator of the fits.
     suspects
         Samples (suspects,) of each record, by name, that the first fit leaves out. Whether they are
         outliers is decided afterwards.

@@ -143,7 +143,7 @@ class JointPrior:
         All parameters of the model and the noise, in the order of θ's columns. Bounds depend on
         those that come before and on fixed ones.
     constraint
-        What must hold besides, in each of several records.
+        Further constraint, on each of several records.
     """
 
     def __init__(

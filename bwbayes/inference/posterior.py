@@ -51,7 +51,7 @@ class Dataset:
         The record starts with a demagnetized actuator at rest, and ``initial`` is h at zero volts
         before. Otherwise the state of the dynamics at the first sample is unknown.
     name
-        What the record is called.
+        Name of the record.
 
     Raises
     ------
@@ -142,7 +142,7 @@ class Posterior:
     prior
         Its parameters are those of :attr:`table`, in that order.
     engine
-        What computes the likelihood: ``"numpy"``, or ``"numba"``, which is compiled.
+        Engine of the likelihood: ``"numpy"``, or ``"numba"``, which is compiled.
     joint
         The parameters of several records; may be left out of one.
 
@@ -289,7 +289,7 @@ class Posterior:
     def noise_of_new(self, theta: FloatArray) -> FloatArray:
         """Return the noise's parameters (models, its own) for readings that were not fitted.
 
-        Of a posterior of one record; ``theta`` (models, parameters) are draws from it.
+        Only for a posterior of one record; ``theta`` (models, parameters) are draws from it.
         """
         readings = self.single_record.readings
 

@@ -44,11 +44,11 @@ def add_prior_creep(
     Parameters
     ----------
     posterior
-        What was fitted. A model with creep of its own is returned as it is.
+        The fitted posterior. A model with creep is returned as it is.
     draws
         Its draws, (draws, free), parameters in their own units.
     duration
-        What is to be predicted, s.
+        Duration of the prediction, s.
     generator
         Draws the strengths.
     """

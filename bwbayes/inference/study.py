@@ -1,4 +1,4 @@
-"""What is fitted to what: a model, the records, and what is stated of its parameters.
+"""A study: a model, the records to fit, and statements about its parameters.
 
 A :class:`Study` makes the posterior. It puts what is stated of parameters (priors, values, bounds,
 names) before what the parts of the model declare, and gives the same study with another model, of
@@ -88,14 +88,14 @@ class Study:
     spec
         The model.
     records
-        What is fitted, by name.
+        Records to fit, by name.
     stated
-        What is stated of parameters, by name, or by name[record] of one record's own.
+        Statements about parameters, by name, or by name[record] for one record.
     per_record, shared
         Parameters that each record has of its own besides those that declare it, and of these
         those that all records share.
     engine
-        What computes the likelihood.
+        Engine of the likelihood.
     """
 
     __repr__ = brief
@@ -110,7 +110,7 @@ class Study:
     def with_model(self, spec: ModelSpec, added: Mapping[str, Stated] | None = None) -> Self:
         """Return the study of another model.
 
-        Of what is stated of parameters it keeps what the other model has too: a parameter of
+        It keeps statements about parameters that the other model has too: a parameter of
         another unit is another one, whatever its name. ``added`` is stated of others.
         """
         units = {declared.name: declared.unit for declared in declarations_of(spec, self.extent)}

@@ -1,4 +1,4 @@
-"""What the noise on a voltage's reading leaves unsure of the parameters.
+"""Uncertainty of the parameters from noise on the voltage's readings.
 
 The model is driven by an estimated path (:mod:`bwbayes.record.voltage_path`), and a posterior given
 this path does not know that it is an estimate. How far the estimate is off is seen where it is made

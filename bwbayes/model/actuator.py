@@ -81,14 +81,14 @@ class Actuator:
     hysteresis
         The operator that makes the drive.
     nonlinearity
-        What is added to the drive without a memory.
+        Static nonlinearity, added to the drive.
     creep
-        What is added to the displacement with a long one.
+        Slow growth, added to the displacement.
     span
         The voltages that drives before a record may have had, V; by default those of the voltage
         that is simulated.
     stages
-        What else is on the way from the command to the reading, in the order of the way.
+        Further stages between command and reading, in the order of the signal.
 
     Raises
     ------

@@ -84,7 +84,7 @@ class Declaration:
     Parameters
     ----------
     name, unit, label, description
-        What people call it; ``label`` is LaTeX without the dollar signs.
+        Text for people; ``label`` is LaTeX without the dollar signs.
     default
         Its default prior, or the value at which it is fixed unless a config frees it; None if it
         has no default.
@@ -97,7 +97,7 @@ class Declaration:
     stated_bounds
         The bounds in words, for messages: ``|gamma| <= beta``.
     pressed
-        What to say where the posterior presses against the lower or upper of these bounds, or of
+        Advice where the posterior presses against the lower or upper of these bounds, or of
         the default prior's where there are none.
     scope
         Whether it belongs to the actuator, to one record alone (its start, its offset), or to an
@@ -107,7 +107,7 @@ class Declaration:
     aliases
         Other names that people give it.
     at_rest
-        What a parameter of one record is where that starts from rest, and one of an event where
+        Value of a parameter of one record where that starts from rest, and one of an event where
         that has not happened; None if this says nothing.
     unit_given
         The unit, where it depends on what is stated of other parameters.

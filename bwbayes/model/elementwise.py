@@ -1,4 +1,4 @@
-"""What a formula needs that is written once, for a number and for arrays of them.
+"""Elementary functions for formulas that serve numbers and arrays alike.
 
 With arrays NumPy works it out for all models at once; compiled with numbers it goes from model to
 model (:mod:`bwbayes.model.compiled`). Besides these it has arithmetic, and NumPy's

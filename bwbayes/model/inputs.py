@@ -1,4 +1,4 @@
-"""What drives an actuator: the voltage, sample by sample, and what was recorded beside it.
+"""Inputs of an actuator: the sampled voltage and further recorded columns.
 
 A part of the model may see more than the voltage: the time, or a covariate, which is a further
 column of the record (a temperature, a load). :class:`Inputs` hold all of them on one time grid.
@@ -18,7 +18,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.shown import brief
 
 VoltageIs = Literal["command", "output"]
-"""What a voltage column is: the command that a DAC holds, or the amplifier's output."""
+"""Kind of a voltage column: the command that a DAC holds, or the amplifier's output."""
 
 
 def require_voltage_is(text: str) -> VoltageIs:

@@ -63,7 +63,7 @@ def inverse(
     theta
         (models, parameters), as of :meth:`Actuator.displacement`.
     displacement
-        What is asked for, (samples,) or (models, samples), um, at the actuator's interval. The
+        Reference, (samples,) or (models, samples), um, at the actuator's interval. The
         dynamics are at rest at the first sample.
     from_rest
         The voltage comes from zero, where the actuator was at rest; otherwise the hysteresis starts
@@ -289,7 +289,7 @@ def solve_branch(
     guess
         A first guess of how far the path goes, V.
     resolution
-        What a travel need not be more exact than, V.
+        Tolerance of a travel, V.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""What an amplifier can do: its voltages, and how fast it changes them.
+"""Limits of an amplifier: voltage range and slew rate.
 
 An actuator is a capacitance to its amplifier, i = C du/dt, so that the current limits the speed of
 the voltage as a slew rate does.

@@ -201,7 +201,7 @@ def first_order_lag(lag: FloatArray, interval: float, hold: Hold) -> Recursion:
     interval
         Sampling interval, s.
     hold
-        What the drive does between samples.
+        Course of the drive between samples.
     """
     with np.errstate(divide="ignore", over="ignore"):
         z = -interval / lag
@@ -229,7 +229,7 @@ def second_order(
     interval
         Sampling interval, s.
     hold
-        What the drive does between samples.
+        Course of the drive between samples.
     """
     decay = damping / (2 * mass)
     natural = np.sqrt(stiffness / mass)

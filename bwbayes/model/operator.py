@@ -1,4 +1,4 @@
-"""What a hysteresis operator is: voltage in, displacement out, with a memory of the voltage's path.
+"""Protocol of a hysteresis operator: voltage in, displacement out, with memory of the path.
 
 An operator is rate-independent: only the path of the voltage counts, not its pace. It works for a
 batch of models at once, whose parameters come as columns by name, and for a record in pieces, with

@@ -1,8 +1,8 @@
-"""What a model is made of: a chain of stages in the order of the signal's way, and a noise.
+"""Description of a model: a chain of stages in the order of the signal, and a noise.
 
 A :class:`ModelSpec` describes a model without any record. It makes the actuator for a record, says
 what it is in words and as a config has it, and gives another one with a stage added, replaced or
-left out. Whoever wants another model (a diagnosis, a comparison, a choice of noise) changes the
+left out. To get another model, a diagnosis, a comparison or a choice of noise changes the
 spec; a config reads and writes it.
 """
 
@@ -70,7 +70,7 @@ class ModelSpec:
         In whatever order, one hysteresis operator among them; they are kept in that of the signal's
         way, those of the package before others in the same slot.
     hold
-        What the voltage does between samples; ``"auto"`` takes it from the record.
+        Course of the voltage between samples; ``"auto"`` takes it from the record.
     noise
         The model of the residual.
 

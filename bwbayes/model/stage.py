@@ -75,7 +75,7 @@ class Stage(ABC):
     def settle(parameters: Any, value: Any, after: Any) -> Any:
         """Return what comes out once the stage is at rest at a value, and write its memory.
 
-        Of one model, whose parameters and memory are numbers in a row, or of all, (any, models).
+        Step of one model, whose parameters and memory are rows, or of all, (any, models).
         """
 
     @staticmethod
@@ -156,7 +156,7 @@ class Stage(ABC):
 
 
 Advance = Callable[[Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""What runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
+"""Runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
 
 
 def begin_stages(

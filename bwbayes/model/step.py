@@ -44,7 +44,7 @@ class HysteresisStep(ABC):
     Parameters
     ----------
     parameters
-        What ``move`` needs to know of the models, (models, any); ``ROW`` says what that is.
+        Numbers of the models for ``move``, (models, any); ``ROW`` names them.
     """
 
     __repr__ = brief
@@ -61,7 +61,7 @@ class HysteresisStep(ABC):
     def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
         """Return w and dw/du once the voltage has gone there, and write the memory ``after`` it.
 
-        Of one model, whose parameters and memory are numbers in a row, or of all, (any, models).
+        Step of one model, whose parameters and memory are rows, or of all, (any, models).
         """
 
     @abstractmethod

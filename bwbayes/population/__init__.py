@@ -1,1 +1,1 @@
-"""What many specimens of one kind of actuator say together: population, outliers, the next one."""
+"""Populations of specimens of one kind of actuator: distribution, outliers, the next specimen."""

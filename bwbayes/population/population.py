@@ -95,9 +95,9 @@ class PopulationParameter:
     new
         (DRAWS,) the parameter of a specimen that was not measured.
     specimens
-        What is said of each, by name.
+        Results of each specimen, by name.
     pareto_k
-        Of the populations' own weights.
+        Pareto k of the populations' own weights.
     """
 
     __repr__ = brief
@@ -196,7 +196,7 @@ def next_specimen(
     Parameters
     ----------
     population
-        What the specimens have shown.
+        The fitted population.
     posterior, draws
         That of one of them, and (draws, free) of its parameters. Draws of the population that break
         the model's constraints are left out.

@@ -50,7 +50,7 @@ class Record(Inputs):
         What the voltage column is: the command that a DAC holds until the next sample, or the
         amplifier's output, which is continuous.
     covariates : dict of arrays (samples,)
-        What else was measured at every sample and may act on the actuator, by name.
+        Further columns that may act on the actuator, one value a sample, by name.
     origin : str
         Where the record comes from: a file's name or free text. Line breaks and other characters
         that do not print become blanks.

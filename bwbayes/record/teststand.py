@@ -161,9 +161,9 @@ class VirtualTestStand:
     sample_rate : float
         Hz.
     amplifier : Amplifier
-        What drives it.
+        The voltage source.
     sensor : LaserSensor
-        What reads it.
+        The sensor.
     actuator : Actuator
         The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
         interval is the stand's, its hold that of the amplifier.

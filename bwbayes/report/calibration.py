@@ -1,4 +1,4 @@
-"""What a simulation-based calibration says: verdict, tests and their power, numbers, pictures."""
+"""Report of a simulation-based calibration: outcome, tests and their power, numbers, figures."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from bwbayes.report.report import Report, Table
 class PagePlots(NamedTuple):
     """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
 
-    What makes either is ``bwbayes.report.figures.interactive``.
+    ``bwbayes.report.figures.interactive`` makes either.
     """
 
     drawn: Mapping[str, Markup]

@@ -1,4 +1,4 @@
-"""What a product has to say: a title, banners, tables, pictures and texts, in their order.
+"""Reports of products: a title, banners, tables, figures and texts, in their order.
 
 A :class:`Product` describes itself by a :class:`Report`. :func:`show` shows it on a terminal of 80
 columns, :mod:`~bwbayes.report.page` as a page, and :mod:`~bwbayes.report.outputs` writes its files.

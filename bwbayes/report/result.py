@@ -49,7 +49,7 @@ class Result:
     moves
         How often each kind of move was proposed to a walker for these draws, and accepted.
     predictions, scores, validation
-        Of all that was predicted; by the bands' names, for those with a measurement, their scores,
+        All that was predicted; by the bands' names, for those with a measurement, their scores,
         and whether they hold. Empty unless converged, as is all that was worked out below.
     innovations, drive_locks, consistency, explanations, posterior_checks
         By fitted record: the innovation of each reading at the most probable draw; whether what the
@@ -60,9 +60,9 @@ class Result:
     information_gain
         Information gained from the data: prior against posterior.
     facts
-        What was run, for people: one line each, by subject.
+        Description of the run for people: one line each, by subject.
     remarks
-        What a user should know: warnings of the record, undetermined combinations.
+        Notes for the user: warnings of the record, combinations that are not identifiable.
     truth
         The true parameters, of a simulated record.
     """

@@ -1,6 +1,6 @@
-"""What a run says: the answer, why one may believe it, and all the rest.
+"""Report of a run: the answer, its validation, and the details.
 
-What does not hold is said first. Without convergence nothing is said of parameters or displacement.
+Failures come first. Without convergence nothing is said of parameters or displacement.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def _failure(error: BaseException) -> tuple[str, int]:
 def _interrupt(_: int, frame: FrameType | None) -> None:
     """End what is under way, but a library that is being loaded only once it is there.
 
-    What it loads in C may lose an interruption, or take it for a module that is missing.
+    Modules that it loads in C may lose an interruption, or take it for a module that is missing.
     """
     while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
         frame = frame.f_back

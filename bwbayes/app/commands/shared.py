@@ -1,4 +1,4 @@
-"""What commands share: their options, what they show, how they end, and their errors.
+"""Shared parts of the commands: options, output, exit status and errors.
 
 The keyword arguments of a function are options of the same names, with their types and defaults;
 their help is the first sentence of each description. They are read from the function's source:

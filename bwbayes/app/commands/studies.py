@@ -1,4 +1,4 @@
-"""What needs no run: studies of many fits, ``simulate``, and the reference that is printed."""
+"""Commands that need no run: studies of many fits, ``simulate``, and the printed reference."""
 
 from __future__ import annotations
 

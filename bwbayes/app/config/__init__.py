@@ -1,4 +1,4 @@
-"""What a config may say: its keys, their types, defaults and descriptions, and how TOML is read.
+"""Configs: their keys, types, defaults and descriptions, and how TOML is read.
 
 Here are constants that configs and the command line share, without waiting for what checks configs.
 """

@@ -53,7 +53,7 @@ def config_of(
         of the training record; another record or its file; or a table of the keys of
         [validation.NAME], in which ``record`` may be a record.
     where
-        What is called, for errors.
+        Name of the call, for errors.
 
     Raises InputError: a key that does not exist, or what no config can say.
     """

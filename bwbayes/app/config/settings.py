@@ -1,4 +1,4 @@
-"""What a config says: the home of every key's type, default and description.
+"""Keys of a config: the home of every key's type, default and description.
 
 A key is a field here and nowhere else: its type is what is checked, its docstring what
 ``bwbayes config`` prints. A new key is a new field, and a new table a model that

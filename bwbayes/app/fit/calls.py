@@ -74,7 +74,7 @@ def fit(
     Warns
     -----
     InputWarning
-        What is wrong with the record or its priors, bands that do not hold, and a sampling that
+        Defects of the record or its priors, bands that do not hold, and a sampling that
         has not converged.
     """
     from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
@@ -123,7 +123,7 @@ def compare(
     Parameters
     ----------
     runs
-        What :func:`fit` takes: a record, its file, or a list or dict of several records; the file
+        As :func:`fit` takes it: a record, its file, or a list or dict of several records; the file
         of a config; or two or more fits and folders of runs.
     models
         Models to fit to a record, as on the command line: an operator, then nonlinearity, creep,

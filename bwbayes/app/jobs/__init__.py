@@ -1,1 +1,1 @@
-"""What each command does, for Python and the command line alike: a module for each job."""
+"""Jobs behind the commands, for Python and the command line alike: one module each."""

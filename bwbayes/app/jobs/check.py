@@ -1,4 +1,4 @@
-"""What to know of a record and a config before a run: on the screen, and as a page with pictures.
+"""Check of a record and its config before a run, on the screen and as a page with figures.
 
 :func:`check` resolves the config, looks at the record, fits a point with the noise that a run would
 take, and says what the record shows to be wrong with it, each with the line of config that deals

@@ -76,7 +76,7 @@ def compensate(
     Parameters
     ----------
     fit
-        What is built on; of several records the first, and a thousand of the draws.
+        The fit to use; the first of several records, and a thousand of the draws.
     reference
         The shape of the displacement. A file with time and displacement, in place of SHAPE. In
         Python also displacements (samples,), um, or the ``reference`` of an earlier command. One
@@ -262,7 +262,7 @@ def export(
     Parameters
     ----------
     fit
-        What is built on; of several records the first, as what belongs to a record matters little
+        The fit to use; the first of several records, as what belongs to a record matters little
         to a controller.
     folder
         Where the files go, ``model.json`` and ``actuator.c``; by default nothing is written.
@@ -341,7 +341,7 @@ def track(
     Parameters
     ----------
     fit
-        What is built on; of several records the first.
+        The fit to use; the first of several records.
     frequencies
         Frequency of the references, Hz; may be given again; default: 0.1 Hz to where dynamics
         matter.

@@ -1,4 +1,4 @@
-"""What to measure next: ``fit.design()``.
+"""Experimental design: ``fit.design()``.
 
 Candidates come from a file, a table of a signal each, or are a preset within the amplifier's
 limits. They are ranked by what they would leave of a parameter's standard deviation, or of a
@@ -62,7 +62,7 @@ def design(
     Parameters
     ----------
     fit
-        What is built on.
+        The fit to use.
     target
         The parameter to know better. Or the drive whose band is to be narrow: a record or a signal.
         In Python the ``Path`` of a record's file or of a signal's name, or voltages (samples,), V.

@@ -1,6 +1,6 @@
 """Methods of a fit: jobs that warn, their voltage limits and scratch folders.
 
-What the command line prints as a remark is a warning in Python.
+Python warns of the remarks that the command line prints.
 """
 
 from __future__ import annotations

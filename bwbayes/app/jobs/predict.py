@@ -45,7 +45,7 @@ def predict(
     Parameters
     ----------
     fit
-        What is built on.
+        The fit to use.
     record
         The record or its file, at any sampling interval. A file of the same columns as that of the
         training record is read as that was. A voltage without readings is a plan, and drives the
@@ -55,7 +55,7 @@ def predict(
     name
         Name of the bands; by default the file's or the signal's, or "prediction".
     table
-        Of a file with several tables the one that counts: its number, from 1 on, or its title.
+        Table to read from a file with several: its number, from 1 on, or its title.
     displacement_file
         The file with the displacement, if the record's has the voltage alone.
     window

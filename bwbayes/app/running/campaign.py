@@ -1,4 +1,4 @@
-"""What many records came to: a row for each, their population, and both as tables and a page.
+"""Results of a campaign: a row for each record, their population, tables and a page.
 
 All of it is a function of what the runs have left, so it is the same whenever and in however many
 pieces the campaign was done.

@@ -1,4 +1,4 @@
-"""What explains a problem's readings better than its model does, how that is shown, and used.
+"""Explanations that describe the readings better than the model: found, shown, and added.
 
 :func:`chosen_noise` takes the noise that the records have evidence for: each is fitted from the
 mode of the rough one, and taken if its evidence leads by odds of twenty to one: the rough

@@ -1,4 +1,4 @@
-"""What a person sees while something takes its time: what it is, how far, how long still, how well.
+"""Progress lines: the current step, its share, the time left and the state of the sampling.
 
 On a terminal one line is kept up to date, which says for how long where nothing else is new;
 elsewhere (a log file, a pipe) a line is printed now and then. Quiet means nothing at all.

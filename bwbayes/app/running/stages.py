@@ -1,4 +1,4 @@
-"""What is computed of a run: each stage once, when it is first asked for, and kept in its folder.
+"""Stages of a run: each is computed once, when first asked for, and kept in its folder.
 
 A stage knows what it needs and asks for that. Progress and figures listen to stages; no computation
 knows of them. To open a run is to read files: a stage loads what it needs when it is computed.

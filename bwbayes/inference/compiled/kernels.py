@@ -213,7 +213,7 @@ def sums(
         The stage that makes the drive, what models are in it (groups, lanes times rows), and what
         it knows of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     curve, lags, growth
-        What nonlinearity and creep know, as in :mod:`bwbayes.inference.compiled.motion`.
+        Constants of nonlinearity and creep, as in :mod:`bwbayes.inference.compiled.motion`.
     """
     result, state = np.empty((SUMS, len(models) * LANES)), _aligned(STATE)
     group, drive = _aligned(groups.shape[1]), _aligned(PIECE * LANES)

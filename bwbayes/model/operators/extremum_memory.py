@@ -1,4 +1,4 @@
-"""What Preisach's model and its kin remember of a voltage: the extrema that still count.
+"""Memory of Preisach's model and its kin: the extrema of the voltage that still count.
 
 A voltage that comes back to an earlier turning point closes a loop, and all that happened inside
 the loop is forgotten. What is left is a stack of extrema, each nearer to the next than the one

@@ -1,4 +1,4 @@
-"""What the Jiles-Atherton and the domain wall model share: walls that are pinned, and bend.
+"""Pinned walls that bend: common base of the Jiles-Atherton and the domain wall model.
 
 Without pinning sites the polarization would follow the effective field along the anhysteretic
 curve, saturating at either end. Walls that are pinned lag behind it: they move irreversibly only

@@ -1,4 +1,4 @@
-"""What operators given by a differential equation in the voltage's path have in common.
+"""Common base of operators given by a differential equation in the voltage's path.
 
 Their whole memory is one number in each model: a displacement. It changes along the path of the
 voltage, and it starts as the parameter ``initial``. An operator of this kind brings a step, or says

@@ -1,4 +1,4 @@
-"""What follows with a lag: an amplifier its command, a sensor the displacement.
+"""First-order lags of an amplifier behind its command and of a sensor behind the displacement.
 
 Both are first-order, τ y′ + y = x. The actuator's own lag is a part of its dynamics; a slow
 amplifier stands before the hysteresis, which then sees a voltage that is smoother than the command,

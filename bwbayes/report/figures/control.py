@@ -1,4 +1,4 @@
-"""What is planned: the signals of a design, commands and their errors, and how a loop tracks."""
+"""Figures of planned signals: designs, commands and their errors, and closed loops."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def record_pictures(
 ) -> dict[str, Picture]:
     """Return the pictures of a record: ``time``, ``loop``, ``drive``; ``name`` is one of several.
 
-    What lies outside of the ``training`` windows is shown in gray; where only a part of the record
+    Readings outside of the ``training`` windows are shown in gray; where only a part of the record
     has a finding, the part is marked.
     """
     kinds: dict[str, tuple[str, str, Callable[[], Figure]]] = {

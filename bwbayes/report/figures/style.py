@@ -1,4 +1,4 @@
-"""What all pictures share: their look, the words on their axes, and how long series are thinned.
+"""Style of all figures: their look, axis labels, and how long series are thinned.
 
 The colors are Okabe and Ito's, which color-blind readers can tell apart; bands differ by
 lightness besides.
