@@ -19,6 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
 
 # Part of the time between turning points over which a speed is taken: a sine's peak speed is then
@@ -83,33 +84,31 @@ class Drive:
 
 def beyond_training(
     posterior: Posterior,
-    voltage: FloatArray,
-    interval: float,
+    inputs: Inputs,
     window: slice = slice(None),
 ) -> list[Finding]:
     """Return in what a drive leaves those that the model was fitted to.
 
-    Findings of kind "range" and "speed" leave what any model knows, and "reversals" the loops on
-    which this one was tested; "slow" and "duration" leave room for creep and drift, which may be as
-    small as the bands allow.
+    Findings of kind "range" and "speed" leave what any model knows, as does "covariate",
+    and "reversals" the loops on which this one was tested; "slow" and "duration" leave room for
+    creep and drift, which may be as small as the bands allow.
 
     Parameters
     ----------
     posterior
         The posterior of the records that were fitted.
-    voltage
-        The drive from its first sample on, (samples,), V.
-    interval
-        Its sampling interval, s.
+    inputs
+        The drive from its first sample on.
     window
         The samples that are predicted; those before are what the actuator went through.
     """
+    voltage, interval = inputs.voltage, inputs.interval
     low, high = _fitted_range(posterior)
     turn_times = [
         time_between_turns(data.voltage, data.actuator.interval, data.training)
         for data in posterior.datasets
     ]
-    planned, findings = voltage[window], []
+    planned, findings = voltage[window], [*_covariates(posterior, inputs, window)]
     slack = 0.02 * (high - low)  # a sensor's noise
     if np.min(planned) < low - slack or np.max(planned) > high + slack:
         text = (
@@ -151,6 +150,22 @@ def beyond_training(
         )
         findings.append(Finding("duration", text, "train on a record that is as long"))
     return findings
+
+
+def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator[Finding]:
+    """Hold what parts of the model see beside the voltage against what they saw in training."""
+    seen = {stage.sees for stage in posterior.datasets[0].actuator.stages}
+    for name in sorted(seen & {*inputs.covariates}):
+        ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
+        low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+        least, most = inputs.range_of(name, [window])
+        slack = 0.02 * (high - low)
+        if least < low - slack or most > high + slack:
+            text = (
+                f"{name} of {least:.4g} to {most:.4g} exceeds the training range {low:.4g} to "
+                f"{high:.4g}; the bands extrapolate, their level untested"
+            )
+            yield Finding("covariate", text, "train on a record that spans this range")
 
 
 def _fitted_range(posterior: Posterior) -> tuple[float, float]:

@@ -66,9 +66,9 @@ def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try each stage before or behind the hysteresis that the model has not."""
     present = scene.study.spec.chain if scene.study is not None else ()
     for name, make in STAGES.items():
-        if name in present:
-            continue
         stage, kind = make(), name.replace("-", " ")
+        if name in present or not scene.posterior.single_record.inputs.has(stage.sees):
+            continue
         yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
 
 

@@ -20,32 +20,32 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Ranges
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.reversals import time_between_turns
 
 
 def ranges_of(
-    voltage: FloatArray,
+    inputs: Inputs,
     displacement: FloatArray,
-    interval: float,
     windows: Sequence[slice] = (slice(None),),
 ) -> Ranges:
     """Take the ranges within windows of a record.
 
-    ``voltage`` and ``displacement`` are the whole record's, (samples,), V and um; a missing
-    reading is NaN; ``interval`` is the sampling interval, s.
+    ``inputs`` and ``displacement`` (samples,), um, are the whole record's; nan is missing.
     """
-    volts = np.concatenate([voltage[window] for window in windows])
+    volts = np.concatenate([inputs.voltage[window] for window in windows])
     readings = np.concatenate([displacement[window] for window in windows])
     low, high = float(np.nanmin(readings)), float(np.nanmax(readings))
     return Ranges(
         voltage=float(np.ptp(volts)) / 2,
         displacement=(high - low) / 2,
         middle=(high + low) / 2,
-        time=time_between_turns(voltage, interval, windows),
+        time=time_between_turns(inputs.voltage, inputs.interval, windows),
         bias=float(np.min(volts) + np.max(volts)) / 2,
-        interval=interval,
-        duration=volts.size * interval,
+        interval=inputs.interval,
+        duration=volts.size * inputs.interval,
         rounding=rounding_sd(readings[~np.isnan(readings)]),
+        covariates={name: inputs.range_of(name, windows) for name in inputs.covariates},
     )
 
 
@@ -86,4 +86,11 @@ def join_ranges(records: Sequence[Ranges]) -> Ranges:
         interval=min(record.interval for record in records),
         duration=max(record.duration for record in records),
         rounding=min(record.rounding for record in records),
+        covariates={
+            name: (
+                min(record.covariates[name][0] for record in records),
+                max(record.covariates[name][1] for record in records),
+            )
+            for name in set.intersection(*(set(record.covariates) for record in records))
+        },
     )

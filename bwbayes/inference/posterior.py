@@ -304,9 +304,12 @@ class Posterior:
         )
 
     def altered(self, *, voltage: FloatArray | None = None, **fields: Any) -> Posterior:
-        """Return a posterior of one record with another voltage, or other fields of its dataset."""
+        """Return a posterior of one record with another voltage, or other fields of its dataset.
+
+        What was recorded beside a voltage is not known of another one.
+        """
         if voltage is not None:
-            fields["inputs"] = replace(self.single_record.inputs, voltage=voltage)
+            fields["inputs"] = replace(self.single_record.inputs, voltage=voltage, covariates={})
         return replace(self, datasets=(replace(self.single_record, **fields),))
 
     def trained(self, windows: Mapping[str, tuple[slice, ...]]) -> Posterior:

@@ -219,9 +219,8 @@ class Study:
         """
         ranges = {
             name: ranges_of(
-                training.record.path.voltage,
+                training.record.inputs,
                 training.displacement,
-                training.record.interval,
                 training.windows,
             )
             for name, training in self.records.items()

@@ -199,10 +199,10 @@ class Actuator:
         column = self.columns(models)
         self.check(column)
         if state is None:
-            before = self.begin_inputs(column, path, from_rest=from_rest)
+            before = self.begin_inputs(column, inputs, from_rest=from_rest)
         else:
             before = state.inputs
-        driven, before = self.pass_inputs(column, path, before)
+        driven, before = self.pass_inputs(column, inputs, before)
         if state is None:
             memory = self.begin(column, driven, from_rest=from_rest, span=self.range_of(path))
         else:
@@ -210,10 +210,10 @@ class Actuator:
         drive, hysteresis = self.drive(column, driven, memory)
         result, equilibrium, filtered = self._follow(column, drive, path, state, initial_transient)
         if state is None:
-            outputs = self.begin_outputs(column, result[:, 0], from_rest=from_rest)
+            outputs = self.begin_outputs(column, result[:, 0], inputs, from_rest=from_rest)
         else:
             outputs = state.outputs
-        result, outputs = pass_stages(self.outputs, column, result, outputs, self.timing)
+        result, outputs = pass_stages(self.outputs, column, result, outputs, inputs, self.timing)
         result += column["offset"][:, np.newaxis]
         return result, State(hysteresis, equilibrium, filtered, before, outputs)
 
@@ -278,33 +278,39 @@ class Actuator:
         return tuple(stage for stage in self.stages if stage.side == side)
 
     def begin_inputs(
-        self, column: Values, path: FloatArray, *, from_rest: bool
+        self, column: Values, inputs: Inputs, *, from_rest: bool
     ) -> tuple[FloatArray, ...]:
         """Return the memories of the stages before the hysteresis at a record's first voltage."""
         models = column["offset"].size
-        equilibrium = np.zeros(models) if from_rest else None
-        return begin_stages(self.inputs, column, np.full(models, path[0]), self.timing, equilibrium)
+        equilibrium, first = (
+            np.zeros(models) if from_rest else None,
+            np.full(models, inputs.voltage[0]),
+        )
+        return begin_stages(self.inputs, column, first, inputs, self.timing, equilibrium)
 
     def begin_outputs(
-        self, column: Values, first: FloatArray, *, from_rest: bool
+        self, column: Values, first: FloatArray, inputs: Inputs, *, from_rest: bool
     ) -> tuple[FloatArray, ...]:
         """Return the memories of the stages behind the dynamics at a first displacement (models,).
 
         Displacements are in um, without the offset.
         """
-        equilibrium = self.level_at_rest(column) if from_rest else None
-        return begin_stages(self.outputs, column, first, self.timing, equilibrium)
+        equilibrium = self.level_at_rest(column, inputs) if from_rest else None
+        return begin_stages(self.outputs, column, first, inputs, self.timing, equilibrium)
 
-    def level_at_rest(self, column: Values) -> FloatArray:
+    def level_at_rest(self, column: Values, inputs: Inputs) -> FloatArray:
         """Return the displacement (models,), um, of demagnetized models at rest at zero volts.
 
-        Before the stages behind the dynamics, and without the offset.
+        Before the first sample of inputs, before the stages behind the dynamics, and without the
+        offset.
         """
         zero, driven = np.zeros(1), np.zeros(1)
         if self.inputs:
             equilibrium = np.zeros(column["offset"].size)
             for stage in self.inputs:
-                equilibrium, _ = stage.settled(stage.numbers(column, self.timing), equilibrium)
+                equilibrium, _ = stage.settled(
+                    stage.numbers_at(column, self.timing, inputs), equilibrium
+                )
             driven = equilibrium[:, np.newaxis]
         memory = self.begin(column, driven, from_rest=True, span=self.range_of(zero))
         drive, _ = self.drive(column, driven, memory)
@@ -317,18 +323,18 @@ class Actuator:
     def pass_inputs(
         self,
         column: Values,
-        path: FloatArray,
+        inputs: Inputs,
         memories: tuple[FloatArray, ...],
         advance: Advance = Stage.advance,
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-        """Return what the stages before the hysteresis make of a path (samples,), V.
+        """Return what the stages before the hysteresis make of the voltage (samples,), V.
 
-        The path itself without any, else (models, samples); and their memories after it.
+        The voltage itself without any, else (models, samples); and their memories after it.
         """
         if not self.inputs:
-            return path, ()
-        paths = np.broadcast_to(path, (column["offset"].size, path.size))
-        return pass_stages(self.inputs, column, paths, memories, self.timing, advance)
+            return inputs.voltage, ()
+        paths = np.broadcast_to(inputs.voltage, (column["offset"].size, inputs.samples))
+        return pass_stages(self.inputs, column, paths, memories, inputs, self.timing, advance)
 
     def drive(self, column: Values, path: FloatArray, memory: Any) -> tuple[FloatArray, Any]:
         """Return what hysteresis and nonlinearity make of a path, V, (models, samples), um.

@@ -36,7 +36,8 @@ class Ranges:
     middle of the displacement's range, um; ``time`` is T, the typical time between turning points
     of the drive, s; ``bias`` the middle of the voltage's range, V; ``interval`` between samples and
     ``duration`` of the record, s. ``rounding`` is the sd of the rounding of readings that show no
-    other noise, um; 0 where they show some.
+    other noise, um; 0 where they show some. ``covariates`` are the least and the largest value of
+    each, by name.
     """
 
     voltage: float
@@ -47,6 +48,22 @@ class Ranges:
     interval: float = 0.0
     duration: float = 0.0
     rounding: float = 0.0
+    covariates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def middle_of(self, covariate: str) -> float:
+        """Return the middle of a covariate's range.
+
+        Raises
+        ------
+        InputError
+            The records have no such covariate.
+        """
+        if covariate not in self.covariates:
+            raise InputError(
+                f"{covariate}: the model needs it at every sample, and a record comes without; "
+                "name its column in covariates"
+            )
+        return sum(self.covariates[covariate]) / 2
 
     @property
     def slope(self) -> float:

@@ -6,7 +6,7 @@ column of the record (a temperature, a load). :class:`Inputs` hold all of them o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal, Self, get_args
 
@@ -77,6 +77,11 @@ class Inputs:
         """What the voltage does between samples."""
         return "zero" if self.voltage_is == "command" else "first"
 
+    def range_of(self, name: str, windows: Sequence[slice]) -> tuple[float, float]:
+        """Return the least and the largest value of a column within windows."""
+        values = np.concatenate([self.column(name)[window] for window in windows])
+        return float(np.min(values)), float(np.max(values))
+
     def __getitem__(self, samples: slice) -> Self:
         """Return some of the samples, on the same clock."""
         first, _, step = samples.indices(self.samples)
@@ -106,6 +111,10 @@ class Inputs:
         voltage = change(self.voltage, *(other.voltage for other in others))
         return {"voltage": voltage, "covariates": covariates}
 
+    def has(self, name: str) -> bool:
+        """Tell whether there is a column of that name; whatever has none sees nothing."""
+        return name in ("", "time", "voltage", *self.covariates)
+
     def column(self, name: str) -> FloatArray:
         """Return what a part of the model sees, (samples,): time, voltage or a covariate.
 
@@ -122,5 +131,5 @@ class Inputs:
             return self.covariates[name]
         raise InputError(
             f"{name}: the model needs it at every sample, and this voltage comes without; give a "
-            f"record with this column, and name it in covariates"
+            "record that has it, and name its column in covariates"
         )

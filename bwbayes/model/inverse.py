@@ -33,6 +33,7 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Recursion
 from bwbayes.model.operator import UNIT
@@ -126,9 +127,12 @@ class _Single:
     def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
         """Return the voltage (samples,) for a displacement."""
         actuator, interval = self.actuator, self.actuator.interval
-        rest_value = actuator.level_at_rest(self.column) if self.from_rest else None
+        known = self._known(displacement.size)
+        rest_value = actuator.level_at_rest(self.column, known) if self.from_rest else None
         drive = (displacement - self.column["offset"][0])[np.newaxis]
-        drive = undo_stages(actuator.outputs, self.column, drive, actuator.timing, rest_value)[0]
+        drive = undo_stages(
+            actuator.outputs, self.column, drive, known, actuator.timing, rest_value
+        )[0]
         span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
         size = peak / self.slope if self.slope > 0 else 1.0
         # Beyond so many times what a straight line would need no voltage is looked for.
@@ -155,9 +159,15 @@ class _Single:
     def _command(self, voltage: FloatArray) -> FloatArray:
         """Return the command (samples,), V, that makes a voltage at the hysteresis."""
         rest_value = np.zeros(1) if self.from_rest else None
-        actuator, path = self.actuator, voltage[np.newaxis]
-        command = undo_stages(actuator.inputs, self.column, path, actuator.timing, rest_value)
+        actuator, path, known = self.actuator, voltage[np.newaxis], self._known(voltage.size)
+        command = undo_stages(
+            actuator.inputs, self.column, path, known, actuator.timing, rest_value
+        )
         return np.asarray(command[0])
+
+    def _known(self, samples: int) -> Inputs:
+        """Return what is known of the inputs, which is their times."""
+        return Inputs(np.full(samples, np.nan), interval=self.actuator.interval)
 
     def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:
         """Undo dynamics and creep, then hysteresis and nonlinearity.

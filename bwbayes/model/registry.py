@@ -30,6 +30,7 @@ from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.model.stages.saturation import Saturation
 from bwbayes.model.stages.sensor_curve import SensorCurve
 from bwbayes.model.stages.slew_limit import SlewLimit
+from bwbayes.model.stages.temperature import Temperature
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
@@ -62,7 +63,15 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 # Stages before and behind the hysteresis, in the order of the signal's way.
 STAGES: Mapping[str, Callable[..., Stage]] = {
     stage.name: stage
-    for stage in (AmplifierLag, SlewLimit, Saturation, Backlash, SensorLag, SensorCurve)
+    for stage in (
+        AmplifierLag,
+        SlewLimit,
+        Saturation,
+        Temperature,
+        Backlash,
+        SensorLag,
+        SensorCurve,
+    )
 }
 
 

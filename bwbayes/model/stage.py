@@ -23,6 +23,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, check
+from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import ComplexArray, Hold
 from bwbayes.shown import brief
 
@@ -48,6 +49,10 @@ class Stage(ABC):
     side: ClassVar[Side]
     rate_independent: ClassVar[bool] = False
     """Whether only the path of its values counts, not their pace: then it shapes loops."""
+    sees: ClassVar[str] = ""
+    """A column of the inputs that it sees: ``"time"``, s since the record began, ``"voltage"``, the
+    command, or a covariate. What that is at a sample is then the last of its ``parameters``.
+    """
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
     starts: ClassVar[Sequence[Mapping[str, float]]] = ({},)
@@ -69,6 +74,17 @@ class Stage(ABC):
     @abstractmethod
     def numbers(self, column: Values, timing: Timing) -> FloatArray:
         """Return what ``move`` needs to know of models, (models, any), from columns (models,)."""
+
+    def numbers_at(self, column: Values, timing: Timing, inputs: Inputs) -> FloatArray:
+        """Return the same with what the stage sees at the first of inputs, if it sees any."""
+        numbers = self.numbers(column, timing)
+        if not self.sees:
+            return numbers
+        return np.column_stack([numbers, np.full(len(numbers), inputs.column(self.sees)[0])])
+
+    def seen(self, inputs: Inputs) -> FloatArray | None:
+        """Return what it sees of inputs, (samples,), if it sees any."""
+        return inputs.column(self.sees) if self.sees else None
 
     @staticmethod
     @abstractmethod
@@ -112,21 +128,34 @@ class Stage(ABC):
         check(self.parameters, column)
 
     def advance(
-        self, numbers: FloatArray, memory: FloatArray, values: FloatArray
+        self,
+        numbers: FloatArray,
+        memory: FloatArray,
+        values: FloatArray,
+        seen: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models, samples) of values, and the memory after them.
 
-        All models take one sample together. The memory that is given stays as it is.
+        All models take one sample together. What is given stays as it is. ``seen`` (samples,) is
+        what the stage sees.
         """
-        result, rows = np.empty(values.shape), numbers.T
+        result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
         for sample in range(values.shape[1]):
+            if seen is not None:
+                rows[-1] = seen[sample]
             result[:, sample] = self.move(rows, now, values[:, sample], after)
             now, after = after, now
         return result, now.T.copy()
 
-    def inverse(self, numbers: FloatArray, memory: FloatArray, values: FloatArray) -> FloatArray:
-        """Return the values (models, samples) with which these come out.
+    def inverse(
+        self,
+        numbers: FloatArray,
+        memory: FloatArray,
+        values: FloatArray,
+        seen: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the values (models, samples) with which these come out; the others as before.
 
         Raises
         ------
@@ -134,9 +163,11 @@ class Stage(ABC):
             The stage has no inverse.
         """
         self.require_inverse()
-        result, rows = np.empty(values.shape), numbers.T
+        result, rows = np.empty(values.shape), numbers.T.copy()
         now, after = memory.T.copy(), np.empty(memory.T.shape)
         for sample in range(values.shape[1]):
+            if seen is not None:
+                rows[-1] = seen[sample]
             result[:, sample] = self.undo(rows, now, values[:, sample])
             self.move(rows, now, result[:, sample], after)
             now, after = after, now
@@ -150,12 +181,14 @@ class Stage(ABC):
         return 1.0
 
     def require_inverse(self) -> None:
-        """Raise an InputError if the stage has no ``undo``."""
-        if type(self).undo is Stage.undo:
+        """Raise an InputError if the stage has no ``undo``, or sees the command itself."""
+        if type(self).undo is Stage.undo or self.sees == "voltage":
             raise InputError(f"inverse: no command undoes the stage {self.name}; leave it out")
 
 
-Advance = Callable[[Stage, FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Advance = Callable[
+    [Stage, FloatArray, FloatArray, FloatArray, FloatArray | None], tuple[FloatArray, FloatArray]
+]
 """Runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
 
 
@@ -163,6 +196,7 @@ def begin_stages(
     stages: Sequence[Stage],
     column: Values,
     first: FloatArray,
+    inputs: Inputs,
     timing: Timing,
     rest_value: FloatArray | None = None,
 ) -> tuple[FloatArray, ...]:
@@ -173,7 +207,7 @@ def begin_stages(
     """
     memories = []
     for stage in stages:
-        numbers = stage.numbers(column, timing)
+        numbers = stage.numbers_at(column, timing, inputs)
         if rest_value is None:
             memory = stage.begin(column, numbers, first, timing)
         else:
@@ -190,12 +224,13 @@ def undo_stages(
     stages: Sequence[Stage],
     column: Values,
     values: FloatArray,
+    inputs: Inputs,
     timing: Timing,
     rest_value: FloatArray | None = None,
 ) -> FloatArray:
     """Return the values (models, samples) with which these come out behind stages in a row.
 
-    ``rest_value`` as in :func:`begin_stages`.
+    ``inputs``, but for the voltage, and ``rest_value`` as in :func:`begin_stages`.
 
     Raises
     ------
@@ -207,16 +242,16 @@ def undo_stages(
         stage.require_inverse()
         at_rest.append(rest_value)
         if rest_value is not None:
-            rest_value = stage.settled(stage.numbers(column, timing), rest_value)[0]
+            rest_value = stage.settled(stage.numbers_at(column, timing, inputs), rest_value)[0]
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
-        numbers, first = stage.numbers(column, timing), values[:, 0].copy()
-        memories = begin_stages((stage,), column, first, timing, rested)
+        numbers, first = stage.numbers_at(column, timing, inputs), values[:, 0].copy()
+        memories = begin_stages((stage,), column, first, inputs, timing, rested)
         # What comes out first hangs on what goes in first.
         for _ in range(40):
             out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
             first = first + (values[:, 0] - out[:, 0])
-            memories = begin_stages((stage,), column, first, timing, rested)
-        values = stage.inverse(numbers, memories[0], values)
+            memories = begin_stages((stage,), column, first, inputs, timing, rested)
+        values = stage.inverse(numbers, memories[0], values, stage.seen(inputs))
     return values
 
 
@@ -225,12 +260,17 @@ def pass_stages(
     column: Values,
     values: FloatArray,
     memories: Sequence[FloatArray],
+    inputs: Inputs,
     timing: Timing,
     advance: Advance = Stage.advance,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Let values (models, samples) pass stages in a row; return them, and the memories."""
+    """Let values (models, samples) pass stages in a row; return them, and the memories.
+
+    The ``inputs`` are those of the same samples.
+    """
     after = []
     for stage, memory in zip(stages, memories, strict=True):
-        values, reached = advance(stage, stage.numbers(column, timing), memory, values)
+        numbers = stage.numbers_at(column, timing, inputs)
+        values, reached = advance(stage, numbers, memory, values, stage.seen(inputs))
         after.append(reached)
     return values, tuple(after)

@@ -109,6 +109,7 @@ class Record(Inputs):
         start: float | None = None,
         time: ArrayLike | None = None,
         units: Mapping[str, str] | None = None,
+        covariates: Mapping[str, ArrayLike] | None = None,
         voltage_is: VoltageIs = "output",
         origin: str = "arrays",
     ) -> Self:
@@ -125,6 +126,8 @@ class Record(Inputs):
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
             ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1.
+        covariates : dict of arrays as these
+            What else was measured and a model may see: ``{"temperature_degC": temperature}``.
 
         Raises
         ------
@@ -151,9 +154,9 @@ class Record(Inputs):
         if interval is not None and not 0 < interval < np.inf:
             raise InputError(f"{origin}: interval: {interval} s is not a positive time")
         arrays = {"time": time, "voltage": voltage, "displacement": displacement}
-        source = array_source(origin, arrays, interval, start or 0.0)
+        source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
         common = {"time": "s", "voltage": "V", "displacement": "um"}
-        naming = Naming(units=common | dict(units or {}))
+        naming = Naming(units=common | dict(units or {}), covariates=tuple(covariates or ()))
         return cls._of(source, naming, voltage_is, displacement is not None)
 
     @classmethod
@@ -166,6 +169,7 @@ class Record(Inputs):
         displacement: str | None = None,
         units: dict[str, str] | None = None,
         fs: float | None = None,
+        covariates: Mapping[str, str] | Sequence[str] = (),
         voltage_is: VoltageIs = "output",
         origin: str = "DataFrame",
     ) -> Self:
@@ -183,12 +187,14 @@ class Record(Inputs):
             Units by quantity, ``{"displacement": "nm"}``, where the names do not say them.
         fs : float, Hz
             The sampling rate, in place of a time column.
+        covariates : dict or list of str
+            Further columns that a model may see, by name, as of :func:`read_record`.
 
         Raises and warns as :func:`read_record` does.
         """
         names = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in names.items() if name is not None}
-        naming = Naming(columns, units or {}, fs)
+        naming = Naming(columns, units or {}, fs, covariates=covariates)
         return cls._of(frame_source(frame, origin), naming, voltage_is, displacement is not None)
 
     @classmethod

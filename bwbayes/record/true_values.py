@@ -21,7 +21,13 @@ from bwbayes.model.operators.duhem import Duhem
 
 # The paper's ring bender on its identification signal: +-100 V at 1 Hz, +-62 um.
 RING_BENDER = Ranges(
-    voltage=100.0, displacement=62.0, middle=0.0, time=0.5, interval=1e-3, duration=16.0
+    voltage=100.0,
+    displacement=62.0,
+    middle=0.0,
+    time=0.5,
+    interval=1e-3,
+    duration=16.0,
+    covariates={"temperature_degC": (20.0, 25.0)},
 )
 
 # Priors that other parameters' bounds cut, and priors about zero, say little by their medians.

@@ -14,6 +14,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import Inputs
 from tests.inference.problems import short_posterior
 
 
@@ -44,17 +45,19 @@ SLOW = fitted(sine(0.1, 0.05), 0.05)
 def test_speed_is_remarked_on_from_a_factor_of_one_and_a_half(
     factor: float, interval: float
 ) -> None:
-    remarks = beyond_training(SLOW, sine(0.1 * factor, interval), interval)
+    remarks = beyond_training(SLOW, Inputs(sine(0.1 * factor, interval), interval=interval))
     assert (factor > 1.5) == bool(remarks)
 
 
 def kinds(posterior: Posterior, voltage: FloatArray, interval: float) -> list[str]:
-    return [finding.kind for finding in beyond_training(posterior, voltage, interval)]
+    return [
+        finding.kind for finding in beyond_training(posterior, Inputs(voltage, interval=interval))
+    ]
 
 
 def test_range_and_speed_are_said_one_by_one() -> None:
     assert ["range", "speed"] == kinds(SLOW, sine(5.0, 1e-3, 100.0), 1e-3)
-    (wide,) = beyond_training(SLOW, sine(0.1, 0.05, 100.0), 0.05)
+    (wide,) = beyond_training(SLOW, Inputs(sine(0.1, 0.05, 100.0), interval=0.05))
     assert wide.text == (
         "voltage 0 to 200 V exceeds the training range 0 to 150 V; the bands extrapolate, "
         "their level untested"
@@ -68,13 +71,15 @@ FAST = fitted(75 * np.sin(4 * np.pi * TIME), 0.005)
 def test_a_slow_sine_and_a_hold_are_said() -> None:
     """Of a fit of 2 Hz for 16 s that holds, the bands cover 34% of the one, 0.3% of the other."""
     long = np.arange(0, 100, 0.005)
-    slow, duration = beyond_training(FAST, 75 * np.sin(0.04 * np.pi * long), 0.005)
+    slow, duration = beyond_training(FAST, Inputs(75 * np.sin(0.04 * np.pi * long), interval=0.005))
     assert ("slow", "duration") == (slow.kind, duration.kind)
     assert slow.text.startswith("voltage averages 50.2 V over 23.7 s, in training at most 0.")
     assert duration.text.startswith("duration of 100 s exceeds the 16 s of training; the bands")
     for held in (np.full(long.size, 75.0), np.where(long > 1, 75.0, 0.0)):
         slow = next(
-            finding for finding in beyond_training(FAST, held, 0.005) if finding.kind == "slow"
+            finding
+            for finding in beyond_training(FAST, Inputs(held, interval=0.005))
+            if finding.kind == "slow"
         )
         assert f"voltage averages {np.mean(held):.3g} V over 100 s" in slow.text
 
@@ -111,7 +116,7 @@ def test_held_out_part_of_the_same_drive_is_no_extrapolation() -> None:
         two = sine(1.0, other, periods=generator.uniform(1.0, 5.0))
         noise = [0.5 * generator.standard_normal(v.size) for v in (one, two)]
         posterior, decay = fitted(one + noise[0], interval), np.linspace(1.0, 0.5, two.size)
-        alarms += len(beyond_training(posterior, two + noise[1], other))
+        alarms += len(beyond_training(posterior, Inputs(two + noise[1], interval=other)))
         assert set(kinds(posterior, decay * two + noise[1], other)) <= {"reversals"}
     assert alarms == 0
 

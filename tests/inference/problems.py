@@ -95,12 +95,12 @@ def posterior_of(
     """Return the posterior with default priors, of a record that starts from rest."""
     model = noise_model(noise, actuator.interval)
     fixed = {"initial": 0.0} if fixed is None else fixed
-    ranges = ranges_of(voltage, displacement, actuator.interval)
+    inputs = Inputs(voltage, interval=actuator.interval)
+    ranges = ranges_of(inputs, displacement)
     known = context(ranges, fixed.get("exponent", 1.0), 4.1e5)
     parameters = parameters_of(ParameterTable(actuator, model).declarations, known, fixed, priors)
     prior = JointPrior(parameters, actuator.hysteresis.holds)
     windows = training or (slice(0, voltage.size),)
-    inputs = Inputs(voltage, interval=actuator.interval)
     one = Dataset(inputs, displacement, windows, actuator, model, from_rest)
     return Posterior((one,), prior)
 

@@ -12,6 +12,7 @@ from bwbayes.inference.defaults import join_ranges, ranges_of, rounding_sd
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.inputs import Inputs
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES as EVERY
 from tests.declared import context, declared, joint, parameter
@@ -57,8 +58,8 @@ def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
     voltage = drive(amplitude, bias=bias)
     noise = 1e-3 * np.random.default_rng(0).standard_normal(voltage.size)
     reading = displacement(voltage) + noise
-    whole = ranges_of(voltage, reading, 1e-3)
-    part = ranges_of(voltage[::every], reading[::every], every * 1e-3)
+    whole = ranges_of(Inputs(voltage, interval=1e-3), reading)
+    part = ranges_of(Inputs(voltage[::every], interval=every * 1e-3), reading[::every])
     for name in NAMES:
         one, other = prior(name, whole), prior(name, part)
         quantiles = [p.frozen.ppf([0.16, 0.5, 0.84]) for p in (one, other)]
@@ -71,7 +72,7 @@ def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
 def test_times_of_a_1_hz_drive_are_those_that_actuators_show(rate: float) -> None:
     """A lag of 0.5 to 50 ms lies within 1.4 sds, a discrepancy's 0.1 to 0.7 s within 1.5."""
     voltage = drive(interval=1 / rate)
-    ranges = ranges_of(voltage, displacement(voltage, 1 / rate), 1 / rate)
+    ranges = ranges_of(Inputs(voltage, interval=1 / rate), displacement(voltage, 1 / rate))
     for lag in (0.5e-3, 5e-3, 20e-3, 50e-3):
         assert abs(score("lag", lag, ranges)) < 1.4
         assert abs(score("damping", 4.1e5 * lag, ranges)) < 1.4
@@ -99,7 +100,7 @@ def share_below(ranges: Ranges, exponent: float | Distribution, **values: float)
 def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bias: float) -> None:
     """Within the central 98% of the cut prior, and 95% of the offset's."""
     voltage = drive(amplitude, bias=bias * amplitude)
-    ranges = ranges_of(voltage, displacement(voltage), 1e-3)
+    ranges = ranges_of(Inputs(voltage, interval=1e-3), displacement(voltage))
     shares = share_below(ranges, 1.0, d=0.7, alpha=0.3575, beta=0.0272, gamma=0.0172)
     assert 0.01 < min(shares), shares
     assert max(shares) < 0.99, shares
@@ -111,7 +112,7 @@ def test_true_parameters_lie_well_inside_whatever_the_drive(amplitude: float, bi
 def test_scales_of_beta_and_gamma_follow_the_exponent(exponent: float, free: bool) -> None:
     """What is a rate of 0.0272 / V at an h of 8 um lies inside, be the exponent known or free."""
     voltage = drive()
-    ranges = ranges_of(voltage, displacement(voltage), 1e-3)
+    ranges = ranges_of(Inputs(voltage, interval=1e-3), displacement(voltage))
     given = Distribution("uniform", {"lower": 1.0, "upper": 5.0}) if free else exponent
     unit = 8.0 ** (1 - exponent)
     shares = share_below(ranges, given, beta=0.0272 * unit, gamma=0.0172 * unit)
@@ -138,7 +139,7 @@ POWERS = {
 def half_width(name: str, exponent: float, k: float = 1.0, m: float = 1.0) -> float:
     """Return half of the central 68% of a default prior, given k and m."""
     voltage = drive()
-    ranges = ranges_of(m * voltage, k * 0.6 * voltage, 1e-3)
+    ranges = ranges_of(Inputs(m * voltage, interval=1e-3), k * 0.6 * voltage)
     low, high = prior(name, ranges, exponent).frozen.ppf([0.16, 0.84])
     return float(high - low) / 2
 
@@ -179,7 +180,7 @@ def test_a_record_without_noise_has_a_sensor_as_good_as_its_rounding_at_best() -
     clean = displacement(voltage)
     noise = 0.1 * np.random.default_rng(0).standard_normal(clean.size)
     exact, rounded, noisy = (
-        ranges_of(voltage, readings, 1e-3)
+        ranges_of(Inputs(voltage, interval=1e-3), readings)
         for readings in (clean, np.round(clean, 2), clean + noise)
     )
     assert prior("sensor_sd", rounded).support[0] == pytest.approx(0.01 / np.sqrt(12), rel=0.01)

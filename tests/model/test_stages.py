@@ -6,6 +6,7 @@ inverse, a model at a controller's pace and its C file have to agree with the wh
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.saturation import Saturation
+from bwbayes.model.stages.temperature import Temperature
 from bwbayes.record.true_values import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -59,10 +61,15 @@ VALUES = {
     "sensor_cubic": -0.015,
     "sensor_middle": 2.0,
     "sensor_half": 60.0,
+    "temperature_gain": 2e-3,
+    "temperature_reference": 24.0,
 }
+# What is sought for a command, or runs a sample at a time, has no more than the voltage.
+COMMANDED = tuple(name for name, stage in STAGES.items() if not stage().sees)
 # A backlash that turns asks for a jump, which a slew rate does not let pass.
-MANY = tuple(name for name in STAGES if name != "slew-limit")
+MANY = tuple(name for name in COMMANDED if name != "slew-limit")
 every_stage = pytest.mark.parametrize("name", STAGES)
+every_commanded = pytest.mark.parametrize("name", COMMANDED)
 every_hold = pytest.mark.parametrize("hold", ["first", "zero"])
 
 
@@ -74,6 +81,13 @@ def drive(samples: int = 600, seed: int = 3) -> FloatArray:
     voltage += 4 * np.sin(2 * np.pi * 23 * t + rng.uniform(0, 6))
     voltage[samples // 3 : samples // 3 + 40] = voltage[samples // 3]
     return voltage
+
+
+def inputs_of(voltage: FloatArray) -> Inputs:
+    """Return the voltage with a temperature that drifts and swings."""
+    time = np.arange(voltage.size) / 600
+    temperature = 20 + 8 * time + 2 * np.sin(9 * time)
+    return Inputs(voltage, interval=INTERVAL, covariates={"temperature_degC": temperature})
 
 
 def actuator(
@@ -96,7 +110,7 @@ def theta(made: Actuator, models: int = 3) -> FloatArray:
     return rows
 
 
-def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
+def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:  # noqa: PLR0911  # one a stage
     """Return what a stage at rest at the first value makes of values (samples,)."""
     v = VALUES
     match name:
@@ -113,6 +127,9 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
         case "saturation":
             c, r = v["saturation_middle"], v["saturation_reach"]
             return np.asarray(c + r * np.tanh((x - c) / r))
+        case "temperature":
+            warmer = inputs_of(x).column("temperature_degC") - v["temperature_reference"]
+            return np.asarray(x * (1 + v["temperature_gain"] * warmer))
         case "sensor-curve":
             s = (x - v["sensor_middle"]) / v["sensor_half"]
             a, b = v["sensor_quadratic"], v["sensor_cubic"]
@@ -139,9 +156,10 @@ def passed(name: str, x: FloatArray, hold: Hold = "first") -> FloatArray:
     """Return what the package's stage makes of the same."""
     stage = STAGES[name]()
     column = {one: np.array([value]) for one, value in VALUES.items()}
-    numbers = stage.numbers(column, Timing(INTERVAL, hold))
+    numbers = stage.numbers_at(column, Timing(INTERVAL, hold), inputs_of(x))
     _, memory = stage.settled(numbers, x[:1])
-    return np.asarray(stage.advance(numbers, memory, x[np.newaxis])[0][0])
+    seen = stage.seen(inputs_of(x))
+    return np.asarray(stage.advance(numbers, memory, x[np.newaxis], seen)[0][0])
 
 
 @every_stage
@@ -173,21 +191,21 @@ def test_chains_agree_in_both_engines_and_in_pieces(
         }
     made, voltage = actuator(*names, hold=hold, operator=operator, **parts), drive(400, seed)
     models = theta(made)
-    whole = made.displacement(models, voltage, from_rest=from_rest)
+    inputs = inputs_of(voltage)
+    whole = made.displacement(models, inputs, from_rest=from_rest)
     cut = 2 + seed % 300
-    first, state = made.advance(models, voltage[:cut], from_rest=from_rest)
-    second, _ = made.advance(models, voltage[cut:], state)
+    first, state = made.advance(models, inputs[:cut], from_rest=from_rest)
+    second, _ = made.advance(models, inputs[cut:], state)
     size = np.ptp(whole)
     np.testing.assert_allclose(np.hstack([first, second]), whole, rtol=0, atol=1e-11 * size)
-    inputs = Inputs(voltage, interval=made.interval)
     onwards = walk(made, models, inputs, from_rest=from_rest)
     pieces = np.hstack([onwards(cut), onwards(voltage.size)])
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-11 * size)
-    alone = made.displacement(models[1:2], voltage, from_rest=from_rest)
+    alone = made.displacement(models[1:2], inputs, from_rest=from_rest)
     np.testing.assert_allclose(alone, whole[1:2], rtol=0, atol=1e-11 * size)
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in STAGES), MANY])
+@pytest.mark.parametrize("names", [*((name,) for name in COMMANDED), MANY])
 @every_hold
 @pytest.mark.parametrize("from_rest", [False, True])
 def test_the_inverse_makes_the_displacement_again(
@@ -210,7 +228,7 @@ def test_the_inverse_makes_the_displacement_again(
 
 
 @pytest.mark.parametrize(
-    ("names", "hold"), [*(((name,), "first") for name in STAGES), (tuple(STAGES), "zero")]
+    ("names", "hold"), [*(((name,), "first") for name in COMMANDED), (COMMANDED, "zero")]
 )
 def test_a_controller_and_its_c_file_do_the_same(
     names: tuple[str, ...], hold: Hold, tmp_path: Path
@@ -233,7 +251,7 @@ def test_a_controller_and_its_c_file_do_the_same(
     np.testing.assert_allclose(in_c, moved, rtol=0, atol=1e-11 * size)
 
 
-@every_stage
+@every_commanded
 @every_hold
 def test_a_controller_s_inverse_undoes_a_stage(name: str, hold: Hold, tmp_path: Path) -> None:
     made, voltage = actuator(name, hold=hold), drive()
@@ -251,7 +269,7 @@ def test_a_controller_s_inverse_undoes_a_stage(name: str, hold: Hold, tmp_path: 
     assert np.quantile(error, 0.98) < 1e-6
 
 
-@pytest.mark.parametrize("names", [("backlash",), ("amplifier-lag", "backlash", "sensor-curve")])
+@pytest.mark.parametrize("names", [("backlash",), ("amplifier-lag", "temperature", "backlash")])
 @pytest.mark.parametrize("from_rest", [False, True])
 @pytest.mark.parametrize("creep", [None, Creep((0.1, 1.0), False, SPAN)])
 def test_both_engines_give_the_same_log_density(
@@ -261,14 +279,15 @@ def test_both_engines_give_the_same_log_density(
     made, voltage = actuator(*names, creep=creep), drive()
     models = theta(made)
     rng = np.random.default_rng(5)
-    readings = made.displacement(models[:1], voltage)[0] + 0.1 * rng.normal(size=voltage.size)
+    inputs = inputs_of(voltage)
+    readings = made.displacement(models[:1], inputs)[0] + 0.1 * rng.normal(size=voltage.size)
     readings[rng.integers(0, readings.size, 40)] = np.nan
     sds = np.tile([0.1, 0.05, 0.02], (len(models), 1))
     every = np.hstack([models, sds])
     densities = []
     for engine in ("numpy", "numba"):
         likelihood = Likelihood(
-            Inputs(voltage, interval=made.interval),
+            inputs,
             Readings.of(readings, [slice(20, 580)]),
             made,
             DiscrepancyNoise(),
@@ -323,3 +342,57 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
     with pytest.raises(InputError, match="inverse: no command undoes the stage saturation; leave"):
         inverse(made, models, made.displacement(models, drive(50)))
     assert "no command undoes" in str(exported("one way", made, models[0], SPAN).without_inverse)
+
+
+class Aging(Temperature):
+    """y = x (1 + c (t − t₀)): sees the time."""
+
+    name, sees = "aging", "time"
+
+
+class Leaking(Temperature):
+    """The same with the command in place of the time: cross-talk."""
+
+    name, sees = "leaking", "voltage"
+
+
+@pytest.mark.parametrize("kind", [Aging, Leaking])
+def test_a_stage_sees_time_or_command(kind: type[Stage]) -> None:
+    """From the record's beginning on, in both engines and in pieces."""
+    made = Actuator("lag", "first", INTERVAL, BoucWen(), span=SPAN, stages=(kind(),))
+    models, inputs = theta(made), inputs_of(drive())
+    without = replace(made, stages=()).displacement(np.delete(models, [-3, -2], axis=1), inputs)
+    change, reference, offset = np.hsplit(models[:, -3:], 3)
+    seen = inputs.column(kind.sees)
+    expected = offset + (without - offset) * (1 + change * (seen - reference))
+    for moved in (made.displacement(models, inputs), walk(made, models, inputs)(inputs.samples)):
+        np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-10)
+    onwards = walk(made, models, inputs)
+    pieces = np.hstack([onwards(123), onwards(inputs.samples)])
+    np.testing.assert_allclose(pieces, expected, rtol=0, atol=1e-10)
+    if kind is Leaking:
+        with pytest.raises(InputError, match="no command undoes the stage leaking"):
+            inverse(made, models, expected)
+        return
+    command = inverse(made, models, expected)
+    for row, own, wanted in zip(models, command, expected, strict=True):
+        again = made.displacement(row, Inputs(own, interval=INTERVAL))
+        np.testing.assert_allclose(again[0], wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "seen"), [(Aging, "time"), (Temperature, "temperature_degC")])
+def test_what_is_not_known_of_a_command_is_refused_in_one_line(
+    kind: type[Stage], seen: str
+) -> None:
+    """Nothing is taken at a reference."""
+    made = Actuator("lag", "first", INTERVAL, BoucWen(), span=SPAN, stages=(kind(),))
+    models = theta(made, 1)
+    with pytest.raises(InputError, match=f"stages: .* needs {seen} at every sample"):
+        SampledModel.of(made, models)
+    refused = "temperature_degC: the model needs it at every sample"
+    for command in (made.displacement, lambda *given: inverse(made, *given)):
+        if kind is Temperature:
+            with pytest.raises(InputError, match=refused):
+                command(models, drive(50))
+        else:
+            assert np.isfinite(command(models, drive(50))).all()

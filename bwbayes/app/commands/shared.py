@@ -127,7 +127,12 @@ def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) ->
 # What of a record's files is meant, and of a single file.
 _reading = Verb(
     "bwbayes.record.io.formats:read_record",
-    flags={"columns": "column", "units": "unit", "displacement_file": "displacement"},
+    flags={
+        "columns": "column",
+        "units": "unit",
+        "covariates": "covariate",
+        "displacement_file": "displacement",
+    },
 )
 naming_options = options_of(_reading, "voltage_is", "need_displacement")
 column_options = options_of(_reading, "voltage_is", "need_displacement", "displacement_file")

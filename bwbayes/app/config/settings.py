@@ -103,6 +103,10 @@ class _Source(ConfigTable):
     """
     displacement_file: str | None = key(None, example='"my_displacement.csv"')
     """The file with the displacement, if the record's has the voltage alone."""
+    covariates: list[str] | dict[str, str] | None = key(None, example='["temperature_degC"]')
+    """Further columns of the file that a part of the model sees, as stages = ["temperature"] does;
+    where they are called otherwise { temperature_degC = "T2" }.
+    """
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
     """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
     that is predicted by default those of the training record.
@@ -113,7 +117,13 @@ class _Source(ConfigTable):
         from bwbayes.record.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
         other = None if self.displacement_file is None else Path(self.displacement_file)
-        Naming(self.columns or {}, self.units or {}, self.fs, displacement_file=other)
+        Naming(
+            self.columns or {},
+            self.units or {},
+            self.fs,
+            displacement_file=other,
+            covariates=self.covariates or (),
+        )
         return self
 
 

@@ -165,7 +165,7 @@ def compensate(
         from_rest=from_rest,
         watch=partial(watch, "predicted error"),
     )
-    extrapolations = beyond_training(alone.posterior, compensation.voltage, desired.interval)
+    extrapolations = beyond_training(alone.posterior, compensation.record.inputs)
     remarks = [*compensation.remarks, *(finding.note for finding in extrapolations)]
     if not from_rest:
         # What is reached from some states need not be from rest.

@@ -13,7 +13,7 @@ from typing import Any
 
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.errors import InputWarning
-from bwbayes.record.io.columns import series_named
+from bwbayes.record.io.columns import Naming, series_named
 from bwbayes.record.io.formats import read_source
 from bwbayes.record.io.series import Source
 
@@ -25,7 +25,7 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     """
     stated = {
         key: getattr(source, key)
-        for key in ("columns", "units", "fs", "voltage_is")
+        for key in ("columns", "units", "fs", "voltage_is", "covariates")
         if getattr(source, key) is not None
     }
     if not stated or source.file is None:
@@ -59,6 +59,8 @@ def column_options_from(
         return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
     options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
+    further = Naming(covariates=noted.get("covariates", ())).covariate_columns
+    options["covariates"] = {name: column for name, column in further.items() if column in names}
     return options | as_stated | {"columns": columns}
 
 

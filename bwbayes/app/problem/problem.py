@@ -174,8 +174,7 @@ class Problem:
         for name, validation in self.validations.items():
             record, windows = validation.record or self.records[validation.of], validation.windows
             window = slice(windows[0].start, windows[-1].stop) if windows else slice(None)
-            voltage = record.path.voltage
-            beyond = beyond_training(self.posterior, voltage, record.interval, window)
+            beyond = beyond_training(self.posterior, record.inputs, window)
             # A held-out part goes on with the loops of the rest, and its readings test them.
             is_window = validation.record is None
             beyond_by_name[name] = [
@@ -247,7 +246,13 @@ def resolve_config(
         aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
     study = study_of(config, fitted, training)
     require_known("truth", config.truth, study.posterior.table, elsewhere=True)
-    truth = recoverable(stand, study.posterior.datasets[0].actuator) if stand else {}
+    actuator = study.posterior.datasets[0].actuator
+    remarks += [
+        f"loops and step responses leave out what {stage.name} makes of {stage.sees}"
+        for stage in actuator.stages
+        if stage.sees and not stage.rate_independent
+    ]
+    truth = recoverable(stand, actuator) if stand else {}
     sources = {
         name: source.model_copy(
             update={
@@ -352,9 +357,8 @@ def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
         )
         for name, source in config.records.items()
     }
-    as_read = dict.fromkeys(
-        ("signal", "voltage_is", "columns", "units", "fs", "table", "displacement_file")
-    )
+    naming = ("columns", "units", "fs", "table", "displacement_file", "covariates")
+    as_read = dict.fromkeys(("signal", "voltage_is", *naming))
     validation = {
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()

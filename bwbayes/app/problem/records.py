@@ -223,6 +223,7 @@ def _read(
             fs=source.fs,
             table=source.table,
             displacement_file=source.displacement_file and folder / source.displacement_file,
+            covariates=source.covariates,
         )
     except ColumnsError as error:
         raise error.within(table) from None
@@ -248,7 +249,9 @@ def validations_of(
             validations[name] = Validation(held_out[name], of=of)
             continue
         if source.signal is None:
-            record = _read(source, folder, in_memory.get(name), table)
+            covariates = source.covariates or config.records[of].covariates
+            told = source.model_copy(update={"covariates": covariates})
+            record = _read(told, folder, in_memory.get(name), table)
             if source.missing is None:
                 record = record.without_values(config.records[of].missing or ())
         else:

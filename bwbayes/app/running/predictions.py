@@ -159,7 +159,7 @@ def predict_another(
     watch(0.0)
     posterior = problem.posterior
     path = other.record.path
-    beyond = beyond_training(posterior, path.voltage, other.record.interval)
+    beyond = beyond_training(posterior, other.record.inputs)
     subset = thin_draws(flat, generator(problem.config.seed, "draws"))
     bands = _of_another(problem, subset, other, name, beyond, part(watch, 0.0, 0.8))
     background = ValidationContext.of(posterior, flat)
@@ -263,7 +263,7 @@ def predict_after(
     watch(0.0)
     seed, record = problem.config.seed, problem.records[of]
     longer, after = continued(record, voltage), slice(record.samples, None)
-    beyond = beyond_training(problem.posterior, longer.voltage, record.interval, after)
+    beyond = beyond_training(problem.posterior, longer.inputs, after)
     subset = thin_draws(flat, generator(seed, "draws"))
     planned = Record(voltage, None, interval=record.interval)
     source = generator(seed, f"forecast {planned.sha256}")

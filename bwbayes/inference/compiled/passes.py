@@ -16,11 +16,16 @@ from bwbayes.model.step import HysteresisStep
 
 
 def advance_stage(
-    stage: Stage, numbers: FloatArray, memory: FloatArray, values: FloatArray
+    stage: Stage,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    seen: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return what :meth:`~bwbayes.model.stage.Stage.advance` does."""
     result, after = np.empty(values.shape), memory.copy()
-    _pass(stage, np.ascontiguousarray(numbers), after, np.ascontiguousarray(values), result)
+    seen = np.empty(0) if seen is None else seen.copy()  # of one type, for which one is compiled
+    _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)
     return result, after
 
 
@@ -42,12 +47,15 @@ def _pass(
     numbers: FloatArray,
     memory: FloatArray,
     values: FloatArray,
+    seen: FloatArray,
     result: FloatArray,
 ) -> None:
     """Write what comes out of values, and move the memory on."""
     after = np.empty(memory.shape[1])
     for i in range(values.shape[0]):
         for t in range(values.shape[1]):
+            if seen.size > 0:
+                numbers[i, -1] = seen[t]
             result[i, t] = formula(stage, numbers[i], memory[i], values[i, t], after)
             for k in range(after.size):
                 memory[i, k] = after[k]

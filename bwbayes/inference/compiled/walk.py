@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,20 +44,21 @@ def walk(
     column = actuator.columns(theta)
     actuator.check(column)
     if not actuator.stages:
-        return _walk_core(actuator, column, inputs.voltage, initial_transient, from_rest)
+        return _walk_core(actuator, column, inputs, initial_transient, from_rest)
     # The offset comes last.
     inner = replace(actuator, stages=actuator.inputs)
     without_offset = column | {"offset": np.zeros(len(theta))}
-    core = _walk_core(inner, without_offset, inputs.voltage, initial_transient, from_rest)
+    core = _walk_core(inner, without_offset, inputs, initial_transient, from_rest)
     memories: tuple[FloatArray, ...] | None = None
+    now = 0
 
     def onwards(last: int) -> FloatArray:
-        nonlocal memories
-        moved = core(last)
+        nonlocal memories, now
+        moved, piece, now = core(last), inputs[now:last], last
         if memories is None:
-            memories = actuator.begin_outputs(column, moved[:, 0], from_rest=from_rest)
+            memories = actuator.begin_outputs(column, moved[:, 0], piece, from_rest=from_rest)
         moved, memories = pass_stages(
-            actuator.outputs, column, moved, memories, actuator.timing, advance_stage
+            actuator.outputs, column, moved, memories, piece, actuator.timing, advance_stage
         )
         return moved + column["offset"][:, np.newaxis]
 
@@ -68,20 +68,24 @@ def walk(
 def _walk_core(
     actuator: Actuator,
     column: Values,
-    voltage: FloatArray,
+    inputs: Inputs,
     initial_transient: FloatArray | None,
     from_rest: bool,
 ) -> Callable[[int], FloatArray]:
     """Walk along the way up to creep and dynamics."""
-    operator, compiled = actuator.hysteresis, None
+    operator, voltage, compiled = actuator.hysteresis, inputs.voltage, None
     if actuator.inputs:
-        advance, memory = _of_own(actuator, column, voltage, from_rest)
+        advance, memory = _of_own(actuator, column, inputs, from_rest)
         actuator = replace(actuator, nonlinearity=None)  # it is in the drive
     else:
-        advance = partial(advance_of(operator), operator, column)
+        along = advance_of(operator)
+
+        def advance(piece: Inputs, memory: Any) -> tuple[FloatArray, Any]:
+            return along(operator, column, piece.voltage, memory)
+
         memory = actuator.begin(column, voltage, from_rest=from_rest)
         compiled = prepared(operator, column, voltage, memory)
-    stage = compiled or given(advance(voltage[:1], memory)[0])
+    stage = compiled or given(advance(inputs[:1], memory)[0])
     sections = actuator.sections(column)
     named = physics(actuator, sections, column, stage.equilibrium, voltage)
     models = by_rows(named, STATE // LANES)
@@ -101,7 +105,7 @@ def _walk_core(
         if compiled is None:
             # The drive of this piece is known, and what goes with it begins where it does.
             piece, begin = slice(now, last), 0
-            drive, memory = advance(voltage[piece], memory)
+            drive, memory = advance(inputs[piece], memory)
             plan = np.ascontiguousarray(drive)
         _walk(
             stage.kind, groups, plan, curve[piece], lags, growth[piece], state, read_only[piece],
@@ -114,16 +118,16 @@ def _walk_core(
 
 
 def _of_own(
-    actuator: Actuator, column: Values, voltage: FloatArray, from_rest: bool
-) -> tuple[Callable[[FloatArray, Any], tuple[FloatArray, Any]], Any]:
-    """Return what makes the drive along the next voltages, of models with voltages of their own.
+    actuator: Actuator, column: Values, inputs: Inputs, from_rest: bool
+) -> tuple[Callable[[Inputs, Any], tuple[FloatArray, Any]], Any]:
+    """Return what makes the drive along the next inputs, of models with voltages of their own.
 
     And what it remembers at the first sample: the stages' memories, and the operator's.
     """
     operator = actuator.hysteresis
-    inputs = actuator.begin_inputs(column, voltage, from_rest=from_rest)
-    first, _ = actuator.pass_inputs(column, voltage[:1], inputs)
-    span = actuator.range_of(voltage)
+    before = actuator.begin_inputs(column, inputs, from_rest=from_rest)
+    first, _ = actuator.pass_inputs(column, inputs[:1], before)
+    span = actuator.range_of(inputs.voltage)
     memory = actuator.begin(column, first, from_rest=from_rest, span=span)
     step = None
     # Those that remember extrema have another memory than their step has.
@@ -134,18 +138,18 @@ def _of_own(
         remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
         memory = np.concatenate(remembered)
 
-    def advance(path: FloatArray, memories: Any) -> tuple[FloatArray, Any]:
-        inputs, memory = memories
-        driven, inputs = actuator.pass_inputs(column, path, inputs, advance_stage)
+    def advance(piece: Inputs, memories: Any) -> tuple[FloatArray, Any]:
+        before, memory = memories
+        driven, before = actuator.pass_inputs(column, piece, before, advance_stage)
         if step is None:
             drive, memory = actuator.drive(column, driven, memory)
         else:
             drive, memory = drive_of_own(step, memory, driven)
             if actuator.nonlinearity is not None:
                 drive += actuator.nonlinearity.displacement(column, driven)
-        return drive, (inputs, memory)
+        return drive, (before, memory)
 
-    return advance, (inputs, memory)
+    return advance, (before, memory)
 
 
 @compile_cached()

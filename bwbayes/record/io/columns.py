@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,8 @@ class Naming:
         Of a file with several tables the one that counts: its number, from 1 on, or its title.
     displacement_file
         The file with the displacement, if it is another one than that with the voltage.
+    covariates
+        The columns of covariates by their names; or columns that are called as these are.
 
     Raises
     ------
@@ -69,8 +71,11 @@ class Naming:
     fs: float | None = None
     table: int | str | None = None
     displacement_file: Path | None = None
+    covariates: Mapping[str, str] | Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        if wrong := {*QUANTITIES, "truth", ""} & self.covariate_columns.keys():
+            raise InputError(f"covariates: {wrong.pop()!r} is none; say what, with its unit")
         for key, table in (("columns", self.columns), ("units", self.units)):
             for quantity in table:
                 if quantity not in QUANTITIES:
@@ -104,6 +109,12 @@ class Naming:
         if self.fs is not None and "time" in self.columns:
             raise InputError("fs: takes the place of the time column; give one of the two")
 
+    @property
+    def covariate_columns(self) -> dict[str, str]:
+        """The columns of the covariates, by name."""
+        named = self.covariates
+        return dict(named) if isinstance(named, Mapping) else {name: name for name in named}
+
 
 @dataclass(frozen=True)
 class FileColumn:
@@ -115,7 +126,9 @@ class FileColumn:
     clock: Clock | None = None
 
     def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
-        """Return values in this column's unit in the package's."""
+        """Return values in this column's unit in the package's; without a unit as they are."""
+        if not self.unit:
+            return values
         factor, power = scale_of(self.unit, quantity) or (1.0, 0)
         # Dividing by 1e3 rounds once, multiplying by the inexact 1e-3 would round twice.
         return factor * (values * 10.0**power if power >= 0 else values / 10.0**-power)
@@ -123,7 +136,7 @@ class FileColumn:
 
 @dataclass(frozen=True)
 class ColumnTable:
-    """The columns of a file by quantity ("time", "voltage", "displacement", "truth").
+    """The columns of a file by quantity ("time", "voltage", "displacement", "truth") or covariate.
 
     ``notes`` is what the file says in words. ``naming`` finds the same columns again; the times
     are those of its rate, or of the source, where there is no column of them. ``rows`` are the
@@ -199,6 +212,14 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
         for quantity, unit in units.items()
         if unit
     }
+    group = next(iter(chosen.values())).group
+    notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
+    covariates = naming.covariate_columns
+    if not covariates and "covariates" in notes:
+        covariates = {name: name for name in notes["covariates"].split(", ")}
+    for name, column in covariates.items():
+        series = series_named(source, column, name)
+        columns[name] = FileColumn(series.name, series.numbers(path), "", series.clock)
     names = {q: column.name for q, column in columns.items()}
     has_clocks = "time" not in chosen and naming.fs is None
     others = [
@@ -214,9 +235,13 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     foreign = {
         q: name for q, name in names.items() if q in QUANTITIES and likeness(name, "", q) != 0
     }
-    used = Naming({**foreign, **naming.columns}, naming.units, naming.fs, naming.table)
-    group = next(iter(chosen.values())).group
-    notes = {**source.notes.get("", {}), **source.notes.get(group, {})}
+    used = Naming(
+        {**foreign, **naming.columns},
+        naming.units,
+        naming.fs,
+        naming.table,
+        covariates=naming.covariates,
+    )
     return ColumnTable(source, columns, notes, used)
 
 

@@ -22,6 +22,7 @@ from bwbayes.record.io.clocks import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
 from bwbayes.record.io.series import Clock
+from bwbayes.record.io.units import QUANTITIES
 
 _MINIMUM_SAMPLES = 10
 
@@ -74,9 +75,15 @@ def record_fields(
             raise table.error(problem, "displacement")
         _check_moving(table, "displacement", readings)
     held = kind == "command"
+    covariates = {
+        name: _without_gaps(table, grid, name, values.pop(name), held=False)
+        for name in table.columns
+        if name in values and name not in (*QUANTITIES, "truth")
+    }
     return {
         "displacement": None,
         **{name: grid.filled(column) for name, column in values.items()},
+        "covariates": covariates,
         "voltage": _without_gaps(table, grid, "voltage", values["voltage"], held),
         "interval": grid.interval,
         "start": grid.start,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -53,6 +53,7 @@ def read_record(
     fs: float | None = None,
     table: int | str | None = None,
     displacement_file: str | Path | None = None,
+    covariates: Mapping[str, str] | Sequence[str] | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -81,6 +82,9 @@ def read_record(
         One of several tables: number or sheet. Numbers count from 1.
     displacement_file : path
         The file with the displacement, if the record's has the voltage alone.
+    covariates : dict or list
+        Further columns that a model may see, by name: temperature_degC. A list names columns that
+        are called so.
 
     Raises
     ------
@@ -99,7 +103,7 @@ def read_record(
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
     other = None if displacement_file is None else Path(displacement_file)
-    naming = Naming(columns or {}, units or {}, fs, table, other)
+    naming = Naming(columns or {}, units or {}, fs, table, other, covariates or ())
     content = read_table(path, naming, needed)
     record = Record(**record_fields(content, voltage_is, need_displacement))
     truth_path = _truth_path(path)
@@ -263,7 +267,8 @@ def require_readable(record: Record, where: str) -> None:
     needed = QUANTITIES if need else ("time", "voltage")
     with warnings.catch_warnings():  # what would be taken as missing is as it is
         warnings.simplefilter("ignore", InputWarning)
-        record_fields(select(source, Naming(), needed), need_displacement=need)
+        naming = Naming(covariates=tuple(record.covariates))
+        record_fields(select(source, naming, needed), need_displacement=need)
 
 
 def _truth_path(path: Path) -> Path:

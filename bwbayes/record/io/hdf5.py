@@ -91,7 +91,7 @@ def record_arrays(record: Record) -> dict[str, Any]:
         "displacement_um": record.displacement,
         "truth_um": record.truth,
     }
-    return {name: values for name, values in arrays.items() if values is not None}
+    return {name: v for name, v in arrays.items() if v is not None} | dict(record.covariates)
 
 
 def record_notes(record: Record) -> dict[str, str | float]:
@@ -101,6 +101,7 @@ def record_notes(record: Record) -> dict[str, str | float]:
         "origin": record.origin,
         "interval_s": record.interval,
         "time_offset_s": record.time_offset,
+        "covariates": ", ".join(record.covariates),
     }
     return {name: value for name, value in notes.items() if value}
 

@@ -64,13 +64,14 @@ def _own(source: Source, naming: Naming, quantity: str) -> Naming:
     if quantity not in columns and len(others) == 1:
         columns[quantity] = others[0].name
     units = {q: unit for q, unit in naming.units.items() if q in ("time", quantity)}
-    return Naming(columns, units, naming.fs)
+    covariates = naming.covariates if quantity == "voltage" else ()
+    return Naming(columns, units, naming.fs, covariates=covariates)
 
 
 def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
     path, other = voltage.source.path, displacement.source.path
     reading = displacement.columns["displacement"]
-    columns = {q: voltage.columns[q] for q in ("time", "voltage") if q in voltage.columns}
+    columns = {q: c for q, c in voltage.columns.items() if q not in ("displacement", "truth")}
     samples, readings = columns["voltage"].values.size, reading.values.size
     if samples != readings and reading.clock is None:
         raise InputError(

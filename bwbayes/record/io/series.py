@@ -22,7 +22,7 @@ from bwbayes.errors import InputError, InputWarning, one_line
 
 MAXIMUM_SAMPLES = 10**8
 # What a file may say beside its numbers.
-NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s")
+NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s", "covariates")
 # What a number beside the series is called, in lower case, that is their rate, Hz, or the interval,
 # s: the power of it that is the rate.
 RATES = {

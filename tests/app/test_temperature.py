@@ -1,0 +1,152 @@
+"""An actuator whose gain follows a temperature that is recorded beside the voltage.
+
+The plant is simulated without the stage: the displacement of an actuator, multiplied.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import bwbayes as bw
+from bwbayes.app.config.config import load
+from bwbayes.app.config.keywords import config_of
+from bwbayes.app.problem.problem import resolve_config
+from bwbayes.arrays import FloatArray
+from bwbayes.model.actuator import Actuator
+from bwbayes.record.io.hdf5 import record_arrays
+
+INTERVAL, PER_KELVIN, REFERENCE = 0.02, 0.002, 22.0
+SLOW = np.arange(700) * INTERVAL
+
+
+def plant(voltage: FloatArray, temperature: FloatArray, seed: int) -> FloatArray:
+    """Return readings (samples,) with 0.1 um of noise of a loop that 15 K make 3% larger."""
+    actuator = Actuator("none", "first", INTERVAL)
+    values = {"d": 0.7, "alpha": 0.3, "beta": 0.04, "gamma": 0.01, "exponent": 1.0}
+    values |= {"initial": 0.0, "offset": 0.0}
+    theta = np.array([[values[name] for name in actuator.parameters]])
+    moved = actuator.displacement(theta, voltage, from_rest=True)[0]
+    noise = 0.1 * np.random.default_rng(seed).standard_normal(voltage.size)
+    return np.asarray(3.0 + moved * (1 + PER_KELVIN * (temperature - REFERENCE)) + noise)
+
+
+def measured(low: float, high: float, seed: int, period: float = 1.0) -> bw.Record:
+    """Return a record along which the temperature goes from low to high, degC."""
+    voltage = 80 * np.exp(-0.05 * SLOW) * np.sin(2 * np.pi * SLOW / period)
+    temperature = np.linspace(low, high, voltage.size)
+    return bw.Record.from_arrays(
+        voltage,
+        plant(voltage, temperature, seed),
+        interval=INTERVAL,
+        covariates={"temperature_degC": temperature},
+    )
+
+
+TRAINED = measured(15.0, 30.0, 1)
+
+
+@pytest.fixture(scope="module")
+def fit() -> Any:
+    keys = {"stages": ["temperature"], "from_rest": True, "ess": 400, "progress": False}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = bw.fit(TRAINED, dynamics="none", **keys)  # type: ignore[arg-type]
+    said = " ".join(str(w.message) for w in caught)
+    assert "loops and step responses leave out what temperature makes of temperature_degC" in said
+    return found
+
+
+def test_the_coefficient_is_inside_its_interval(fit: Any) -> None:
+    """One truth in a hundred is not, and one noise in a hundred shows no such coefficient."""
+    found = fit.flat_draws[:, fit.problem.posterior.names.index("temperature_gain")]
+    low, high = np.quantile(found, [0.005, 0.995])
+    assert low < PER_KELVIN < high
+    assert np.std(found) < 0.1 * PER_KELVIN
+
+
+def covered(bands: Any, record: bw.Record) -> float:
+    inside = bands.covers("sensor", 95, record.displacement)
+    return float(np.mean(inside[bands.scored_from :]))
+
+
+def test_a_next_record_at_another_temperature_is_covered(fit: Any) -> None:
+    """The twin that is told a wrong temperature is not."""
+    other = measured(29.0, 29.5, 2, 1.3)
+    wrong = replace(other, covariates={"temperature_degC": np.full(other.samples, 17.0)})
+    assert covered(fit.predict(other, from_rest=True), other) > 0.9
+    with pytest.warns(bw.InputWarning, match="another gain"):
+        assert covered(fit.predict(wrong, from_rest=True), wrong) < 0.5
+
+
+def test_a_temperature_beyond_those_of_training_is_said(fit: Any) -> None:
+    with pytest.warns(bw.InputWarning, match="temperature_degC of 38 to 39 exceeds the training"):
+        fit.predict(measured(38.0, 39.0, 3), from_rest=True)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda fit: fit.predict(replace(TRAINED, covariates={}), from_rest=True),
+        lambda fit: fit.predict(signal="step50"),
+        lambda fit: fit.predict(signal="step50", after=True),
+        lambda fit: fit.compensate("sine", amplitude=20, frequency=1),
+        lambda fit: fit.design("d"),
+        lambda fit: fit.export(),
+        lambda fit: fit.track(),
+    ],
+)
+def test_what_does_not_know_the_temperature_refuses_in_one_line(
+    fit: Any, ask: Callable[[Any], Any]
+) -> None:
+    with pytest.raises(bw.InputError, match=r"temperature_degC.*; ") as refused:
+        ask(fit)
+    assert "\n" not in str(refused.value)
+
+
+def test_both_engines_give_one_log_density() -> None:
+    config, records = config_of(TRAINED, {"stages": ["temperature"], "dynamics": "lag"})
+    posterior = resolve_config(config, Path(), records).posterior
+    theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 20))
+    one, other = (
+        replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("said", "shift"), [('["temperature_degC"]', 0.0), ('{ temperature_degC = "T2" }', 1.0)]
+)
+def test_a_config_names_the_column_of_a_covariate(said: str, shift: float, tmp_path: Path) -> None:
+    """As it is called, or otherwise; a problem's own files bring it along."""
+    temperature = TRAINED.covariates["temperature_degC"]
+    columns = record_arrays(TRAINED) | {"T2": temperature + 1}
+    pd.DataFrame(columns).to_csv(tmp_path / "bench.csv", index=False)
+    text = f"[record]\nfile = 'bench.csv'\ncovariates = {said}\n[model]\nstages = ['temperature']"
+    (tmp_path / "bench.toml").write_text(text, encoding="utf-8")
+    problem = resolve_config(load(tmp_path / "bench.toml"), tmp_path)
+    read = problem.records["record"]
+    np.testing.assert_allclose(read.covariates["temperature_degC"], temperature + shift)
+    fixed = {p.name: p.fixed for p in problem.posterior.prior.parameters}
+    assert fixed["temperature_reference"] == pytest.approx(22.5 + shift)
+
+
+def test_a_model_that_needs_a_covariate_is_refused_without(tmp_path: Path) -> None:
+    bare = replace(TRAINED, covariates={})
+    config, records = config_of(bare, {"stages": ["temperature"]})
+    with pytest.raises(bw.InputError, match=r"temperature_degC: .*; name its column in covariates"):
+        resolve_config(config, tmp_path, records)
+
+
+@pytest.mark.parametrize("suffix", ["h5", "csv", "mat"])
+def test_files_bring_covariates_back(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"record.{suffix}"
+    bw.write_record(TRAINED, path)
+    assert bw.read_record(path).sha256 == TRAINED.sha256
