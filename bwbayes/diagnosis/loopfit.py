@@ -114,9 +114,9 @@ def fit_loop(record: Record) -> LoopFit:
     undriven = (design[:, -2:] * coefficients[-2:]).sum(axis=1)
     driven = centered - undriven
     drift = undriven if times[which] > LONG_DECAY * elapsed[-1] else coefficients[-2] * trend_shape
-    moved = float(drift[-1] - drift[0])
     alone = np.column_stack([design[:, :-2], drift])
     among_alone = _products(alone, alone)
+    trend_share = _distinct(among_alone)
     followed = np.abs(_inverse(among_alone) @ _products(alone, slow)).sum(axis=1)
     lagged = basis[:, 1] - basis[:, 1].mean()
 
@@ -149,13 +149,17 @@ def fit_loop(record: Record) -> LoopFit:
         float(design[0, 4 + WIDTHS.size :] @ coefficients[4 + WIDTHS.size :])
         + coefficients[-2] / 2,
         _distinct(among),
-        moved,
-        _distinct(among_alone),
-        1 - float(np.var(residual) / max(np.var(driven), 1e-300)),
+        float(drift[-1] - drift[0]),
+        trend_share,
+        # A trend that loops imitate may be theirs, as where the voltage only rises.
+        1
+        - float(
+            np.var(residual) / max(np.var(driven), (1 - trend_share) * np.var(centered), 1e-300)
+        ),
         max(float(np.var(residual) - _white(residual)), 0.0) / max(np.var(centered), 1e-300),
         float(scipy.stats.f.sf(ratio, added, degrees)),
         abs(gain) * float(imitated[-1]),
-        abs(gain * moved) * float(followed[-1]),
+        abs(gain * (drift[-1] - drift[0])) * float(followed[-1]),
     )
 
 

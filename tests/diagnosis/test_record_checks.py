@@ -382,3 +382,12 @@ def test_readings_without_noise_are_named_and_those_with_some_are_not(step: floa
 
     assert len(findings("no noise", voltage, rounded(clean))) == 1
     assert [] == findings("no noise", voltage, rounded(clean + noise))
+
+
+def test_a_ramp_is_followed_though_a_trend_imitates_it() -> None:
+    """As its displacement is; one that swings while the voltage rises is not."""
+    time, generator = np.arange(1200) / 400, np.random.default_rng(11)
+    for displacement, is_found in [*[(10 * time, False)] * 12, (10 * np.sin(40 * time), True)]:
+        noisy = displacement + generator.normal(0.0, 0.03, time.size)
+        record = Record.from_arrays(20 * time, noisy, interval=1 / 400)
+        assert is_found == bool(findings_of("no relation", record))
