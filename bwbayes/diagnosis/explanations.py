@@ -8,6 +8,8 @@ keep them.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
@@ -51,14 +53,17 @@ LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *STAGES))))
 TIED = float(np.log(20))
 
 
-def explain(scene: ResidualAnalysis, watch: Watch = unwatched) -> tuple[Explanation, ...]:
+def explain(
+    scene: ResidualAnalysis, watch: Watch = unwatched, until: float = math.inf
+) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
     Only the first of them where the discrepancy takes up too little for any other to be worth more
     than :data:`LIMIT`, unless one of these is, so that all compete where a cause is named. Where
     the discrepancy is smooth, they are fitted beside a rough one first, then those beside the
     smooth one that are worth more than the limit there; each counts as the better fit. ``watch`` is
-    called with the share that is done.
+    called with the share that is done. No other one is begun after ``until`` s of the process's
+    CPU time.
     """
     best: dict[str, Explanation] = {}
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
@@ -71,6 +76,8 @@ def explain(scene: ResidualAnalysis, watch: Watch = unwatched) -> tuple[Explanat
             and scene.unexplained <= LIMIT
             and all(e.nats <= LIMIT for e in best.values())
         ):
+            break
+        if time.process_time() > until:
             break
         found = [] if rough is None else list(kind(rough))
         lead = 0.0 if rough is None else rough.lead

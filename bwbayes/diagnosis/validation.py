@@ -274,7 +274,7 @@ def validate_bands(
         )
     elif better is not None:
         parts = any(explanation.spec is not None for explanation in better_models(explanations))
-        remedy = "; --improve adds it" if parts else ", which no key of [model] adds"
+        remedy = '; stages = "auto" adds it' if parts else ", which no key of [model] adds"
         doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){remedy}")
     if standard.idle and not bands.training:
         doubts.append(standard.idle)

@@ -99,10 +99,12 @@ def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
 def test_a_records_run_is_what_the_run_command_makes(
     given: Path, whole: Path, tmp_path: Path
 ) -> None:
+    """But for a search for stages: all records of a campaign have the same model."""
     file = given / "records/s000.csv"
     text = CONFIG.replace("[record]", f'[record]\nfile = "{file}"')
+    config = parse(text, "alone").searched("none")
     alone = resume_run(
-        RunFolder.create(tmp_path / "alone", resolve_config(parse(text, "alone"), given)),
+        RunFolder.create(tmp_path / "alone", resolve_config(config, given)),
         small.quiet(),
         workers=1,
         files=False,

@@ -304,9 +304,9 @@ def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_
     """All but those of the columns, which it settles; the rate too."""
     path = tmp_path / "bench 3.csv"
     path.write_text(lines("amp,laser", *(row.partition(",")[2] for row in ROWS)))
-    given = ("--fs", "200", "--out", "my results", "--seed", "3", "--improve")
+    given = ("--fs", "200", "--out", "my results", "--seed", "3", "--search", "9s")
     said = bwbayes("run", str(path), "--column", "voltage=amp", *given).err
-    begin = f"copy and correct: bwbayes run '{path}' --out 'my results' --seed 3 --improve "
+    begin = f"copy and correct: bwbayes run '{path}' --out 'my results' --seed 3 --search 9s "
     assert begin in said
     assert "--column voltage=amp" in said
     assert said.rstrip().endswith("--fs 200")

@@ -222,7 +222,7 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
         "linear + creep + lag + white",
     ]
     first, second, third = models.values()
-    assert first == ModelConfig(dynamics="none", hold="first")
+    assert first == ModelConfig(dynamics="none", hold="first", stages=[])
     assert (second.hysteresis, second.thresholds) == ("maxwell-slip", 4)
     assert second.nonlinearity == ["quadratic", "cubic"]
     assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")

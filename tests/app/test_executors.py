@@ -187,7 +187,7 @@ def test_a_run_refuses_an_executor_before_its_map_estimate(
     """Nor does it take a new target, which the next one would have."""
     folder = small.begun(tmp_path / "run")
     before = folder.config.read_bytes()
-    monkeypatch.setattr("bwbayes.app.running.run.find_map", None)
+    monkeypatch.setattr("bwbayes.app.running.run.choose_model", None)
     with pytest.raises(InputError, match="'slurm' is unknown"):
         resume(folder, small.quiet(), executor="slurm", ess=50.0)
     assert before == folder.config.read_bytes()

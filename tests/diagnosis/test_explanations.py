@@ -197,7 +197,7 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
 def test_a_good_plant_has_no_cause_and_a_planted_one_is_found_among_all(
     kind: str, tmp_path: Path
 ) -> None:
-    """Runs that improve a model find them among all in the default suite too."""
+    """Runs that search for stages find them among all in the default suite too."""
     found = explain(scene(kind, 1, tmp_path, 5.0))
     causes = {cause.kind for cause in likely_causes(found)}
     assert causes & CAUSES[kind] if kind != "good" else not causes

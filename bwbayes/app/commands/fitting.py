@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
 
 from bwbayes.app.commands.shared import (
     FILE,
@@ -20,6 +19,7 @@ from bwbayes.app.commands.shared import (
     quiet_option,
     refuse_beside_config,
     resumable,
+    search_option,
     seed_option,
     show_report,
     working,
@@ -64,12 +64,16 @@ def init(record: Path, out: Path | None, **naming: Any) -> int:
 @click.option("--record", type=FILE, help="Check this record instead of the config's.")
 @naming_options
 @click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
-def check(config: Path, record: Path | None, out: Path | None, **naming: Any) -> int:
+@search_option
+def check(
+    config: Path, record: Path | None, out: Path | None, search: str | None, **naming: Any
+) -> int:
     """Check a CONFIG or record for issues and compute a MAP estimate; no sampling.
 
     Example: bwbayes check runs/measured_stack.toml --record my_record.csv
     """
     chosen, _ = _config_or_proposal(config, record, naming, "check", quiet=True)
+    chosen = chosen.searched(search)
     out = out or Path("results") / f"{config.stem}-check"
     with working() as watch:
         from bwbayes.app.jobs.check import check as check_config
@@ -86,6 +90,7 @@ def check(config: Path, record: Path | None, out: Path | None, **naming: Any) ->
 @naming_options
 @click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
 @seed_option
+@search_option
 @options_of(Verb("bwbayes.app.fit.calls:fit"))
 @quiet_option
 def run(
@@ -94,7 +99,7 @@ def run(
     out: Path | None,
     seed: int | None,
     overwrite: bool,
-    improve: bool,
+    search: str | None,
     workers: int | None,
     executor: str | None,
     quiet: bool,
@@ -110,7 +115,6 @@ def run(
     with open_figure_worker(workers) as figure_worker:
         with working():
             from bwbayes.app.problem.problem import resolve_config
-            from bwbayes.app.running.explaining import improve_model
             from bwbayes.app.running.folder import RunFolder
             from bwbayes.report.report import Report, remarks_banner
             from bwbayes.report.tables import priors_table
@@ -118,9 +122,7 @@ def run(
         chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
         chosen = chosen.renamed(path_text(config.stem), seed)
         path = out or Path("results") / config.stem
-        if improve:
-            RunFolder.require_free(path, overwrite)
-            chosen = improve_model(chosen, config.parent, Console(stderr=True, quiet=quiet))
+        chosen = chosen.searched(search)
         with working():
             problem = resolve_config(chosen, config.parent)
             folder = RunFolder.create(path, problem, overwrite)

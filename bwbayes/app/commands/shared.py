@@ -50,6 +50,9 @@ folder_argument = click.argument("folder", type=FILE)
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 quiet_option = click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 seed_option = click.option("--seed", type=RANGES["seed"], help="Seed, instead of the config's.")
+search_option = click.option(
+    "--search", help="Longest time of the search for stages, as 60s or 2min; none: no search."
+)
 
 
 def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:

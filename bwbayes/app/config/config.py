@@ -130,6 +130,19 @@ class Config(ConfigTable):
         changes = {"name": self.name or name} | ({} if seed is None else {"seed": seed})
         return self.model_copy(update=changes)
 
+    def searched(self, search: str | None) -> Config:
+        """Return the config with another longest time of the search for stages, if there is one.
+
+        Raises InputError: it is no time.
+        """
+        if search is None:
+            return self
+        try:
+            model = ModelConfig.model_validate(self.model.model_dump() | {"search": search})
+        except ValidationError:
+            raise InputError(f"--search: {search!r} is no time; write 60s, 2min or none") from None
+        return self.model_copy(update={"model": model})
+
     @property
     def records(self) -> Mapping[str, RecordConfig]:
         """The training records by name; one alone is called "record"."""

@@ -20,6 +20,7 @@ from bwbayes.model.spec import ModelSpec
 
 # Names go into file names.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]
+Duration = Annotated[str, StringConstraints(pattern=r"^(none|\d+(\.\d+)? ?(s|min))$")]
 NotNegative = Annotated[float, Field(ge=0)]
 Window = Annotated[list[float], Field(min_length=2, max_length=2)]
 # A single window stands for a list of one.
@@ -186,8 +187,10 @@ class ActuatorConfig(ConfigTable):
     """Whether the creep grows with the voltage; needs creep."""
     dynamics: str = key("lag", example='"second-order"')
     """The linear dynamics behind the hysteresis."""
-    stages: Texts = key([], example='["backlash"]')
-    """What else is between command and reading; see `bwbayes models`."""
+    stages: Literal["auto"] | Texts = key("auto", example='["backlash"]')
+    """What else is between command and reading, see `bwbayes models`; auto: what the record has
+    evidence for, in a search that may also add a nonlinearity, creep or other dynamics.
+    """
     passive: bool | None = key(None, example="false")
     """For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true)."""
     thresholds: int | list[float] | None = key(
@@ -202,7 +205,8 @@ class ActuatorConfig(ConfigTable):
     @property
     def spec(self) -> ModelSpec:
         """The model that it describes."""
-        return ModelSpec.from_keys(vars(self))
+        stages = () if self.stages == "auto" else self.stages
+        return ModelSpec.from_keys(vars(self) | {"stages": stages})
 
 
 class ModelConfig(ActuatorConfig):
@@ -212,6 +216,8 @@ class ModelConfig(ActuatorConfig):
     """What the voltage does between samples: straight lines (first), held (zero), or held if it is
     a command (auto).
     """
+    search: Duration = key("60s", example='"none"', called="improve")
+    """Longest time of the search for stages, as in 60s or 2min; none: no search."""
     noise: str = key("auto", example='"smooth"')
     """The model of the residual; auto: the one that the records have evidence for."""
     per_record: Texts = key([], example='["sensor_sd"]')
@@ -226,6 +232,13 @@ class ModelConfig(ActuatorConfig):
         """The model that it describes; where the noise is open, the one that claims least."""
         spec = super().spec
         return replace(spec, noise="discrepancy") if spec.noise == "auto" else spec
+
+    @property
+    def search_seconds(self) -> float:
+        """The longest time of the search for stages; 0 where there is none."""
+        if self.stages != "auto" or self.search == "none":
+            return 0.0
+        return float(self.search.rstrip(" mins")) * (60.0 if "min" in self.search else 1.0)
 
     def with_spec(self, spec: ModelSpec) -> Self:
         """Return the config of another model; what both have in common is said as it was."""

@@ -30,7 +30,6 @@ def fit(
     *,
     folder: str | Path | None = None,
     overwrite: bool = False,
-    improve: bool = False,
     workers: int | None = None,
     executor: Any = None,
     progress: bool = True,
@@ -50,8 +49,6 @@ def fit(
         Ctrl-C too, for :func:`resume`. By default nothing is left but the fit.
     overwrite
         Replace an existing run.
-    improve
-        Add the parts of the model that the record supports, one after the other, first of all.
     workers
         Ensembles side by side; default: all cores. The draws do not depend on it.
     executor
@@ -80,15 +77,11 @@ def fit(
     from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
     from bwbayes.app.problem.problem import resolve_config
     from bwbayes.app.running import run
-    from bwbayes.app.running.explaining import improve_model
     from bwbayes.app.running.folder import RunFolder
 
     config, where, records = _asked(record, keys, "fit")
     path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
-    if improve:
-        RunFolder.require_free(path, overwrite)
-        config = improve_model(config, where, console, records)
     problem = resolve_config(config, where, records)
     warn(problem.remarks, 3)
     result = run.resume(

@@ -188,7 +188,9 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config
-    problem = resolve_config(config.model_copy(update={"name": file.stem}), where)
+    # All have the same model.
+    model = config.model.model_copy(update={"search": "none"})
+    problem = resolve_config(config.model_copy(update={"name": file.stem, "model": model}), where)
     path = campaign.run(file.stem)
     if path.exists():
         try:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import explain_record, find_map, lines
+from bwbayes.app.running.explaining import choose_model, explain_record, lines
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
@@ -33,7 +33,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, point, why = find_map(resolve_config(config, folder), watch)
+    problem, point, steps, found = choose_model(resolve_config(config, folder), watch)
     posterior, seed = problem.posterior, config.seed
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
@@ -42,10 +42,11 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
-    for name in problem.records:
-        remarks += lines(
-            explain_record(problem, name, point.optima, partial(watch, "explanations"))
-        )
+    if found is None:
+        explaining = partial(watch, "explanations")
+        found = {n: explain_record(problem, n, point.optima, explaining) for n in problem.records}
+    for explanations in found.values():
+        remarks += lines(explanations)
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)
@@ -58,14 +59,12 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     about = [
         fact for subject, fact in problem.facts.items() if subject.startswith(("record", "start"))
     ]
-    about += [why] * bool(why)
+    about += steps
     pictures: list[Picture] = []
     for name, record in problem.records.items():
-        training, found = (
-            problem.posterior.for_record(name).single_record.training,
-            problem.findings[name],
-        )
-        drawn = record_pictures(record, training, found, name if several else "")
+        training = problem.posterior.for_record(name).single_record.training
+        issues = problem.findings[name]
+        drawn = record_pictures(record, training, issues, name if several else "")
         pictures += drawn.values()
     name = problem.config.name or problem.record.origin
     priors = priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True)))

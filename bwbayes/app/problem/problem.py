@@ -9,7 +9,7 @@ moved, continued and run again by itself.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,8 +42,9 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.study import Study, require_known
+from bwbayes.inference.study import Stated, Study, require_known
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.spec import ModelSpec
 from bwbayes.record import Record
 from bwbayes.sampling.plan import (
     SamplingPlan,
@@ -193,17 +194,35 @@ class Problem:
 
         As it is, if its config names a noise, or none is chosen yet.
         """
-        model = self.config.model
-        if model.noise != "auto" or chosen == "auto":
+        if self.config.model.noise != "auto" or chosen == "auto":
             return self
-        spec = replace(self.study.spec, noise=chosen)
-        config = with_model(self.config, spec, self.records)
-        named = config.model.model_copy(update={"noise": chosen})
-        config = config.model_copy(update={"model": named})
+        return self.with_model(replace(self.study.spec, noise=chosen), noise=chosen)
+
+    def with_model(
+        self,
+        spec: ModelSpec,
+        stated: Mapping[str, Stated] | None = None,
+        remarks: Sequence[str] = (),
+        **keys: object,
+    ) -> Problem:
+        """Return the problem of another model of the same readings.
+
+        ``stated`` is stated of new parameters, ``remarks`` are added to those of the records, and
+        ``keys`` are what [model] says from now on.
+        """
+        config = with_model(self.config, spec, self.records, stated)
+        changes: dict[str, object] = {"model": config.model.model_copy(update=keys)}
+        if remarks:
+            record = config.record
+            assert isinstance(record, RecordConfig)
+            noted = [*(record.remarks or []), *remarks]
+            changes["record"] = record.model_copy(update={"remarks": noted})
+        config = config.model_copy(update=changes)
         if spec != self.study.spec:
-            return _problem(config, self.study.with_model(spec), self.validations)
+            return _problem(config, self.study.with_model(spec, stated), self.validations)
         same = copy(self)  # with all that is known of it
         object.__setattr__(same, "config", config)
+        vars(same).pop("remarks", None)
         return same
 
     def windows(self, record: str) -> dict[str, tuple[slice, ...]]:

@@ -5,42 +5,37 @@ mode of the rough one, and taken if its evidence leads by odds of twenty to one:
 discrepancy claims least, because it has white noise as a limit, and corners that a smooth one has
 not. What another noise could gain shows in the rough one's innovations, which are cheap to look at.
 
-:func:`improve_model` gives a model the parts for which its record has evidence. Each round fits the
-model, explains its readings better in every way there is, and takes the stage that leads, if it is
-worth more than chance; then it leaves out again what was added and is not needed any more. None is
-added while the fit follows what the actuator did not do: no stage mends a transient.
+:func:`search_stages` gives a model the stages for which its record has evidence. None is added
+while the fit follows what the actuator did not do: no stage mends a transient.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
 
-from bwbayes.app.config.config import Config
-from bwbayes.app.problem.parameters import with_model
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.progress import StepProgress
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.model import without
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
-from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
-from bwbayes.record import Record
 from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 
-# Stages that a search adds at most if it has found the mechanism.
+# A search that has found the mechanism adds no more stages, and leaves no more discrepancy, in sds
+# of the sensor.
 MAX_STAGES = 3
+MAX_DISCREPANCY = 0.25
 
 
 def explain_record(
@@ -138,20 +133,37 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     return best, f"noise: {best} ({', '.join(against)})"
 
 
-def find_map(problem: Problem, watch: WatchSteps = unwatched) -> tuple[Problem, MAPEstimate, str]:
-    """Return a problem with the noise that it shows, its MAP estimate, and why it has that noise.
+class ChosenModel(NamedTuple):
+    """A problem with the model that its records have evidence for, and its MAP estimate.
 
-    The problem as it is, and no reason, if its config names a noise. ``watch`` is called with the
-    name of a step and the share of it that is done.
+    ``steps`` say what was chosen, a line each; ``explanations`` are what would still explain each
+    record's readings better, by its name, or None if that was not looked for to the end.
     """
-    point = _fit_point(problem, partial(watch, "MAP estimate"))
+
+    problem: Problem
+    point: MAPEstimate
+    steps: tuple[str, ...]
+    explanations: dict[str, tuple[Explanation, ...]] | None
+
+
+def choose_model(problem: Problem, watch: WatchSteps = unwatched) -> ChosenModel:
+    """Choose what a problem's config leaves open: further stages first, then the noise.
+
+    A config that names both is left as it is. ``watch`` is called with the name of a step and the
+    share of it that is done.
+    """
+    searched = search_stages(problem, watch)
     if problem.config.model.noise != "auto":
-        return problem, point, ""
+        return searched
+    problem, point = searched.problem, searched.point
     noise, why = chosen_noise(problem, point, partial(watch, "noise model"))
-    chosen = problem.with_noise(noise)
+    chosen, explanations = problem.with_noise(noise), searched.explanations
     if chosen.posterior is not problem.posterior:
-        point = _fit_point(chosen, partial(watch, f"MAP estimate, {noise} noise"))
-    return chosen, point, why
+        point, explanations = (
+            _fit_point(chosen, partial(watch, f"MAP estimate, {noise} noise")),
+            None,
+        )
+    return ChosenModel(chosen, point, (*searched.steps, why), explanations)
 
 
 def _fit_point(problem: Problem, watch: Watch) -> MAPEstimate:
@@ -159,27 +171,27 @@ def _fit_point(problem: Problem, watch: Watch) -> MAPEstimate:
     return map_estimate.fit(problem.posterior, source, watch)
 
 
-def improve_model(
-    config: Config, folder: Path, console: Console, records: Mapping[str, Record] | None = None
-) -> Config:
-    """Return a config with all stages that pay; progress goes to the console.
+def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenModel:
+    """Give a problem whose ``stages`` are ``auto`` all the stages that pay.
 
-    Config, folder and records are as :func:`~bwbayes.app.problem.problem.resolve` takes them.
-
-    Raises InputError: the config cannot be used, or several records are fitted.
+    Each round fits the model, explains its readings better in every way there is, and takes the
+    stage that leads; then it leaves out again what was added and is not needed any more. Several
+    records have none added: an explanation is one of a single record. Time is CPU time, so that a
+    busy machine finds the same.
     """
-    if len(config.records) > 1:
-        raise InputError("improve: is for one training record; improve a fit of one of them first")
-    notes = dict[str, str]()
+    begin, seconds = time.process_time(), problem.config.model.search_seconds
+    point = _fit_point(problem, partial(watch, "MAP estimate"))
+    if not seconds or len(problem.records) > 1:
+        return ChosenModel(problem, point, (), None)
+    (name,) = problem.records
+    notes, steps = dict[str, str](), list[str]()
     while True:
-        problem = resolve_config(config, folder, records)
-        (name,) = problem.records
-        with StepProgress(console, "searching for missing parts of the model ...") as watch:
-            point = _fit_point(problem, partial(watch, "MAP estimate"))
-            scene = _scene(problem, name, point.optima)
-            found = explain(scene, partial(watch, "explanations"))
-            # The last one has just been weighed.
-            needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
+        step = partial(watch, f"stages, round {len(steps) + 1}")
+        scene = _scene(problem, name, point.optima)
+        found = explain(scene, step, begin + seconds)
+        is_over = time.process_time() > begin + seconds
+        # The last one has just been weighed.
+        needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
         parts = likely_causes([cause for cause in found if cause.spec is not None])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
@@ -189,21 +201,36 @@ def improve_model(
             chosen, chain = parts[0], problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
-            notes[added] = f"model improved: {chosen.text} ({chosen.worth})"
-            note = f"added: {chosen.text}"
+            gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
+            notes[added], note = f"stage added: {gain}", f"added: {gain}"
         else:
             break
-        console.print(note, highlight=False, soft_wrap=True)
+        steps.append(f"{note}, {time.process_time() - begin:.0f} s")
         assert chosen.spec is not None
-        config = with_model(config, chosen.spec, problem.records, chosen.stated)
-    if not notes:
-        return config
+        problem = problem.with_model(chosen.spec, chosen.stated)
+        point = _fit_point(problem, partial(watch, "MAP estimate"))
+        if is_over:
+            break
+    if is_over:
+        steps.append(f"the search for stages ended after {seconds:g} s, before it was complete")
     remarks = [*notes.values()]
-    if len(notes) > MAX_STAGES:
+    discrepancy = _relative_discrepancy(problem, point)
+    if len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
         remarks.append(
-            f"{len(notes)} stages were added: many gains are no proof of a mechanism, and a drive "
-            "unlike the training record's may be missed"
+            "the search for stages may not have found the mechanism: the model error is still "
+            f"{discrepancy:.2g} times the sensor's noise, with {len(notes)} added; a drive unlike "
+            "the training record's may be missed"
         )
-    record = config.records[name]
-    noted = record.model_copy(update={"remarks": [*(record.remarks or []), *remarks]})
-    return config.model_copy(update={"record": noted})
+    spec = problem.study.spec
+    problem = problem.with_model(spec, remarks=remarks, stages=spec.keys["stages"])
+    return ChosenModel(problem, point, tuple(steps), None if is_over else {name: found})
+
+
+def _relative_discrepancy(problem: Problem, point: MAPEstimate) -> float:
+    """Return the sd of the discrepancy at a MAP estimate, in sds of the sensor; 0 without one."""
+    posterior = problem.posterior
+    theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
+    discrepancy, sensor = posterior.single_record.noise.marginal_sd(
+        posterior.single_record.table.noise(theta)
+    )
+    return float(discrepancy[0] / sensor[0])

@@ -151,6 +151,7 @@ class RunFolder(Folder):
     config = FileOf("config.toml")  # every choice an explicit number
     chain = FileOf("chain")  # a folder, which grows by a file a block
     backend = FileOf("chain.h5")  # the same as emcee stores it
+    search = FileOf("search.npz")  # what explains the readings better than the chosen model
     result = FileOf("result.npz")  # what was worked out of the chain
     summary = FileOf("summary.json")  # the numbers, written last of all
     replicates = FileOf("replicates.jsonl")  # of a calibration alone

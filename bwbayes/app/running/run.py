@@ -22,9 +22,9 @@ from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.draws import voltage_noise
-from bwbayes.app.running.explaining import find_map
+from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.figure_worker import FigureWorker
-from bwbayes.app.running.fingerprint import fingerprint, require_own, versions
+from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
@@ -138,13 +138,17 @@ def _open_chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists():
-        with StepProgress(console, "computing the MAP estimate ...") as watch:
-            problem, point, why = find_map(problem, watch)
+        given = problem.config
+        with StepProgress(console, "choosing the model ...") as watch:
+            problem, point, steps, explanations = choose_model(problem, watch)
             unsure = voltage_noise(problem, point, partial(watch, "noise on the voltage"))
         posterior, config = problem.posterior, problem.config
-        if why:  # the noise was chosen
-            console.print(why, highlight=False, soft_wrap=True)
+        for step in steps:
+            console.print(step, highlight=False, soft_wrap=True)
+        if config != given:
             _rewrite(folder, config)
+        if explanations is not None:
+            save(folder.search, fingerprint(problem), explanations)
         attributes: dict[str, str | int] = {
             "config": dump(config),
             "data_sha256": problem.sha256,

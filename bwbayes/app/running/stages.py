@@ -287,8 +287,12 @@ class Stages:
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
         """Return what may explain each record's readings better than the model, the best first."""
         from bwbayes.app.running.explaining import explain_record
+        from bwbayes.app.running.fingerprint import fingerprint, load
         from bwbayes.inference.map_estimate import distinct
 
+        # The search for stages ended with all of this.
+        if searched := load(self.folder.search, fingerprint(self.problem)):
+            return searched
         best = self.problem.posterior.prior.unconstrain(self.best)
         modes = distinct([*best, *self.chain.point.optima], self.chain.point.covariance)
         return {

@@ -7,6 +7,7 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,19 +22,18 @@ from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import chosen_noise, improve_model, lines
+from bwbayes.app.running.explaining import chosen_noise, lines, search_stages
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
+from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.errors import InputError, InputWarning
+from bwbayes.errors import InputWarning
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
 from tests.stand import autoregressive, play
 from tests.test_sampling_rates import records
-
-QUIET = Console(quiet=True)
 
 
 def config_of(kind: str, folder: Path) -> Config:
@@ -42,32 +42,41 @@ def config_of(kind: str, folder: Path) -> Config:
 
 
 def test_a_quadratic_gain_is_added(tmp_path: Path) -> None:
-    improved = improve_model(config_of("quadratic", tmp_path), tmp_path, QUIET)
-    assert "quadratic" in improved.model.nonlinearity
-    (note,) = improved.records["record"].remarks or [""]
-    assert re.match(r"model improved: quadratic.* nats, RMSE .* um\)$", note)
+    chosen = search_stages(resolve_config(config_of("quadratic", tmp_path), tmp_path))
+    model, record = chosen.problem.config.model, chosen.problem.config.records["record"]
+    assert "quadratic" in model.nonlinearity
+    note, *others = record.remarks or [""]
+    assert re.match(r"stage added: quadratic.* nats, RMSE .* um\)$", note)
+    # The plant has a discrepancy of its own, which no stage explains.
+    assert [other[:24] for other in others] == ["the search for stages ma"]
+    assert [step.partition(":")[0] for step in chosen.steps] == ["added"]
+    # It has been looked for what else there is, and nothing was found.
+    assert chosen.explanations is not None
+    assert not likely_causes(chosen.explanations["record"])
 
 
 @pytest.mark.slow
-def test_a_quadratic_gain_is_added_and_the_run_says_what_it_is_worth() -> None:
+def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -> None:
     record = plant("quadratic", (8, 1), 8.0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         fit = bw.fit(
             record,
-            improve=True,
+            folder=tmp_path / "run",
             from_rest=True,
             train=(0.0, 6.0),
             validation={"rest": (6.0, 8.0)},
             ess=500,
             progress=False,
         )
-    (note,) = [str(w.message) for w in caught if "model improved" in str(w.message)]
-    assert re.match(
-        r"model improved: quadratic.* nats, RMSE .* um, held out .* um\); set nonlinearity", note
-    )
+    (note,) = [str(w.message) for w in caught if "stage added" in str(w.message)]
+    assert re.match(r"stage added: quadratic.* nats, RMSE .* um, held out .* um\)$", note)
     assert "quadratic" in fit.problem.config.model.nonlinearity
     assert fit.validation["rest"].passed is not False
+    # The run that is opened has the same model, which is not searched again.
+    again = bw.open_run(tmp_path / "run")
+    assert again.problem.config.model.stages == []
+    assert again.problem.config.model.nonlinearity == fit.problem.config.model.nonlinearity
 
 
 @pytest.mark.parametrize("kind", [pytest.param("good", marks=pytest.mark.slow), "transient"])
@@ -75,15 +84,44 @@ def test_nothing_is_added_to_a_right_model_or_for_what_the_actuator_did_not_do(
     kind: str, tmp_path: Path
 ) -> None:
     """The twin: a transient of many nats, which parts of a model could follow."""
-    config = config_of(kind, tmp_path)
-    assert improve_model(config, tmp_path, QUIET) == config
+    problem = resolve_config(config_of(kind, tmp_path), tmp_path)
+    chosen = search_stages(problem)
+    assert chosen.steps == ()
+    assert chosen.problem.posterior is problem.posterior
+    assert chosen.problem.config.model.stages == []
 
 
-def test_several_records_are_refused_in_one_line(tmp_path: Path) -> None:
-    config_of("good", tmp_path)
-    record = RecordConfig(file="record.h5", from_rest=True)
-    with pytest.raises(InputError, match="improve: is for one training record"):
-        improve_model(Config(record={"first": record, "second": record}), tmp_path, QUIET)
+@pytest.mark.parametrize(
+    "keys", [{"stages": []}, {"stages": ["backlash"]}, {"search": "none"}, {"search": "0s"}]
+)
+def test_stages_that_are_named_are_not_searched(keys: dict[str, Any], tmp_path: Path) -> None:
+    """Nor is anything else added to them: a list, or no time, is the user's word."""
+    config = config_of("quadratic", tmp_path)
+    model = config.model.model_copy(update=keys)
+    problem = resolve_config(config.model_copy(update={"model": model}), tmp_path)
+    chosen = search_stages(problem)
+    assert chosen.problem is problem
+    assert chosen.explanations is None
+
+
+def test_a_search_ends_when_its_time_is_over(tmp_path: Path) -> None:
+    """It says so, what it found by then counts, and a run looks at the rest once more."""
+    config = config_of("quadratic", tmp_path)
+    model = config.model.model_copy(update={"search": "0.001s"})
+    chosen = search_stages(resolve_config(config.model_copy(update={"model": model}), tmp_path))
+    assert chosen.explanations is None
+    assert chosen.steps[-1].startswith("the search for stages ended after 0.001 s")
+
+
+def test_several_records_have_no_stage_added(tmp_path: Path) -> None:
+    config_of("quadratic", tmp_path)
+    parts = {"first": [[0.0, 3.0]], "second": [[3.0, 6.0]]}
+    files = {
+        name: RecordConfig(file="record.h5", from_rest=True, train=train)
+        for name, train in parts.items()
+    }
+    problem = resolve_config(Config(record=files), tmp_path)
+    assert search_stages(problem).problem is problem
 
 
 @given(st.floats(-5, 100), st.floats(0.01, 10), st.floats(0.1, 10))
@@ -97,6 +135,7 @@ def test_nothing_explains_better_that_misses_more(nats: float, rmse: float, rati
 # ``noise = "auto"`` is the one that a record has evidence for, and the run says so
 
 CONFIG = '[record]\nfile = "record.h5"\ntrain = [[0.0, 4.0]]\nfrom_rest = true\n'
+NOT_SEARCHED = f'{CONFIG}[model]\nsearch = "none"\n'
 
 
 def thinned(record: Record) -> Record:
@@ -194,7 +233,7 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
 
 def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
     write_record(thinned(records(2)[0]), tmp_path / "record.h5")
-    report = check(parse(CONFIG, "config"), tmp_path, tmp_path / "out")
+    report = check(parse(NOT_SEARCHED, "config"), tmp_path, tmp_path / "out")
     assert "noise: smooth (" in report.about
     page = (tmp_path / "out" / "check.html").read_text(encoding="utf-8")
     assert "discrepancy_quality" in page
@@ -202,7 +241,7 @@ def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
 
 def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     write_record(thinned(records(2)[0]), tmp_path / "record.h5")
-    config = parse(f'{CONFIG}[model]\nnoise = "auto"\n[sampling]\nsteps = 50\n', "config")
+    config = parse(f'{NOT_SEARCHED}noise = "auto"\n[sampling]\nsteps = 50\n', "config")
     folder = RunFolder.create(tmp_path / "run", resolve_config(config, tmp_path))
     console = Console(file=io.StringIO(), width=200)
     fit = resume(folder, console, workers=1, files=False)
