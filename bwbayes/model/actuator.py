@@ -390,13 +390,8 @@ class Actuator:
 
     def check(self, column: Mapping[str, FloatArray]) -> None:
         """Raise an InputError where a model is outside of the domain of a part."""
+        check(self.declarations, column)
         self.hysteresis.check(column)
-        self.filter.check(column)
-        for component in (self.nonlinearity, self.creep):
-            check(component.parameters if component else (), column, ("creep_growth",))
-        for stage in self.stages:
-            stage.check(column)
-        check((OFFSET,), column)
 
     def sections(self, column: Values) -> Sections:
         """Return dynamics and creep of models given by the columns (models,) of θ."""

@@ -91,6 +91,7 @@ class Creep:
             "growth of the creep from no voltage to the largest, as a part of it",
             lambda _: Distribution("halfnormal", {"scale": 1.0}),
             floor=0.0,
+            limit_at_floor=True,
         )
         return (*strengths, growth)
 

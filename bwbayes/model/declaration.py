@@ -11,7 +11,7 @@ states of other parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -108,6 +108,8 @@ class Declaration:
     floor
         No parameter may be lower; it lies above unless ``reaches_floor``. A positive parameter has
         a floor of zero.
+    limit_at_floor
+        Whether a model may be simulated on the floor, a limit that no posterior reaches.
     bounds
         Lower and upper bound (models,) given other parameters: those that come before it, and those
         that are fixed. There are none (:meth:`limits`) where one that it asks for is not known yet.
@@ -141,6 +143,7 @@ class Declaration:
     default: Callable[[Context], Distribution | float | None]
     floor: float = -math.inf
     reaches_floor: bool = False
+    limit_at_floor: bool = False
     bounds: Callable[[Values], tuple[ArrayLike, ArrayLike]] | None = None
     stated_bounds: str = ""
     pressed: Mapping[str, str] = field(default_factory=dict)
@@ -193,17 +196,12 @@ def positive(
     return replace(declared, **others)
 
 
-def check(
-    declared: Iterable[Declaration], column: Values, may_be_zero: Container[str] = ()
-) -> None:
-    """Raise an InputError where a column (models,) is not finite or below its floor.
-
-    Those that ``may_be_zero`` may be on a floor that others lie above: the model has that limit.
-    """
+def check(declared: Iterable[Declaration], column: Values) -> None:
+    """Raise an InputError where a column (models,) is not finite or below its floor."""
     for parameter in declared:
         values, floor = column[parameter.name], parameter.floor
         refuse(parameter.name, ~np.isfinite(values), values, "must be finite")
-        if parameter.reaches_floor or parameter.name in may_be_zero:
+        if parameter.reaches_floor or parameter.limit_at_floor:
             requirement = "must not be negative" if floor == 0 else f"must be at least {floor:g}"
             refuse(parameter.name, values < floor, values, requirement)
         else:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal
+from bwbayes.model.declaration import Context, Declaration, Values, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
 
@@ -36,13 +36,6 @@ class Filter(ABC):
     @abstractmethod
     def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:
         """Return the recursion of a number of ``models`` with these columns (models,)."""
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError that names the parameter where a model is outside of the domain.
-
-        A time constant or a damping may be zero: the recursion has that limit.
-        """
-        check(self.parameters, column, ("lag", "damping"))
 
 
 @dataclass(frozen=True)
@@ -68,6 +61,7 @@ class Lag(Filter):
             "time constant of the first-order lag",
             lambda context: lognormal(LAG * context.ranges.time, LAG_SIGMA),
             floor=0.0,
+            limit_at_floor=True,
             aliases=("tau", "time_constant"),
         ),
     )
@@ -97,6 +91,7 @@ class SecondOrder(Filter):
             description,
             default,
             floor=0.0,
+            limit_at_floor=name == "damping",
             aliases=(label,),
             without_default="a record shows mass and stiffness only through the damping",
         )

@@ -22,7 +22,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values, check
+from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.linear import ComplexArray, Hold
 from bwbayes.shown import brief
@@ -122,10 +122,6 @@ class Stage(ABC):
         more.
         """
         return self.settled(numbers, first)[1]
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError that names the parameter where a model is outside of the domain."""
-        check(self.parameters, column)
 
     def advance(
         self,

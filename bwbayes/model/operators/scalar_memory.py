@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, check, normal, positive
+from bwbayes.model.declaration import Context, Declaration, Values, normal, positive
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.step import OneStateStep
@@ -34,13 +34,6 @@ class StateMemory(NamedTuple):
 
 class OneState(Operator):
     """An operator that remembers the last voltage and one displacement in each model."""
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError that names the parameter where a model is outside of the domain.
-
-        d and β may be zero.
-        """
-        check(self.parameters, column, ("d", "beta"))
 
     def holds(self, column: Values) -> BoolArray:
         """Tell where α < d, or one of them is missing: there the initial curve rises."""
@@ -135,6 +128,7 @@ def d() -> Declaration:
         lambda ranges: 1.6 * ranges.slope,
         0.6,
         bounds=lambda earlier: (earlier["alpha"], np.inf),
+        limit_at_floor=True,
         aliases=("gain", "d33"),
     )
 
@@ -167,6 +161,7 @@ def beta(scale: float = 1.0, bounds: Bounds | None = None) -> Declaration:
         description,
         lambda ranges: scale / ranges.voltage,
         2.3,
+        limit_at_floor=True,
         bounds=bounds,
     )
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, check, lognormal, normal
+from bwbayes.model.declaration import Context, Declaration, Values, lognormal, normal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import ComplexArray, first_order_lag
 from bwbayes.model.stage import Side, Stage, Timing
@@ -51,10 +51,6 @@ class _Lag(Stage):
     def is_held(self, timing: Timing) -> bool:  # noqa: ARG002  # a displacement has no steps
         """Tell whether x stays the same until the next sample."""
         return False
-
-    def check(self, column: Values) -> None:
-        """Raise an InputError for a negative time constant; it may be zero."""
-        check(self.parameters, column, (self.parameters[0].name,))
 
     @staticmethod
     def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # whatever the lag
@@ -108,6 +104,7 @@ def _declared(name: str, label: str, whose: str, unit: str, range_: str) -> tupl
             f"time constant of the {whose}",
             lambda context: lognormal(0.02 * context.ranges.time, 1.5),
             floor=0.0,
+            limit_at_floor=True,
         ),
         Declaration(
             f"{name}_speed",
