@@ -6,8 +6,10 @@ import json
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,9 @@ import numpy as np
 import pytest
 
 import bwbayes
+from bwbayes.diagnosis import effects, explanations
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
+from bwbayes.inference import map_estimate
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.inference.noise import (
     DISCREPANCY_SD,
@@ -29,9 +34,13 @@ from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
 from bwbayes.model.operator import Span
 from bwbayes.model.spec import Extent, ModelSpec
+from bwbayes.record.io import formats
+from bwbayes.record.io.series import Source, array_source
 from bwbayes.record.true_values import true_values
 from bwbayes.sampling.moves import IndependenceMove
 from tests.app import small
+from tests.diagnosis.plants import plant
+from tests.prediction.runs import problem_of
 
 TEXT = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
@@ -99,6 +108,86 @@ def test_a_stage_of_ones_own_is_in_the_chain(
     command = inverse(made, theta[:1], displacement[:1], from_rest=True)
     again = made.displacement(theta[:1], command[0], from_rest=True)
     np.testing.assert_allclose(again, displacement[:1], rtol=0, atol=1e-8)
+
+
+def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its import path: along its first branch and the next, on both engines and back."""
+    head = (
+        "from dataclasses import dataclass\n"
+        "import numpy as np\n"
+        "from bwbayes.model.declaration import positive\n"
+        "from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema\n\n\n"
+    )
+    (tmp_path / "my_operator.py").write_text(head + example("my_operator.py"), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    spec = ModelSpec.from_keys({"hysteresis": "my_operator:TanhLoop", "dynamics": "none"})
+    made = spec.actuator(1e-3, "first", Extent(Span(-50.0, 50.0), 1e-3, 1.0))
+    assert made.parameters == ("d", "alpha", "width", "initial", "offset")
+    theta = np.array([[1.2, 9.0, 20.0, 0.0, 1.0], [0.8, 5.0, 35.0, 0.0, 0.0]])
+    voltage = np.concatenate([np.linspace(0, 50, 200), np.linspace(50, -20, 300)[1:]])
+
+    def branch(distance: np.ndarray) -> np.ndarray:
+        return theta[:, :1] * distance - theta[:, 1:2] * np.tanh(distance / theta[:, 2:3])
+
+    rising, falling = branch(voltage[:200]), branch((50 - voltage[200:]) / 2)
+    expected = np.concatenate([rising, rising[:, -1:] - 2 * falling], axis=1) + theta[:, 4:]
+    displacement = made.displacement(theta, voltage, from_rest=True)
+    np.testing.assert_allclose(displacement, expected, rtol=0, atol=1e-10)
+    compiled = walk(made, theta, Inputs(voltage, interval=1e-3), from_rest=True)(voltage.size)
+    np.testing.assert_allclose(compiled, expected, rtol=0, atol=1e-10)
+    command = inverse(made, theta[:1], displacement[:1], from_rest=True)
+    np.testing.assert_allclose(command[0], voltage, rtol=0, atol=1e-6)
+
+
+def test_a_format_of_ones_own_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the way of any file: by its content, with its units, and in one line where it is cut."""
+    names = {"Path": Path, "Source": Source, "array_source": array_source}
+    known: dict[str, Any] = {**names, "np": np, "struct": struct}
+    exec(example("my_reader.py"), known)
+    added = formats.Format(b"SCOPE1", ".scp", known["read_scope"])
+    monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, added))
+    voltage = np.float32(40 * np.sin(np.arange(300) / 20))
+    content = b"SCOPE1" + struct.pack("<d", 2e-3) + np.stack([voltage, 600 * voltage], 1).tobytes()
+    file = tmp_path / "record.bin"
+    file.write_bytes(content)
+    record = bwbayes.read_record(file)
+    assert (record.samples, record.interval) == (300, 2e-3)
+    np.testing.assert_array_equal(record.voltage, voltage)
+    np.testing.assert_allclose(record.displacement, 0.6 * record.voltage, rtol=1e-6)
+    file.write_bytes(content[:-3])
+    with pytest.raises(bwbayes.InputError, match=r"record.bin: damaged or cut off .*; write it"):
+        bwbayes.read_record(file)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5])
+def test_a_defect_of_ones_own_is_named_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: float
+) -> None:
+    """Before a vibration of any frequency, which has more to pay for; not in a good record."""
+    names = {"ResidualAnalysis": ResidualAnalysis, "add_shapes": effects.add_shapes, "np": np}
+    known: dict[str, Any] = {**names, "Iterator": Iterator, "Explanation": Explanation}
+    exec(example("my_defect.py"), known)
+    monkeypatch.setattr(
+        explanations, "ADDITIONS", (effects.oscillation, effects.drift, known["swaying_table"])
+    )
+    monkeypatch.setattr(explanations, "CHANGES", ())
+    record = plant("good", (5, 1), 4.0)
+    assert record.displacement is not None
+    swaying = record.displacement + size * np.sin(2 * np.pi * 2.7 * record.time)
+    bwbayes.write_record(replace(record, displacement=swaying), tmp_path / "record.h5")
+    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    rng = np.random.default_rng(1)
+    optima = map_estimate.fit(problem.posterior, rng).optima
+    ranked = explanations.explain(ResidualAnalysis.of(problem.posterior, optima, rng))
+    causes = explanations.likely_causes(ranked)
+    if size:
+        assert (causes[0].kind, ranked[0].kind) == ("swaying table", "swaying table")
+        (um,) = re.findall(r"table that sways by ([\d.]+) um", causes[0].text)
+        assert float(um) == pytest.approx(size, rel=0.2)
+    else:
+        assert not causes
 
 
 def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import h5py
@@ -37,10 +38,28 @@ from bwbayes.record.record import Record
 
 _TEXT = (".csv", ".txt")
 _BINARY = (".h5", ".hdf5", ".mat")
+
+
+class Format(NamedTuple):
+    """A kind of file: what its content begins with, the suffix of its names, and what reads it."""
+
+    mark: bytes
+    suffix: str
+    read: Callable[[Path], Source]
+
+
+# A line a format. HDF5, archives and text, which begin with anything, are told by `_reader`.
+FORMATS: tuple[Format, ...] = (
+    Format(b"\x93NUMPY", ".npy", read_numpy),
+    Format(b"MATLAB", ".mat", read_mat),
+    Format(b"TDSm", ".tdms", read_tdms),
+    Format(b"CDF", ".nc", read_netcdf),
+)
 # What a folder of records is searched for.
-SUFFIXES = (*_TEXT, *_BINARY, ".npy", ".npz", ".lvm", ".tdms", ".xlsx", ".gz", ".nc")
-# What files of a format begin with.
-_MARKS = {b"\x93NUMPY": read_numpy, b"MATLAB": read_mat, b"TDSm": read_tdms, b"CDF": read_netcdf}
+SUFFIXES = (
+    *(*_TEXT, ".h5", ".hdf5", ".npz", ".lvm", ".xlsx", ".gz"),
+    *(each.suffix for each in FORMATS),
+)
 
 
 def read_record(
@@ -164,7 +183,7 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
         raise InputError(f"{path}: is not a regular file; give one")
     try:
         with path.open("rb") as file:
-            begin = file.read(8)
+            begin = file.read(64)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from error
     try:
@@ -200,9 +219,9 @@ def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path
         return partial(read_workbook, table=table)
     if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
-    for mark, read in _MARKS.items():
-        if begin.startswith(mark):
-            return read
+    for known in FORMATS:
+        if begin.startswith(known.mark):
+            return known.read
     if suffix == ".mat":
         return read_mat
     if suffix in _BINARY:
