@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import bwbayes
+from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import effects, explanations
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate
@@ -128,8 +129,9 @@ def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
     theta = np.array([[1.2, 9.0, 20.0, 0.0, 1.0], [0.8, 5.0, 35.0, 0.0, 0.0]])
     voltage = np.concatenate([np.linspace(0, 50, 200), np.linspace(50, -20, 300)[1:]])
 
-    def branch(distance: np.ndarray) -> np.ndarray:
-        return theta[:, :1] * distance - theta[:, 1:2] * np.tanh(distance / theta[:, 2:3])
+    def branch(distance: FloatArray) -> FloatArray:
+        d, alpha, width = theta.T[:3, :, np.newaxis]
+        return np.asarray(d * distance - alpha * np.tanh(distance / width))
 
     rising, falling = branch(voltage[:200]), branch((50 - voltage[200:]) / 2)
     expected = np.concatenate([rising, rising[:, -1:] - 2 * falling], axis=1) + theta[:, 4:]
@@ -155,6 +157,7 @@ def test_a_format_of_ones_own_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     record = bwbayes.read_record(file)
     assert (record.samples, record.interval) == (300, 2e-3)
     np.testing.assert_array_equal(record.voltage, voltage)
+    assert record.displacement is not None
     np.testing.assert_allclose(record.displacement, 0.6 * record.voltage, rtol=1e-6)
     file.write_bytes(content[:-3])
     with pytest.raises(bwbayes.InputError, match=r"record.bin: damaged or cut off .*; write it"):

@@ -171,12 +171,21 @@ def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None
     assert (0.0, None) == (result["gamma"].fixed, result["gamma"].prior)
 
 
+def test_nothing_is_said_of_a_record_in_memory_that_stays_as_it_is(tmp_path: Path) -> None:
+    """Numbers that a file has for missing readings may be readings here."""
+    marked = np.tile(np.append(-9999.0, np.arange(49.0)), 8)
+    in_memory = {"record": replace(record(), displacement=marked)}
+    problem = resolve_config(parse(RECORD, "my.toml"), tmp_path, in_memory)
+    assert problem.record.sha256 == in_memory["record"].sha256
+    assert not any("taken as missing" in remark for remark in problem.remarks)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("train = [[0.0, 2.0], [1.0, 3.0]]", "overlaps the training window 0 to 2 s"),
         ("start = 3.0\nstop = 2.0", "holds no sample"),
-        ("decimate = 1000", "record: displacement_um: too few readings: 1;"),
+        ("decimate = 1000", "record: displacement: too few readings: 1;"),
         (
             "start = 1.0\ntrain = [[0.5, 0.9], [1.2, 2.0]]",
             "record.train: no readings from 0.5 to 0.89 s",
@@ -210,7 +219,7 @@ def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said
 @pytest.mark.parametrize(
     ("signal", "said"),
     [
-        ("amplitude = 1e-30, frequency = 1.0, duration = 3.0", "voltage_V: moves by "),
+        ("amplitude = 1e-30, frequency = 1.0, duration = 3.0", "voltage: moves by "),
         ("amplitude = 1.0, frequency = 1.0, duration = 1e12", "more than 10,000,000 samples"),
     ],
 )

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming, select
-from bwbayes.record.io.formats import require_readable
 from bwbayes.record.io.series import frame_source
 from bwbayes.record.io.units import power_of
 
@@ -439,11 +438,6 @@ def test_a_number_far_from_all_readings_that_is_repeated_is_a_missing_one(
     with pytest.warns(InputWarning, match=line):
         record = Record.from_arrays(**arrays, units={"displacement": unit})
     assert rows == np.flatnonzero(~record.has_reading).tolist()
-
-
-def test_nothing_is_said_of_a_record_in_memory_that_stays_as_it_is() -> None:
-    displacement = np.where(np.arange(200) % 50 == 7, -9999.0, DISPLACEMENT)
-    require_readable(Record(VOLTAGE, displacement, interval=0.01), "record")
 
 
 def test_a_number_that_may_be_a_reading_stays_one() -> None:

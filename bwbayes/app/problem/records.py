@@ -8,6 +8,7 @@ together before anything else is done with them, and the fit is that of the whol
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -21,11 +22,10 @@ from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationCo
 from bwbayes.app.problem.parameters import stand_of
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
-from bwbayes.errors import ColumnsError, InputError, suggestion
+from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
 from bwbayes.inference.study import place_of
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
-from bwbayes.record.io.formats import require_readable
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
@@ -109,9 +109,23 @@ def training_records(
             record = record.decimate(source.decimate)
         as_read = record is records[name] and not (source.missing or source.signal)
         if name in in_memory or not as_read:
-            require_readable(record, table)
+            _require_usable(record, table)
         records[name] = record
     return records, stand
+
+
+def _require_usable(record: Record, where: str) -> None:
+    """Refuse a record that was not read from a file, as one with its numbers would be."""
+    with warnings.catch_warnings():  # of numbers that a file has for missing readings
+        warnings.simplefilter("ignore", InputWarning)
+        Record.from_arrays(
+            record.voltage,
+            record.displacement,
+            interval=record.interval,
+            start=record.start,
+            covariates=record.covariates,
+            origin=where,
+        )
 
 
 def join_records(config: Config, records: Mapping[str, Record]) -> tuple[Config, dict[str, Record]]:
@@ -258,7 +272,7 @@ def validations_of(
             stand = stand_of(config, list(training.values()))
             record = _measured(stand, source.signal, generator(config.seed, f"record {name}"))
         if source.file is None or name in in_memory:
-            require_readable(record, table)
+            _require_usable(record, table)
         # Its hold is its own, unless given.
         hold = None if config.model.hold == "auto" else config.model.hold
         lead_in = source.lead_in, source.lead_in_start

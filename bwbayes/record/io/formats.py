@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,16 +22,16 @@ import h5py
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, InputWarning, refuse_unwritable
+from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.fields import record_fields, reference_fields
-from bwbayes.record.io.hdf5 import read_hdf5, record_arrays, write_hdf5
+from bwbayes.record.io.hdf5 import read_hdf5, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.record.io.netcdf import read_netcdf
 from bwbayes.record.io.pair import select_pair
-from bwbayes.record.io.series import Source, array_source, damaged, read_numpy
+from bwbayes.record.io.series import Source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
 
@@ -271,23 +270,6 @@ def write_record(record: Record, path: str | Path, *, mat_version: MatVersion = 
     for file, content in files.items():
         with refuse_unwritable(file), draft_of(file) as draft:
             write(content, draft)
-
-
-def require_readable(record: Record, where: str) -> None:
-    """Refuse a record that could be written to a file and not be read back.
-
-    Raises
-    ------
-    InputError
-        As for a file that is called ``where``.
-    """
-    source = array_source(where, record_arrays(record), notes={"interval_s": repr(record.interval)})
-    need = record.displacement is not None
-    needed = QUANTITIES if need else ("time", "voltage")
-    with warnings.catch_warnings():  # what would be taken as missing is as it is
-        warnings.simplefilter("ignore", InputWarning)
-        naming = Naming(covariates=tuple(record.covariates))
-        record_fields(select(source, naming, needed), need_displacement=need)
 
 
 def _truth_path(path: Path) -> Path:
