@@ -24,6 +24,9 @@ from bwbayes.watching import Watch, part, parts, unwatched, watched
 # Draws that are asked about each of many histories.
 FEW = 50
 
+# Draws that a lead-in leaves at least, in effect.
+EFFECTIVE = 100
+
 # Nodes of the grid of hysteretic states.
 NODES = 17
 
@@ -120,22 +123,24 @@ def choose_histories(
     theta: FloatArray,
     generator: np.random.Generator,
     watch: Watch = unwatched,
-) -> tuple[Histories, FloatArray]:
+) -> tuple[Histories, FloatArray, FloatArray]:
     """Choose every draw's history and state by what the lead-in says; return θ with the states.
 
-    Beforehand all histories are equally probable, and in each all :class:`States`. ``watch`` is
-    called with the share that is done.
+    Beforehand all histories are equally probable, and in each all :class:`States`. Beside them
+    comes the log evidence (draws,) of the lead-in for each draw, whatever its history and state.
+    ``watch`` is called with the share that is done.
     """
     draws, single = len(theta), len(likelihoods) == 1
     if single and not States(likelihoods[0], theta, single=True).open:
         which, quantile = np.zeros(draws, dtype=np.int64), np.zeros(draws)
+        evidence = np.nan_to_num(likelihoods[0].log_density(theta), nan=-np.inf)
     elif single or draws < 2 * FEW:
-        which, quantile, _ = _by_grids(likelihoods, theta, generator, watch=watch)
+        which, quantile, evidence = _by_grids(likelihoods, theta, generator, watch=watch)
     else:
-        which, quantile = _by_importance(likelihoods, theta, generator, watch)
+        which, quantile, evidence = _by_importance(likelihoods, theta, generator, watch)
     watch(1.0)
     histories = Histories(likelihoods, which)
-    return histories, histories.with_states(theta, quantile)
+    return histories, histories.with_states(theta, quantile), evidence
 
 
 def _by_grids(
@@ -174,13 +179,13 @@ def _by_importance(
     theta: FloatArray,
     generator: np.random.Generator,
     watch: Watch,
-) -> tuple[IntArray, FloatArray]:
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Draw histories and quantiles (draws,) from those that a few draws would draw.
 
     With the likelihood Lⱼ and the evidence Zⱼ of J of the draws, pairs that these have drawn in
     equal numbers have the density Σ Lⱼ / (J Zⱼ) beside the prior. So a draw with the likelihood L
-    takes one of those that are proposed to it with a weight of L / Σ (Lⱼ / Zⱼ). Draws that few
-    proposals suit are asked on grids of their own.
+    takes one of those that are proposed to it with a weight of L / Σ (Lⱼ / Zⱼ), and its evidence is
+    J times their mean. Draws that few proposals suit are asked on grids of their own.
     """
     draws = len(theta)
     few = np.arange(0, draws, draws // FEW)
@@ -211,18 +216,50 @@ def _by_importance(
     log_weight = density(rows, proposed) - pooled[proposed]
     watch(0.9)
     # Where none is possible all weights are zero.
-    weight = np.exp(log_weight - np.max(log_weight, axis=0, initial=-1e300))
+    best = np.max(log_weight, axis=0, initial=-1e300)
+    weight = np.exp(log_weight - best)
     total = np.cumsum(weight, axis=0)
+    with np.errstate(divide="ignore"):
+        evidence = best + np.log(few.size * total[-1] / len(weight))
     index = np.sum(total < uniform(generator, draws) * total[-1], axis=0)
     pick = proposed[index, np.arange(draws)]
     which, quantile = pool_which[pick], pool_quantile[pick]
     # Of effectively fewer than four proposals one in ten is beyond what a draw allows.
     uncovered = np.flatnonzero(~(total[-1] ** 2 > 4 * np.sum(weight**2, axis=0)))
     if uncovered.size:
-        which[uncovered], quantile[uncovered], _ = _by_grids(
+        which[uncovered], quantile[uncovered], evidence[uncovered] = _by_grids(
             likelihoods, theta[uncovered], generator
         )
-    return which, quantile
+    return which, quantile, evidence
+
+
+def weigh(evidence: FloatArray, generator: np.random.Generator) -> IntArray:
+    """Choose as many draws by their log evidence (draws,), some several times; return their rows.
+
+    A lead-in tells of what the training record left open, and evidence may single out a few draws:
+    then it counts by a power below one, with which the weights w leave (Σ w)² / Σ w² =
+    :data:`EFFECTIVE` draws, or all of fewer. So bands have enough of them, and are rather too wide.
+    """
+    draws, best = evidence.size, np.max(evidence)
+    if draws <= EFFECTIVE or not np.isfinite(best):
+        return np.arange(draws)
+
+    def effective(power: float) -> float:
+        weights = np.exp(power * (evidence - best))
+        return float(np.sum(weights) ** 2 / np.sum(weights**2))
+
+    low, power = 0.0, 1.0
+    if effective(power) < EFFECTIVE:
+        # Draws that are not possible never count.
+        high = power
+        for _ in range(50):
+            power = (low + high) / 2
+            low, high = (power, high) if effective(power) > EFFECTIVE else (low, power)
+    total = np.cumsum(np.exp(power * (evidence - best)))
+    # Evenly: of equal weights, each draw once.
+    levels = (np.arange(draws) + generator.uniform()) / draws
+    rows: IntArray = np.minimum(np.searchsorted(total, levels * total[-1]), draws - 1)
+    return rows
 
 
 def _grid(

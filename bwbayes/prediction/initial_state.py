@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
@@ -25,7 +25,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
-from bwbayes.prediction.histories import Histories, choose_histories, uniform
+from bwbayes.prediction.histories import Histories, choose_histories, uniform, weigh
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched
@@ -120,7 +120,8 @@ class InitialStates:
     (draws, parameters of the actuator) with initial state and offset; ``initial_transient`` (draws,
     unknowns) of the dynamics, um; ``offset_sd`` (draws,), um, what is unsure of the offset still;
     ``lead_in`` says how that went, if there is one, and ``scored_from`` is the first sample after
-    it; ``discrepancy`` is what its readings leave of the discrepancy, for a forecast.
+    it; ``discrepancy`` is what its readings leave of the discrepancy, for a forecast. ``rows`` are
+    the draws, of those that were given, that these have come from.
     """
 
     __repr__ = brief
@@ -132,6 +133,7 @@ class InitialStates:
     lead_in: LeadIn | None = None
     scored_from: int = 0
     discrepancy: DiscrepancyState | None = None
+    rows: IntArray | slice = slice(None)
 
     def displacement(self, inputs: Inputs) -> FloatArray:
         """Displacement (draws, samples) along inputs, um."""
@@ -209,12 +211,18 @@ def estimate_initial_states(
         typical = whole.table.actuator(np.mean(theta, axis=0)[np.newaxis])
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
-    histories, start_theta = choose_histories(likelihoods, theta, generator, part(watch, 0.0, 0.5))
+    histories, start_theta, evidence = choose_histories(
+        likelihoods, theta, generator, part(watch, 0.0, 0.5)
+    )
     # What stages do not know and what the hysteresis has been through is chosen in turns.
     for _ in range(SWEEPS if redrawn else 0):
         theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
-        histories, start_theta = choose_histories(likelihoods, theta, generator)
+        histories, start_theta, evidence = choose_histories(likelihoods, theta, generator)
+    rows = weigh(evidence, generator)
+    theta, start_theta = theta[rows], start_theta[rows]
+    histories = replace(histories, which=histories.which[rows])
     informed = _informed(histories, start_theta, record, window, generator)
+    informed = replace(informed, rows=rows)
     if not start.after:
         return informed
     return continue_discrepancy(informed, whole, theta, generator, part(watch, 0.5, 1.0))

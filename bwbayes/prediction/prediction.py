@@ -214,7 +214,7 @@ def predict_record(
     bands = _bands(
         name,
         posterior,
-        theta,
+        theta[start_states.rows],
         start_states,
         record,
         predicted_window,

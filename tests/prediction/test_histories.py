@@ -107,7 +107,7 @@ def test_histories_are_chosen_by_the_mean_of_their_likelihood() -> None:
         logs.append(one.log_density(one.table.replaced(theta, "initial", states)))
     weight = np.mean(np.exp(np.array(logs) - np.max(logs)), axis=1)
     expected = weight / np.sum(weight)
-    histories, _ = choose_histories(every, draws, np.random.default_rng(5))
+    histories, _, _ = choose_histories(every, draws, np.random.default_rng(5))
     got = np.bincount(histories.which, minlength=3) / len(draws)
     error = np.sqrt(expected * (1 - expected) / len(draws)) + 1e-3
     assert np.all(np.abs(got - expected) < 4 * error), (got, expected)
