@@ -25,6 +25,7 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.sampling.secant import SecantMap
 
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
@@ -293,7 +294,7 @@ class TotalRatioMap:
         return slopes
 
 
-type Map = TotalRatioMap | SkewMap | QuadraticMap
+type Map = TotalRatioMap | SkewMap | QuadraticMap | SecantMap
 
 
 def fit_maps(draws: FloatArray) -> list[Map]:

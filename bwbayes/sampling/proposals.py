@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -27,10 +27,19 @@ from bwbayes.sampling.curvature import (
     invert_maps,
     subsample,
 )
+from bwbayes.sampling.secant import SecantMap
 from bwbayes.shown import brief
 
+if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
+
 # By the name in a file, in the order in which they make coordinates straight.
-_MAPS: dict[str, type[Map]] = {"totals": TotalRatioMap, "skew": SkewMap, "bend": QuadraticMap}
+_MAPS: dict[str, type[Map]] = {
+    "secant": SecantMap,
+    "totals": TotalRatioMap,
+    "skew": SkewMap,
+    "bend": QuadraticMap,
+}
 
 
 @dataclass(frozen=True)
@@ -150,7 +159,7 @@ class StudentMixture:
         names = {kind: name for name, kind in _MAPS.items()}
         for map_ in self.maps:
             named = {f"{names[type(map_)]}_{f.name}": getattr(map_, f.name) for f in fields(map_)}
-            arrays |= {name: array for name, array in named.items() if array is not None}
+            arrays |= {n: array for n, array in named.items() if isinstance(array, np.ndarray)}
         return arrays
 
     @classmethod
@@ -165,6 +174,25 @@ class StudentMixture:
                 maps.append(kind(**stored))
         parts = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
         return cls(**parts, maps=tuple(maps))
+
+    def of_posterior(self, posterior: Posterior) -> StudentMixture:
+        """Return the mixture with maps that know what is sampled; a file does not keep it."""
+        known = [
+            replace(m, posterior=posterior) if isinstance(m, SecantMap) else m for m in self.maps
+        ]
+        return replace(self, maps=tuple(known)) if self.has_secant else self
+
+    @property
+    def has_secant(self) -> bool:
+        """Whether one of its maps asks the model: a :class:`SecantMap`."""
+        return any(isinstance(map_, SecantMap) for map_ in self.maps)
+
+    def behind(self, first: Map) -> StudentMixture:
+        """Return what tells a fit to put draws in line with another map first, of no modes."""
+        weights, centers, factors = self.weights[:1], self.centers[:1], self.factors[:1]
+        return replace(
+            self, weights=weights, centers=centers, factors=factors, maps=(first, *self.maps)
+        )
 
     @cached_property
     def _whitening(self) -> FloatArray:

@@ -28,7 +28,7 @@ that was interrupted goes on: it comes to the same end.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -55,6 +55,7 @@ from bwbayes.sampling.ensemble import advance, start
 from bwbayes.sampling.moves import pilot_moves, sampling_moves
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
+from bwbayes.sampling.secant import SecantMap, linear
 
 # Blocks before the first check, and how much longer the chain is at the next one at most, or at
 # least if it is not draws that are missing. A proposal is fitted again to so many more at least.
@@ -141,7 +142,8 @@ class _Sampling:
                 for blocks in history:
                     fitted_to.append("sampling", blocks)
                 thin = thinning(fitted_to.draws("sampling"))
-                proposal = _fitted(fitted_to, "sampling", slice(None), thin)
+                before = chain.proposal_in_use("sampling")
+                proposal = self._fitted(fitted_to, "sampling", slice(None), thin, before)
             chain.fall_back(len(history), proposal)
         return replace(outcome, remarks=_remarks(chain))
 
@@ -153,7 +155,7 @@ class _Sampling:
     def _extend(self, phase: Phase) -> None:
         """Advance every ensemble by a block, wherever the executor likes."""
         plan, chain = self.plan, self.chain
-        proposal = chain.proposal_in_use(phase)
+        proposal = _in_use(chain, phase, self.posterior)
         # Only where draws count has a step several tries.
         tries = plan.tries if phase == "sampling" else 1
         futures, ends = [], chain.ends
@@ -200,24 +202,44 @@ class _Sampling:
         a round fits again to what that round had begun with.
         """
         plan, chain = self.plan, self.chain
-        proposal = _fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
+        proposal = self._fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
         begin, end, rate = 0, 1, 0.0
         while rate < 0.5 and end <= 4:
             if chain.blocks("tuning") < end:
                 chain.freeze("tuning", proposal)
             while chain.blocks("tuning") < end:
                 self._extend("tuning")
-            proposal = _fitted(chain, "tuning", slice(begin * plan.block, end * plan.block))
-            # Which part of what the proposal proposed was accepted; 1 without one.
-            counts = [
-                block.moves.get("mixture", (0, 0))
-                for ensembles in chain.history("tuning")[begin:end]
-                for block in ensembles
-            ]
-            proposed, accepted = np.sum(counts, axis=0)
-            rate = float(accepted / proposed) if proposed else 1.0
+            now = slice(begin * plan.block, end * plan.block)
+            proposal = self._fitted(chain, "tuning", now, before=chain.proposals["tuning"])
+            rate = _accepted(chain.history("tuning")[begin:end], "mixture")
             begin, end = end, 2 * end
         chain.freeze("sampling", proposal)
+
+    def _fitted(
+        self,
+        chain: Chain,
+        phase: Phase,
+        steps: slice,
+        thin: int = 1,
+        before: StudentMixture | None = None,
+    ) -> StudentMixture | None:
+        """Fit a proposal to the draws of these steps of a phase, if they span the space.
+
+        Where fewer places of the one ``before`` it are taken than of differential evolution, whose
+        steps are small, it is fitted with slope and level for coordinates; and so are others then.
+        """
+        draws = chain.coordinates(phase, thin)[steps]
+        log_density = chain.log_density(phase, thin)[steps].ravel()
+        flat, guess = draws.reshape(-1, draws.shape[-1]), chain.proposals["pilot"]
+        made = chain.history(phase)[-(-steps.start // self.plan.block) if steps.start else 0 :]
+        lags = _accepted(made, "mixture") < _accepted(made, "differential evolution")
+        try:
+            if before and guess and linear(self.posterior) and (before.has_secant or lags):
+                place = flat[np.argmax(log_density)]
+                guess = guess.behind(SecantMap(place, self.posterior))
+            return StudentMixture.fitted(flat, log_density, guess)
+        except np.linalg.LinAlgError:
+            return None
 
     def _sampled(self) -> SamplingResult | None:
         """Sample to the end, or until the proposal turns out not to cover the draws: then None.
@@ -297,7 +319,7 @@ class _Judgment:
         self.draws = constrain_steps(posterior, coordinates)
         self.times = times(self.draws, self.thin)
         self.pareto_k: float | None = None
-        if (proposal := chain.proposal_in_use("sampling")) is not None:
+        if (proposal := _in_use(chain, "sampling", posterior)) is not None:
             density = chain.log_density("sampling", self.thin, blocks)
             self.pareto_k = pareto_k((density - proposal.log_density(coordinates)).ravel())
 
@@ -339,15 +361,17 @@ def _agree(draws: FloatArray) -> bool:
     return bool((nested_rhat(draws) < 1.1).all())
 
 
-def _fitted(chain: Chain, phase: Phase, steps: slice, thin: int = 1) -> StudentMixture | None:
-    """Fit a proposal to the draws of these steps of a phase, if they span the space."""
-    draws = chain.coordinates(phase, thin)[steps]
-    log_density = chain.log_density(phase, thin)[steps]
-    flat, guess = draws.reshape(-1, draws.shape[-1]), chain.proposals["pilot"]
-    try:
-        return StudentMixture.fitted(flat, log_density.ravel(), guess)
-    except np.linalg.LinAlgError:
-        return None
+def _accepted(history: Sequence[Sequence[Block]], move: str) -> float:
+    """Return which part of what a move proposed in blocks was accepted; 1 without any."""
+    counts = [block.moves.get(move, (0, 0)) for blocks in history for block in blocks]
+    proposed, accepted = np.sum(counts, axis=0) if counts else (0, 0)
+    return float(accepted / proposed) if proposed else 1.0
+
+
+def _in_use(chain: Chain, phase: Phase, posterior: Posterior) -> StudentMixture | None:
+    """Return the proposal that a phase goes on with, its maps those of the posterior."""
+    proposal = chain.proposal_in_use(phase)
+    return None if proposal is None else proposal.of_posterior(posterior)
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
