@@ -129,12 +129,8 @@ def reversed_sign(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 
 def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try u(t − δ), of either sign; δ is a fiftieth of the time between reversals, give or take.
-
-    Up to a quarter of a period it is told by loops: the model is fitted anew to readings that are
-    moved by whole samples, and compared with a fit of the same readings where they are.
-    """
-    scale = max(scene.turn_time / 50, scene.interval / scene.stride)
+    """Try u(t − δ), of either sign; δ is a fiftieth of the time between reversals, give or take."""
+    scale = _delay_scale(scene)
 
     def shifted(voltage: FloatArray, sizes: FloatArray) -> FloatArray:
         clock = scene.interval * np.arange(voltage.size)
@@ -142,13 +138,21 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
     fit = scene.extended(Effect(np.array([[-1.0], [0.0], [1.0]]), drive=shifted))
     yield _late(scene, scale * float(fit.sizes[0]), fit)
+
+
+def long_delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
+    """Try a delay up to a quarter of a period, which is told by loops.
+
+    The model is fitted anew to readings that are moved by whole samples, and compared with a fit of
+    the same readings where they are.
+    """
     record, limit = scene.posterior.single_record, min(0.55 * scene.turn_time, 0.2 * scene.duration)
     displacement_kept = np.full(record.displacement.size, np.nan)
     for window in record.training:
         displacement_kept[window] = record.displacement[window]
     late, _ = find_delay(Record(record.voltage, displacement_kept, interval=scene.interval), limit)
     rows = round(late / scene.interval)
-    if abs(late) < scale or not rows:
+    if abs(late) < _delay_scale(scene) or not rows:
         return
     displacement_kept[: max(rows, 0)] = displacement_kept[
         displacement_kept.size + min(rows, 0) :
@@ -162,6 +166,10 @@ def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:
     fit = climb(moved, map_estimate.local_minima(moved, scene.generator))
     cost = scene.lead + float(np.log(2 * limit / scene.interval))
     yield _late(before, rows * scene.interval, fit, cost)
+
+
+def _delay_scale(scene: ResidualAnalysis) -> float:
+    return max(scene.turn_time / 50, scene.interval / scene.stride)
 
 
 def _late(scene: ResidualAnalysis, late: float, fit: LocalFit, cost: float = 0.0) -> Explanation:

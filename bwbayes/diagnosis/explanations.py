@@ -36,6 +36,7 @@ ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.growing_noise,
 )
 CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
+    effects.long_delay,
     model.stages,
     model.nonlinearity,
     model.creep,
@@ -86,8 +87,9 @@ def explain(
             found = list(kind(scene))
         elif worth:
             found += kind(replace(scene, kinds=worth))
-        for explanation in sorted(found, key=lambda explanation: explanation.nats):
-            best[explanation.kind] = explanation
+        for explanation in found:
+            known = best.get(explanation.kind, explanation)
+            best[explanation.kind] = max(known, explanation, key=lambda either: either.nats)
         watch((number + 1) / len(kinds))
     ranked = _ranked(best.values())
     # A long record was looked at in parts: what leads has to lead on all of it.

@@ -10,16 +10,16 @@ with the curvature H of minus the log density at the mode z
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference import mode_finding
+from bwbayes.inference import map_estimate, mode_finding
 from bwbayes.inference.likelihood import Likelihood, batches
-from bwbayes.inference.mode_finding import NOISE_STEPS, Target
+from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
 from bwbayes.watching import Watch, unwatched
 
@@ -105,6 +105,14 @@ class LocalFit:
         """Whether it misses less than a constant would: else the noise takes up the readings."""
         return self.rmse < float(np.std(self.posterior.single_record.readings.values))
 
+    def distinct(self, places: Iterable[FloatArray]) -> FloatArray:
+        """Return where it is, and those places (free,) where the displacement is another one.
+
+        To those of its noise alone a climb finds back.
+        """
+        physical = Target(self.posterior).physical
+        return map_estimate.distinct([self.coordinates, *places], self.covariance, physical)
+
     def error(self, windows: Sequence[slice]) -> float:
         """Root mean square, um, of what it misses of the readings in windows; nan of none."""
         if not windows:
@@ -134,9 +142,7 @@ def climb(
     """
     target = _EffectTarget(posterior, effect)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
-    # An effect has many starts, and few of them lead far.
-    steps = NOISE_STEPS if effect is NONE else 2
-    state = mode_finding.climb(target, np.stack(starts), least, steps, watch)
+    state = mode_finding.climb(target, np.stack(starts), least, watch)
     covariance, log_determinant = target.covariance(state)
     return LocalFit(
         posterior,

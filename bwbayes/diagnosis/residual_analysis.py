@@ -131,7 +131,8 @@ class ResidualAnalysis:
         """Fit a posterior of one record once more, from its optima (optima, free).
 
         Something at the start of the record may have drawn the fit to an optimum that the rest of
-        it does not have: a fit of the rest says where else to start from.
+        it does not have: a fit of the rest says where else to start from, if it does not allow
+        that optimum.
         """
         theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
         whole, posterior = posterior, thin_posterior(posterior, theta, READINGS)
@@ -147,16 +148,19 @@ class ResidualAnalysis:
         first = int(rows[rows.size // 5])
         windows = posterior.single_record.training
         later = tuple(slice(max(w.start, first), w.stop) for w in windows if w.stop > first)
-        places = optima
+        best = max((climb(posterior, p) for p in optima), key=lambda fit: fit.log_evidence)
+        places = [*optima]
         try:
             shorter = posterior.altered(training=later)
-            best = climb(shorter, map_estimate.local_minima(shorter, generator))
-            places = np.concatenate([optima, best.coordinates[np.newaxis]])
+            of_rest = climb(shorter, map_estimate.local_minima(shorter, generator, 1))
         except InputError:
             pass  # the rest has too few readings for these priors
-        best = max((climb(posterior, p) for p in places), key=lambda fit: fit.log_evidence)
+        else:
+            if len(of_rest.distinct([best.coordinates])) > 1:
+                places.append(of_rest.coordinates)
+                best = max(best, climb(posterior, places[-1]), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
-        starts = map_estimate.distinct([best.coordinates, *places], best.covariance)
+        starts = best.distinct(places)
         held_out = thin_windows(held_out, stride_of(posterior, whole))
         return cls(best, whole, starts, generator, held_out, begin, study)
 
@@ -173,7 +177,7 @@ class ResidualAnalysis:
         posterior = self.rebuilt(study)
         rows = [self.posterior.names.index(name) for name in posterior.names]
         fit = climb(posterior, self.places[:, rows])
-        places = map_estimate.distinct([fit.coordinates, *self.places[:, rows]], fit.covariance)
+        places = fit.distinct(self.places[:, rows])
         return replace(self, fit=fit, places=places, study=study, before=self.fit)
 
     @property

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.mode_finding import Mode, Target, refine
@@ -257,15 +257,21 @@ def _distinct_minima(least_squares: LeastSquares, places: FloatArray) -> list[Fl
     return [places[i] for i in distinct]
 
 
-def distinct(places: list[FloatArray], covariance: FloatArray) -> FloatArray:
-    """Keep the places (free,) that lie more than an sd or so from those before them."""
+def distinct(
+    places: list[FloatArray], covariance: FloatArray, columns: IntArray | None = None
+) -> FloatArray:
+    """Keep the places (free,) that lie more than an sd or so from those before them.
+
+    In all coordinates, or in some ``columns`` of them.
+    """
+    columns = np.arange(len(covariance)) if columns is None else columns
     with warnings.catch_warnings():
         # A discrepancy of which a record shows nothing is far less sure than a gain.
         warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
-        inverse = scipy.linalg.inv(covariance)
+        inverse = scipy.linalg.inv(covariance[np.ix_(columns, columns)])
     distinct: list[FloatArray] = []
     for position in places:
-        distances = [(position - other) @ inverse @ (position - other) for other in distinct]
-        if all(distance > position.size for distance in distances):
+        away = [(position - other)[columns] for other in distinct]
+        if all(distance @ inverse @ distance > columns.size for distance in away):
             distinct.append(position)
     return np.stack(distinct)

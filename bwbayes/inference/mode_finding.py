@@ -22,8 +22,9 @@ from bwbayes.watching import Watch, unwatched, watched
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
 
-# Steps in the noise's coordinates a round.
-NOISE_STEPS = 6
+# Steps in the noise's coordinates a round, and of each of several climbs: few of their starts lead
+# far.
+NOISE_STEPS, FEW_NOISE_STEPS = 6, 2
 
 # Rounds from every start, and how many times what a round gained all later ones may gain.
 FIRST_ROUNDS, AHEAD = 2, 10.0
@@ -254,30 +255,33 @@ class Target:
 
 
 def climb(
-    target: Target,
-    starts: FloatArray,
-    least: float = -np.inf,
-    many_steps: int = NOISE_STEPS,
-    watch: Watch = unwatched,
+    target: Target, starts: FloatArray, least: float = -np.inf, watch: Watch = unwatched
 ) -> Iterate:
     """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
 
-    The one that leads after :data:`FIRST_ROUNDS` goes on alone, until it gains so little that it
-    would never reach a log density of ``least``. A round has ``many_steps`` in the noise's
-    coordinates while there are several. Where no start is possible, that is the state. ``watch``
-    is called with the share of the most rounds that is done.
+    The one that leads after :data:`FIRST_ROUNDS` goes on alone. Each ends where it gains so little
+    that it would never reach a log density of ``least``. Where no start is possible, that is the
+    state. ``watch`` is called with the share of the most rounds that is done.
     """
     initial_states = target.at(starts)
-    states = [state for state in initial_states if np.isfinite(state.density)]
-    for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch) if states else ():
-        ahead = target.round(states, many_steps if len(states) > 1 else NOISE_STEPS)
-        best = int(np.argmax([state.density for state in ahead]))
-        gain = ahead[best].density - states[best].density
-        states = ahead if number < FIRST_ROUNDS else [ahead[best]]
-        missing = least - ahead[best].density
-        if len(states) == 1 and gain < max(GAIN, missing / AHEAD):
+    climbing = [state for state in initial_states if np.isfinite(state.density)]
+    ended: list[Iterate] = []
+    for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch):
+        if not climbing:
             break
-    return max(states or initial_states, key=lambda state: state.density)
+        ahead = target.round(climbing, FEW_NOISE_STEPS if len(climbing) > 1 else NOISE_STEPS)
+        gains = [
+            state.density - before.density for state, before in zip(ahead, climbing, strict=True)
+        ]
+        if number == FIRST_ROUNDS:
+            best = int(np.argmax([state.density for state in ahead]))
+            ended += ahead
+            ahead, gains = [ahead[best]], [gains[best]]
+        climbing = []
+        for state, gain in zip(ahead, gains, strict=True):
+            leads = gain >= max(GAIN, (least - state.density) / AHEAD)
+            (climbing if leads else ended).append(state)
+    return max(ended + climbing or initial_states, key=lambda state: state.density)
 
 
 def refine(posterior: Posterior, coordinates: FloatArray, covariance: FloatArray) -> Mode:
