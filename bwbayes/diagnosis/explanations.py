@@ -62,31 +62,30 @@ def explain(
     Only the first of them where the discrepancy takes up too little for any other to be worth more
     than :data:`LIMIT`, unless one of these is, so that all compete where a cause is named. Where
     the discrepancy is smooth, they are fitted beside a rough one first, then those beside the
-    smooth one that are worth more than the limit there; each counts as the better fit. ``watch`` is
-    called with the share that is done. No other one is begun after ``until`` s of the process's
-    CPU time.
+    smooth one that are worth more than the limit there; each counts as the better fit. Other models
+    are fitted to the beginning of a record that is too long. ``watch`` is called with the share
+    that is done. No other one is begun after ``until`` s of the process's CPU time.
     """
     best: dict[str, Explanation] = {}
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
-    rough = scene.with_rough_noise()
+    looked_at, rough = scene, scene.with_rough_noise()
     kinds = ADDITIONS + CHANGES
     for number, kind in enumerate(kinds):
-        if (
-            number == len(ADDITIONS)
-            and scene.unexplained <= LIMIT
-            and all(e.nats <= LIMIT for e in best.values())
-        ):
-            break
         if time.process_time() > until:
             break
+        if number == len(ADDITIONS):
+            if scene.unexplained <= LIMIT and all(e.nats <= LIMIT for e in best.values()):
+                break
+            looked_at = scene.of_beginning()
+            rough = rough if looked_at is scene else looked_at.with_rough_noise()
         found = [] if rough is None else list(kind(rough))
         lead = 0.0 if rough is None else rough.lead
         worth = frozenset(cause.kind for cause in found if cause.nats + lead > LIMIT)
         if rough is None:
-            found = list(kind(scene))
+            found = list(kind(looked_at))
         elif worth:
-            found += kind(replace(scene, kinds=worth))
+            found += kind(replace(looked_at, kinds=worth))
         for explanation in found:
             known = best.get(explanation.kind, explanation)
             best[explanation.kind] = max(known, explanation, key=lambda either: either.nats)

@@ -18,8 +18,12 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.thinning import beginning
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
+
+# Samples of a long record that are made anew, after its voltage has been nearly everywhere.
+SAMPLES = 100_000
 
 # What is looked at: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
@@ -86,6 +90,8 @@ def check_predictions(
 ) -> PredictiveChecks:
     """Check the training readings of a record against replicated ones.
 
+    Of a long record its beginning, see :func:`~bwbayes.inference.thinning.beginning`.
+
     Parameters
     ----------
     posterior
@@ -99,6 +105,7 @@ def check_predictions(
     watch
         Called with the share that is done.
     """
+    posterior = beginning(posterior, SAMPLES)
     dataset = (
         posterior.single_record if record is None else posterior.for_record(record).single_record
     )

@@ -15,10 +15,18 @@ from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
+from bwbayes.inference.map_estimate import SAMPLES
 from bwbayes.inference.noise import SmoothNoise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study
-from bwbayes.inference.thinning import readings_at, stride_of, thin, thin_posterior, thin_windows
+from bwbayes.inference.thinning import (
+    beginning,
+    readings_at,
+    stride_of,
+    thin,
+    thin_posterior,
+    thin_windows,
+)
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
@@ -164,6 +172,18 @@ class ResidualAnalysis:
         held_out = thin_windows(held_out, stride_of(posterior, whole))
         return cls(best, whole, starts, generator, held_out, begin, study)
 
+    def of_beginning(self) -> ResidualAnalysis:
+        """Return the same of a long record's beginning, if the record cannot be thinned.
+
+        That shows what another model does. A short record's analysis is returned as it is.
+        """
+        if beginning(self.posterior, SAMPLES) is self.posterior:
+            return self
+        short = beginning(self.whole, SAMPLES)
+        return ResidualAnalysis.of(
+            short, self.places, self.generator, begin=self.begin, study=self.study
+        )
+
     def with_rough_noise(self) -> ResidualAnalysis | None:
         """Return the same with a rough discrepancy, if it has a smooth one; else none.
 
@@ -285,7 +305,9 @@ class ResidualAnalysis:
             theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
             held = readings_at(posterior, rebuilt, theta)
             readings = np.where(np.isfinite(readings), held, np.nan)
-        return posterior.altered(displacement=readings)
+        return posterior.altered(
+            displacement=readings, training=self.posterior.single_record.training
+        )
 
     def extended(
         self,

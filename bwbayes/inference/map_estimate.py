@@ -3,7 +3,7 @@
 Least squares from several prior draws finds the optima of the physical parameters, of residuals and
 of their steps; from the best ones the posterior's own modes follow by Newton steps, with all noise
 parameters. The curvature there is the Gaussian approximation: it starts the sampler and is never
-the answer itself. The modes of a long record are looked for in a thinned one.
+the answer itself. The modes of a long record are looked for in a thinned one, or in its beginning.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.mode_finding import Mode, Target, refine
-from bwbayes.inference.thinning import thin_posterior
+from bwbayes.inference.thinning import beginning, thin_posterior
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, parts, unwatched, watched
 
@@ -73,7 +73,7 @@ def fit(
     """
     # Drawn aside: what a short record is fitted from does not depend on them.
     probes = posterior.prior.theta(posterior.prior.draw(generator.spawn(1)[0], PROBES))
-    short = thin_posterior(posterior, probes, SAMPLES)
+    short = beginning(thin_posterior(posterior, probes, SAMPLES), SAMPLES)
     modes: list[Mode] = []
     if short is posterior:
         places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))
@@ -98,21 +98,15 @@ def local_minima(
 ) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
 
-    From so many starts: a few find the best of them, if not all. A long record is looked at until
-    its voltage has been nearly everywhere, and :data:`SAMPLES` on.
+    From so many starts: a few find the best of them, if not all. Of a long record the beginning is
+    looked at.
 
     Raises
     ------
     InputError
         As :func:`fit`.
     """
-    data = posterior.single_record
-    covered = np.maximum.accumulate(data.voltage) - np.minimum.accumulate(data.voltage)
-    everywhere = int(np.searchsorted(covered, 0.9 * covered[-1]))
-    last = max(everywhere, int(data.readings.rows[0])) + SAMPLES
-    if data.readings.samples > last:
-        windows = (slice(w.start, min(w.stop, last)) for w in data.training if w.start < last)
-        posterior = posterior.altered(training=tuple(windows))
+    posterior = beginning(posterior, SAMPLES)
     return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
 
 

@@ -4,7 +4,8 @@ The voltage keeps its reversals and is taken to go straight in between, so that 
 remembers what it remembers of the whole record. The error that is left is that of the drive's
 curvature between two samples. Where it is small beside a model's error, the modes of the thinned
 posterior are near those of the whole one, which a climb along all readings then reaches in a few
-steps.
+steps. A drive that is too fast to be thinned comes back soon: there the beginning of the record
+shows as much of the model (:func:`beginning`).
 """
 
 from __future__ import annotations
@@ -47,6 +48,24 @@ def thin_posterior(posterior: Posterior, theta: FloatArray, samples: int) -> Pos
                 break
             stride //= 2
     return posterior
+
+
+def beginning(posterior: Posterior, samples: int) -> Posterior:
+    """Return the posterior of the beginnings of its records, of those that are twice as long.
+
+    Until the voltage has been nearly everywhere, and so many samples on. A posterior of short
+    records is returned as it is.
+    """
+    windows, shorter = {}, False
+    for dataset in posterior.datasets:
+        covered = np.maximum.accumulate(dataset.voltage) - np.minimum.accumulate(dataset.voltage)
+        everywhere = int(np.searchsorted(covered, 0.9 * covered[-1]))
+        last = max(everywhere, int(dataset.readings.rows[0])) + samples
+        windows[dataset.name] = dataset.training
+        if dataset.readings.samples > max(last, 2 * samples):
+            cut = (slice(w.start, min(w.stop, last)) for w in dataset.training if w.start < last)
+            windows[dataset.name], shorter = tuple(cut), True
+    return posterior.trained(windows) if shorter else posterior
 
 
 def thin(dataset: Dataset, stride: int) -> Dataset:

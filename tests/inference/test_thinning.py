@@ -12,6 +12,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.thinning import (
+    beginning,
     displacement,
     readings_at,
     thin,
@@ -51,6 +52,35 @@ def test_the_voltage_is_one_that_the_record_has_nearby(voltage: FloatArray, stri
         assert value in nearby
         ahead = voltage[sample * stride]
         assert value == ahead or value in (nearby.min(), nearby.max())
+
+
+@given(
+    amplitudes=st.lists(st.floats(0.1, 50.0), min_size=1, max_size=9),
+    samples=st.integers(1, 60),
+    first=st.integers(0, 50),
+)
+def test_a_long_record_begins_until_its_voltage_has_been_nearly_everywhere(
+    amplitudes: list[float], samples: int, first: int
+) -> None:
+    """And so many samples on, with all of its readings there; a short one is whole."""
+    phase = 2 * np.pi * np.arange(40) / 40
+    voltage = np.concatenate([amplitude * np.sin(phase) for amplitude in amplitudes])
+    moved = np.random.default_rng(1).normal(size=voltage.size)
+    moved[:first] = moved[::5] = np.nan
+    windows = (slice(0, 25), slice(30, voltage.size))
+    actuator = Actuator("none", "first", INTERVAL)
+    whole = posterior_of(voltage, moved, actuator, "white", training=windows)
+    short = beginning(whole, samples)
+    before, after = (each.single_record.readings for each in (whole, short))
+    everywhere = next(
+        last for last in range(voltage.size) if np.ptp(voltage[: last + 1]) >= 0.9 * np.ptp(voltage)
+    )
+    last = max(everywhere, before.rows[0]) + samples
+    if before.samples <= max(last, 2 * samples):
+        assert short is whole
+        return
+    np.testing.assert_array_equal(after.rows, before.rows[before.rows < last])
+    np.testing.assert_array_equal(after.values, before.values[: after.rows.size])
 
 
 @given(
@@ -135,7 +165,7 @@ def test_what_is_searched_in_a_thinned_record_is_found_on_the_whole(
         return short
 
     monkeypatch.setattr(map_estimate, "SAMPLES", 500)
-    monkeypatch.setattr(map_estimate, "thinned", noted)
+    monkeypatch.setattr(map_estimate, "thin_posterior", noted)
     fast = map_estimate.fit(whole, np.random.default_rng(1))
     assert [500, 500] == searched
     sds = np.sqrt(np.diag(slow.covariance))
