@@ -19,7 +19,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate, mode_finding
 from bwbayes.inference.likelihood import Likelihood, batches
-from bwbayes.inference.mode_finding import Target
+from bwbayes.inference.mode_finding import NOISE_STEPS, Target
 from bwbayes.inference.posterior import Posterior
 from bwbayes.watching import Watch, unwatched
 
@@ -142,7 +142,9 @@ def climb(
     """
     target = _EffectTarget(posterior, effect)
     starts = [np.concatenate(pair) for pair in product(np.atleast_2d(places), effect.starts)]
-    state = mode_finding.climb(target, np.stack(starts), least, watch)
+    # An effect has many starts, and few of them lead far.
+    steps = NOISE_STEPS if effect is NONE else 2
+    state = mode_finding.climb(target, np.stack(starts), least, steps, watch)
     covariance, log_determinant = target.covariance(state)
     return LocalFit(
         posterior,

@@ -22,9 +22,8 @@ from bwbayes.watching import Watch, unwatched, watched
 # A round that gains less, nats, is the last one; and rounds at most.
 GAIN, ROUNDS = 0.05, 20
 
-# Steps in the noise's coordinates a round, and of each of several climbs: few of their starts lead
-# far.
-NOISE_STEPS, FEW_NOISE_STEPS = 6, 2
+# Steps in the noise's coordinates a round.
+NOISE_STEPS = 6
 
 # Rounds from every start, and how many times what a round gained all later ones may gain.
 FIRST_ROUNDS, AHEAD = 2, 10.0
@@ -255,13 +254,18 @@ class Target:
 
 
 def climb(
-    target: Target, starts: FloatArray, least: float = -np.inf, watch: Watch = unwatched
+    target: Target,
+    starts: FloatArray,
+    least: float = -np.inf,
+    many_steps: int = NOISE_STEPS,
+    watch: Watch = unwatched,
 ) -> Iterate:
     """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
 
     The one that leads after :data:`FIRST_ROUNDS` goes on alone. Each ends where it gains so little
-    that it would never reach a log density of ``least``. Where no start is possible, that is the
-    state. ``watch`` is called with the share of the most rounds that is done.
+    that it would never reach a log density of ``least``. A round has ``many_steps`` in the noise's
+    coordinates while there are several. Where no start is possible, that is the state. ``watch``
+    is called with the share of the most rounds that is done.
     """
     initial_states = target.at(starts)
     climbing = [state for state in initial_states if np.isfinite(state.density)]
@@ -269,7 +273,7 @@ def climb(
     for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch):
         if not climbing:
             break
-        ahead = target.round(climbing, FEW_NOISE_STEPS if len(climbing) > 1 else NOISE_STEPS)
+        ahead = target.round(climbing, many_steps if len(climbing) > 1 else NOISE_STEPS)
         gains = [
             state.density - before.density for state, before in zip(ahead, climbing, strict=True)
         ]
