@@ -192,7 +192,7 @@ def _config_or_proposal(
             "of numbers"
         ) from None
     config = proposal.config
-    tables = {key: naming[key] for key in ("columns", "units")}
+    tables = {key: naming[key] for key in ("columns", "units", "covariates")}
     init = f"bwbayes init {shlex.quote(str(path))}"
     for option, key in ("table", "table"), ("displacement", "displacement_file"):
         init += "" if naming[key] is None else f" --{option} {shlex.quote(str(naming[key]))}"

@@ -140,7 +140,7 @@ def predict(
         fit = open_converged(folder)
         try:
             options |= {"name": name, "estimate_offset": not same_offset, "watch": watch}
-            reading = {key: options.pop(key) for key in ("columns", "units", "fs")}
+            reading = {key: options.pop(key) for key in ("columns", "units", "fs", "covariates")}
             bands = predict_record(fit, record, reading=reading, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None

@@ -183,10 +183,11 @@ def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, An
 
     Raises InputError: they say something, and the command is given no ``file``.
     """
-    reading = {key: options.pop(key) for key in ("columns", "units", "fs", "table")}
+    keys = ("columns", "units", "fs", "covariates", "table")
+    reading = {key: options.pop(key) for key in keys}
     if file is None and any(value not in (None, {}) for value in reading.values()):
         context = click.get_current_context()
-        problem = "--column, --unit, --fs and --table are for a file"
+        problem = "--column, --unit, --covariate, --fs and --table are for a file"
         raise InputError(f"{context.info_name}: {problem}; give {flag}, or remove them")
     return reading
 
@@ -195,8 +196,9 @@ def refuse_beside_config(config: Path, reading: Mapping[str, Any]) -> None:
     """Refuse what says how a file is read beside a config, which says that itself."""
     if any(value not in (None, {}) for value in reading.values()):
         raise InputError(
-            f"{config}: --column, --unit, --fs, --table and --displacement are for a record; in "
-            "a config say columns, units, fs, table and displacement_file under [record]"
+            f"{config}: --column, --unit, --covariate, --fs, --table and --displacement are for a "
+            "record; in a config say columns, units, covariates, fs, table and displacement_file "
+            "under [record]"
         )
 
 

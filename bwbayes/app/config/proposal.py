@@ -130,7 +130,9 @@ def _text(
     source = f"file = {relative(path)}"
     if naming.displacement_file is not None:
         source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
-    for key, table in (("columns", naming.columns), ("units", naming.units)):
+    tables = {"columns": naming.columns, "units": naming.units}
+    tables["covariates"] = naming.covariate_columns
+    for key, table in tables.items():
         if table:
             pairs = ", ".join(
                 f"{quantity} = {quoted(column)}" for quantity, column in table.items()
