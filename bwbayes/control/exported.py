@@ -227,14 +227,15 @@ class Exported(Product):
         name = re.sub(r"\W", "_", stage.name)
         size = max(stage.remembers, 1)  # C has no empty arrays
         shapes = {"parameters": (len(numbers),), "memory": (size,), "after": (size,)}
-        functions: list[Callable[..., Any]] = [stage.settle, stage.move]
+        functions: list[Callable[..., Any]] = [stage.settle] * (stage.remembers > 0) + [stage.move]
         functions += [stage.undo] * (self.without_inverse is None)
         return {
             "name": name,
             "what": to_ascii(type(stage).__doc__ or "").split("\n\n")[0],
             "parameters": [*map(to_c_number, numbers[:, 0])],
             "size": size,
-            "settles": not stage.rate_independent,
+            "settles": stage.remembers > 0,
+            "keeps_path": stage.rate_independent and stage.remembers > 0,
             "at_rest": float(at_rest[0]),
             "functions": c_functions(functions, shapes, f"actuator_{name}_"),
         }

@@ -156,11 +156,11 @@ class SampledStage(NamedTuple):
 
     def settled(self, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) once they went to a value and settled, and the memory."""
-        memory = np.empty((self.stage.remembers, value.size))
+        numbers = self.numbers.T
         if not self.stage.rate_independent:
-            return self.stage.settle(self.numbers, value, memory), memory
-        self.stage.settle(self.numbers, self.at_rest, memory)
-        return self.step(memory, value)
+            result, memory = self.stage.settled(numbers, value)
+            return result, memory.T
+        return self.step(self.stage.settled(numbers, self.at_rest)[1].T, value)
 
     def step(self, memory: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) at a sample with a value, and the memory after it."""

@@ -18,7 +18,6 @@ import numpy as np
 from bwbayes.diagnosis import effects, model
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
-from bwbayes.model.registry import STAGES
 from bwbayes.watching import Watch, unwatched
 
 # A line an explanation: each yields what it finds of a fit. The first are small additions, which a
@@ -48,7 +47,7 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
 
 # Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
-LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *STAGES))))
+LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *model.SEARCHED))))
 
 # Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))

@@ -27,6 +27,10 @@ from bwbayes.model.declaration import lognormal
 from bwbayes.model.registry import HYSTERESIS, STAGES
 from bwbayes.model.spec import ModelSpec
 
+# Stages that are tried beside any model; those of a time are tried as effects.
+EFFECTS = ("moving-gain", "reversed-sign", "drift", "transient", "step", "oscillation")
+SEARCHED = {name: make for name, make in STAGES.items() if name not in EFFECTS}
+
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try quadratic and cubic terms of the voltage."""
@@ -65,7 +69,7 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
 def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try each stage before or behind the hysteresis that the model has not."""
     present = scene.study.spec.chain if scene.study is not None else ()
-    for name, make in STAGES.items():
+    for name, make in SEARCHED.items():
         stage, kind = make(), name.replace("-", " ")
         if name in present or not scene.posterior.single_record.inputs.has(stage.sees):
             continue

@@ -25,12 +25,14 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 from bwbayes.model.stage import Stage
+from bwbayes.model.stages.additions import Drift, Oscillation, Step, Transient
 from bwbayes.model.stages.backlash import Backlash
+from bwbayes.model.stages.gain import Heating, MovingGain, Temperature
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
+from bwbayes.model.stages.reversed_sign import ReversedSign
 from bwbayes.model.stages.saturation import Saturation
 from bwbayes.model.stages.sensor_curve import SensorCurve
 from bwbayes.model.stages.slew_limit import SlewLimit
-from bwbayes.model.stages.temperature import Temperature
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "bouc-wen": BoucWen,
@@ -68,9 +70,16 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
         SlewLimit,
         Saturation,
         Temperature,
+        Heating,
+        MovingGain,
         Backlash,
         SensorLag,
         SensorCurve,
+        ReversedSign,
+        Drift,
+        Transient,
+        Step,
+        Oscillation,
     )
 }
 

@@ -6,9 +6,9 @@ side what the sensor sees of the displacement:
     command > input stages > hysteresis, nonlinearity > dynamics, creep > output stages > + offset
 
 It is one class in one file. It declares its parameters, and says what it does with a sample:
-``settle`` at the first one, ``move`` at each of the next, and ``undo``, which is ``move`` the other
-way round, for commands. Each is written once: NumPy moves all models at once with it, compiled it
-moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
+``settle`` at the first one, if it has a memory, ``move`` at each of the next, and ``undo``, which
+is ``move`` the other way round, for commands. Each is written once: NumPy moves all models at once
+with it, compiled it moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
 (:mod:`bwbayes.control.codegen`); so it is made of what :mod:`bwbayes.model.elementwise` says.
 """
 
@@ -87,12 +87,13 @@ class Stage(ABC):
         return inputs.column(self.sees) if self.sees else None
 
     @staticmethod
-    @abstractmethod
     def settle(parameters: Any, value: Any, after: Any) -> Any:
         """Return what comes out once the stage is at rest at a value, and write its memory.
 
         Step of one model, whose parameters and memory are rows, or of all, (any, models).
+        What has no memory needs none: ``move`` says all.
         """
+        raise NotImplementedError
 
     @staticmethod
     @abstractmethod
@@ -107,6 +108,8 @@ class Stage(ABC):
     def settled(self, numbers: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models,) at rest at a value (models,), and the memory there."""
         memory = np.empty((self.remembers, value.size))
+        if not self.remembers:
+            return np.asarray(self.move(numbers.T, memory, value, memory)), memory.T
         return np.asarray(self.settle(numbers.T, value, memory)), memory.T
 
     def begin(

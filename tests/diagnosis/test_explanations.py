@@ -230,7 +230,7 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     """The twin: from the smooth one alone a fit of the cause does not lead as far."""
     monkeypatch.setattr(explanations, "ADDITIONS", (effects.drift,))
     monkeypatch.setattr(explanations, "CHANGES", (model.stages,))
-    monkeypatch.setattr(model, "STAGES", {"slew-limit": SlewLimit})
+    monkeypatch.setattr(model, "SEARCHED", {"slew-limit": SlewLimit})
     slow = scene("slew limit", 1, tmp_path, 5.0)
     found = explain(slow)
     beside_smooth = max(each.nats for each in model.stages(slow))

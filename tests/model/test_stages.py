@@ -7,6 +7,7 @@ inverse, a model at a controller's pace and its C file have to agree with the wh
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
-from bwbayes.model.declaration import Context
+from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
@@ -39,8 +40,8 @@ from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.model.registry import STAGES
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
+from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.saturation import Saturation
-from bwbayes.model.stages.temperature import Temperature
 from bwbayes.record.true_values import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -63,6 +64,20 @@ VALUES = {
     "sensor_half": 60.0,
     "temperature_gain": 2e-3,
     "temperature_reference": 24.0,
+    "heating": 0.04,
+    "heating_time": 0.2,
+    "heating_speed": 1000.0,
+    "heating_start": 0.4,
+    "gain_drift": 0.05,
+    "drift": 2.0,
+    "drift_curvature": -1.5,
+    "transient": 3.0,
+    "transient_time": 0.1,
+    "step": 2.5,
+    "step_time": 0.0505,
+    "oscillation_sine": 0.3,
+    "oscillation_cosine": -0.2,
+    "oscillation_frequency": 50.0,
 }
 # What is sought for a command, or runs a sample at a time, has no more than the voltage.
 COMMANDED = tuple(name for name, stage in STAGES.items() if not stage().sees)
@@ -71,6 +86,10 @@ MANY = tuple(name for name in COMMANDED if name != "slew-limit")
 every_stage = pytest.mark.parametrize("name", STAGES)
 every_commanded = pytest.mark.parametrize("name", COMMANDED)
 every_hold = pytest.mark.parametrize("hold", ["first", "zero"])
+
+
+def _events(stage: Stage) -> list[Declaration]:
+    return [declared for declared in stage.parameters if declared.scope == "event"]
 
 
 def drive(samples: int = 600, seed: int = 3) -> FloatArray:
@@ -110,30 +129,56 @@ def theta(made: Actuator, models: int = 3) -> FloatArray:
     return rows
 
 
-def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:  # noqa: PLR0911  # one a stage
+def _with_backlash(x: FloatArray) -> list[float]:
+    y = [float(x[0])]
+    for value in x.tolist():
+        y.append(min(max(y[-1], value - VALUES["backlash"]), value + VALUES["backlash"]))
+    return y[1:]
+
+
+def _with_slew_limit(x: FloatArray) -> list[float]:
+    y, most = [float(x[0])], VALUES["slew_limit"] * INTERVAL
+    for value in x.tolist():
+        y.append(y[-1] + min(max(value - y[-1], -most), most))
+    return y[1:]
+
+
+def _heat(command: FloatArray) -> list[float]:
+    """Heat by steps of a hundredth of a sample, of a drive that begins cold."""
+    heat, every = 0.0, [0.0]
+    for before, now in pairwise(command.tolist()):
+        for _ in range(100):
+            warming = abs(now - before) / INTERVAL / VALUES["heating_speed"] - heat
+            heat += INTERVAL / 100 / VALUES["heating_time"] * warming
+        every.append(heat)
+    return every
+
+
+def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     """Return what a stage at rest at the first value makes of values (samples,)."""
-    v = VALUES
-    match name:
-        case "backlash":
-            y = [float(x[0])]
-            for value in x.tolist():
-                y.append(min(max(y[-1], value - v["backlash"]), value + v["backlash"]))
-            return np.array(y[1:])
-        case "slew-limit":
-            y, most = [float(x[0])], v["slew_limit"] * INTERVAL
-            for value in x.tolist():
-                y.append(y[-1] + min(max(value - y[-1], -most), most))
-            return np.array(y[1:])
-        case "saturation":
-            c, r = v["saturation_middle"], v["saturation_reach"]
-            return np.asarray(c + r * np.tanh((x - c) / r))
-        case "temperature":
-            warmer = inputs_of(x).column("temperature_degC") - v["temperature_reference"]
-            return np.asarray(x * (1 + v["temperature_gain"] * warmer))
-        case "sensor-curve":
-            s = (x - v["sensor_middle"]) / v["sensor_half"]
-            a, b = v["sensor_quadratic"], v["sensor_cubic"]
-            return np.asarray(x + v["sensor_half"] * (a * (s**2 - 1) + b * (s**3 - s)))
+    v, inputs = VALUES, inputs_of(x)
+    t, warmer = inputs.time, inputs.column("temperature_degC") - v["temperature_reference"]
+    s = (x - v["sensor_middle"]) / v["sensor_half"]
+    middle, reach, phase = v["saturation_middle"], v["saturation_reach"], 2 * np.pi * 50.0 * t
+    of_name = {
+        "backlash": _with_backlash(x),
+        "slew-limit": _with_slew_limit(x),
+        "saturation": middle + reach * np.tanh((x - middle) / reach),
+        "temperature": x * (1 + v["temperature_gain"] * warmer),
+        "moving-gain": x * (1 + v["gain_drift"] * t),
+        "heating": x * (1 + v["heating"] * np.array(_heat(x))),
+        "sensor-curve": x
+        + v["sensor_half"] * (v["sensor_quadratic"] + v["sensor_cubic"] * s) * (s**2 - 1),
+        "reversed-sign": -x,
+        "drift": x + v["drift"] * t + v["drift_curvature"] * t**2,
+        "transient": x + v["transient"] * np.exp(-t / v["transient_time"]),
+        "step": x + v["step"] * (t >= v["step_time"]),
+        "oscillation": x
+        + v["oscillation_sine"] * np.sin(phase)
+        + v["oscillation_cosine"] * np.cos(phase),
+    }
+    if name in of_name:
+        return np.asarray(of_name[name])
     # A lag, four hundred steps between each two samples; of a held command the mean in between.
     lag, fine = v[name.replace("-", "_")], 400
     held = hold == "zero" and name == "amplifier-lag"
@@ -326,6 +371,18 @@ def test_a_stage_declares_priors_that_follow_the_record(name: str) -> None:
     assert stage.advice
     own = {declared.name for declared in stage.parameters}
     assert all(set(start) <= own | {"lag"} for start in stage.starts)
+
+
+@pytest.mark.parametrize("name", [n for n, stage in STAGES.items() if _events(stage())])
+def test_an_event_is_not_expected_of_the_next_record(name: str) -> None:
+    """There all that belongs to it is as where it has not happened, and nothing is left of it."""
+    stage, x = STAGES[name](), drive(120)
+    values = VALUES | {declared.name: declared.at_rest for declared in _events(stage)}
+    column = {one: np.array([value]) for one, value in values.items()}
+    numbers = stage.numbers_at(column, Timing(INTERVAL, "first"), inputs_of(x))
+    _, memory = stage.settled(numbers, x[:1])
+    result, _ = stage.advance(numbers, memory, x[np.newaxis], stage.seen(inputs_of(x)))
+    np.testing.assert_array_equal(result[0], x)
 
 
 def _extent() -> Extent:

@@ -50,12 +50,6 @@ class Saturation(Stage):
         return np.stack([column["saturation_middle"], column["saturation_reach"]], axis=1)
 
     @staticmethod
-    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # no memory
-        """Return y."""
-        middle, reach = parameters[0], parameters[1]
-        return middle + reach * np.tanh((value - middle) / reach)
-
-    @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
         """Return y."""
         middle, reach = parameters[0], parameters[1]

@@ -65,11 +65,6 @@ class SensorCurve(Stage):
         return np.stack([column[name] for name in names], axis=1)
 
     @staticmethod
-    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # no memory
-        """Return y."""
-        return bent(parameters, value)
-
-    @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
         """Return y."""
         return bent(parameters, value)
