@@ -38,7 +38,7 @@ class Extent(NamedTuple):
 
 
 class StageSpec(NamedTuple):
-    """A stage by name or import path, where it stands, and its options: pairs of name and value."""
+    """A stage by name or import path, where it stands, and its options, by a config's keys."""
 
     slot: Slot
     name: str
@@ -88,15 +88,14 @@ class ModelSpec:
     noise: str = "discrepancy"
 
     def __post_init__(self) -> None:
-        slots, names = get_args(Slot), [*TERMS, *STAGES]
+        slots, names = get_args(Slot), (*TERMS, *STAGES)
         places = [stage.place for stage in self.stages]
         for place in places:
             if places.count(place) > 1:
                 raise InputError(f"model: {place!r} is there twice; leave one out")
 
         def position(stage: StageSpec) -> tuple[int, int]:
-            is_known = stage.name in names
-            return slots.index(stage.slot), names.index(stage.name) if is_known else len(names)
+            return slots.index(stage.slot), (*names, stage.name).index(stage.name)
 
         chain = sorted((stage for stage in self.stages if stage.name != "none"), key=position)
         object.__setattr__(self, "stages", tuple(chain))
@@ -111,17 +110,16 @@ class ModelSpec:
             Something that no model can be.
         """
         keys = cls().keys | {key: value for key, value in said.items() if value is not None}
-        options = {name: said.get(name) for name in OPTIONS}
         stages = [
-            StageSpec.of("operator", keys["hysteresis"], options),
+            StageSpec.of(
+                "operator", keys["hysteresis"], {name: keys.get(name) for name in OPTIONS}
+            ),
             StageSpec("dynamics", keys["dynamics"]),
             *(StageSpec("nonlinearity", term) for term in keys["nonlinearity"]),
             *(StageSpec(_side_of(name), name) for name in keys["stages"]),
         ]
         if keys["creep"]:
-            times = None if keys["creep"] is True else keys["creep"]
-            options = {"times": times, "growing": keys["creep_growth"] or None}
-            stages.append(StageSpec.of("creep", "creep", options))
+            stages.append(_creep(keys["creep"], keys["creep_growth"]))
         elif keys["creep_growth"]:
             raise InputError("model.creep_growth: there is no creep; give creep = true with it")
         return cls(tuple(stages), keys["hold"], keys["noise"])
@@ -129,18 +127,16 @@ class ModelSpec:
     @property
     def keys(self) -> dict[str, Any]:
         """What a config's [model] says of it, by key; lists for tuples."""
-        creep = self._in("creep")
-        options = dict(creep[0].options) if creep else {}
         keys = {
             "hysteresis": self.operator.name,
-            "nonlinearity": [stage.name for stage in self._in("nonlinearity")],
-            "creep": options.get("times", bool(creep)),
-            "creep_growth": options.get("growing", False),
-            "dynamics": next((stage.name for stage in self._in("dynamics")), "none"),
+            "nonlinearity": self._in("nonlinearity"),
+            "creep": "creep" in self.chain,
+            "creep_growth": False,
+            "dynamics": "".join(self._in("dynamics")) or "none",
             "hold": self.hold,
             "noise": self.noise,
-            "stages": [stage.name for stage in self._in("input", "output")],
-            **dict(self.operator.options),
+            "stages": self._in("input", "output"),
+            **dict(option for stage in self.stages for option in stage.options),
         }
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in keys.items()
@@ -154,15 +150,15 @@ class ModelSpec:
     @property
     def operator(self) -> StageSpec:
         """The hysteresis operator."""
-        return self._in("operator")[0]
+        return next(stage for stage in self.stages if stage.slot == "operator")
 
     @property
     def chain(self) -> tuple[str, ...]:
         """Names of all stages, in the order of the signal's way."""
         return tuple(stage.name for stage in self.stages)
 
-    def _in(self, *slots: Slot) -> list[StageSpec]:
-        return [stage for stage in self.stages if stage.slot in slots]
+    def _in(self, *slots: Slot) -> list[str]:
+        return [stage.name for stage in self.stages if stage.slot in slots]
 
     def with_stages(self, *stages: StageSpec | str) -> Self:
         """Return the spec with further stages; those that the package has go by their names.
@@ -206,8 +202,7 @@ class ModelSpec:
         options = {name: getattr(operator, name, None) for name in OPTIONS}
         stages = [StageSpec.of("operator", self.operator.name, options)]
         if creep is not None:
-            options = {"times": creep.times, "growing": creep.growing or None}
-            stages.append(StageSpec.of("creep", "creep", options))
+            stages.append(_creep(creep.times, creep.growing))
         return self.with_stages(*stages)
 
     def actuator(self, interval: float, hold: Hold, extent: Extent) -> Actuator:
@@ -218,11 +213,9 @@ class ModelSpec:
         InputError
             A stage that does not exist, or an option that it does not have.
         """
-        keys, creep = self.keys, None
-        for stage in self._in("creep"):
+        keys, terms, times = self.keys, tuple(self._in("nonlinearity")), self.keys["creep"]
+        if times is True:
             times = creep_times(extent.shortest, extent.longest)
-            creep = Creep(**{"times": tuple(times), **dict(stage.options)}, reference=extent.span)
-        terms = tuple(keys["nonlinearity"])
         return Actuator(
             keys["dynamics"],
             hold if self.hold == "auto" else self.hold,  # type: ignore[arg-type]  # refuses others
@@ -235,7 +228,7 @@ class ModelSpec:
                 Operator,
             ),
             PolynomialNonlinearity(terms, extent.span) if terms else None,
-            creep,
+            Creep(tuple(times), keys["creep_growth"], extent.span) if times else None,
             extent.span,
             tuple(build_part("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
         )
@@ -252,8 +245,12 @@ class ModelSpec:
         return f"{', '.join(parts)}, dynamics {keys['dynamics']}, {self.hold} hold"
 
 
+def _creep(times: Any, growth: bool) -> StageSpec:
+    options = {"creep": None if times is True else times, "creep_growth": growth or None}
+    return StageSpec.of("creep", "creep", options)
+
+
 def _slot_of(name: str) -> Slot:
-    """Return where the stage of that name stands."""
     slots: dict[Slot, Any] = {
         "operator": HYSTERESIS,
         "nonlinearity": TERMS,

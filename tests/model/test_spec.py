@@ -29,7 +29,9 @@ def specs(draw: st.DrawFn) -> ModelSpec:
         spec = spec.with_stages(StageSpec.of("operator", "bouc-wen", {"passive": passive}))
     if draw(st.booleans()):
         times = draw(st.lists(st.floats(0.1, 1e3), min_size=1, max_size=3))
-        spec = spec.with_stages(StageSpec.of("creep", "creep", {"times": times, "growing": True}))
+        spec = spec.with_stages(
+            StageSpec.of("creep", "creep", {"creep": times, "creep_growth": True})
+        )
     return spec
 
 
