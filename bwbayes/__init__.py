@@ -14,7 +14,7 @@ of parameters::
 
 The names here are what a Python user needs; each is loaded when it is first used, so that
 ``import bwbayes`` costs nothing. ``notebooks/quickstart.ipynb`` shows them at work. All else is
-imported from its room: ``from bwbayes.calibration.replicates import run_replicates``.
+imported from its room: ``from bwbayes.model.actuator import Actuator``.
 """
 
 from __future__ import annotations

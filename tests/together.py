@@ -7,7 +7,6 @@ as many more of a single parameter would. Its errors come from the spread betwee
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy import linalg, stats
 
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
-from bwbayes.calibration.replicates import CalibrationSetup, Replicate, run_replicates
+from bwbayes.calibration.replicates import CalibrationSetup, Replicate, replicate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior
 
@@ -29,8 +28,8 @@ Plant = Callable[[FloatArray], FloatArray]
 
 def made(common: CalibrationSetup, count: int, seed: int = SEED) -> list[Replicate]:
     """Make so many replicates, on one thread."""
-    with one_thread(), ThreadPoolExecutor(1) as pool:
-        return list(run_replicates(common, seed, range(count), pool))
+    with one_thread():
+        return [replicate(common, seed, number) for number in range(count)]
 
 
 @dataclass(frozen=True)

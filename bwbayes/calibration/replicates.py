@@ -11,10 +11,10 @@ made; :mod:`bwbayes.calibration.evaluation` judges many of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import islice, repeat
+from itertools import repeat
 from typing import TypedDict
 
 import numpy as np
@@ -130,41 +130,6 @@ class Replicate:
 
     entry: Entry
     draws: FloatArray
-
-
-def run_replicates(
-    experiment: CalibrationSetup,
-    seed: int,
-    numbers: Iterable[int],
-    executor: Executor,
-    together: int = 1,
-) -> Iterator[Replicate]:
-    """Make the replicates of those numbers, and yield each as soon as it is done.
-
-    The executor may be any of ``concurrent.futures``; its kind and size do not change a bit of any
-    replicate.
-    """
-    return as_done(executor, together, replicate, ((experiment, seed, n) for n in numbers))
-
-
-def as_done[T](
-    executor: Executor,
-    together: int,
-    call: Callable[..., T],
-    arguments: Iterable[tuple[object, ...]],
-) -> Iterator[T]:
-    """Call a function with each of the arguments, and yield each result as soon as it is there.
-
-    Only so many ``together`` are under way, so that whoever stops waits for those alone.
-    """
-    waiting = iter(arguments)
-    running: set[Future[T]] = set()
-    while True:
-        running |= {executor.submit(call, *a) for a in islice(waiting, together - len(running))}
-        if not running:
-            return
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        yield from (future.result() for future in done)
 
 
 def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from bwbayes.calibration.replicates import (
     CalibrationSetup,
     Replicate,
     replicate,
-    run_replicates,
 )
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
@@ -44,11 +44,7 @@ def small(**changes: object) -> CalibrationSetup:
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:
     with ThreadPoolExecutor(2) as executor:
-        made = {
-            one.entry["number"]: one.entry
-            for one in run_replicates(small(), 1, [0, 1], executor, 2)
-        }
-    both = [made[0], made[1]]
+        both = [one.entry for one in executor.map(partial(replicate, small(), 1), [0, 1])]
     assert both[1] == replicate(small(), 1, 1).entry
     assert both[1]["truth"] != both[0]["truth"]
     assert both[1]["truth"] != replicate(small(), 2, 1).entry["truth"]

@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from itertools import islice
 from typing import Self
 
 import numpy as np
@@ -162,8 +163,6 @@ def batch[T](
     this ``kind`` that were there before. They go into processes, also with the compiled engine:
     most of their time goes into Python.
     """
-    from bwbayes.calibration.replicates import as_done  # noqa: PLC0415  # of no use to one run
-
     if not arguments:
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
@@ -171,7 +170,7 @@ def batch[T](
     with open_executor(count, executor=executor) as pool, ProgressLine(console) as line:
         line.show(f"{kind} {done} of {total}   ETA unknown")
         together = side_by_side(pool, workers, len(arguments))
-        for fresh, result in enumerate(as_done(pool, together, call, arguments), start=1):
+        for fresh, result in enumerate(_as_done(pool, together, call, arguments), start=1):
             yield result
             if label(result):
                 short[label(result)] += 1
@@ -181,3 +180,23 @@ def batch[T](
                 f"{kind} {done + fresh} of {total}   {60 * rate:.1f} a minute   "
                 f"ETA {_minutes((len(arguments) - fresh) / rate)}   {counts}"
             )
+
+
+def _as_done[T](
+    executor: Executor,
+    together: int,
+    call: Callable[..., T],
+    arguments: Iterable[tuple[object, ...]],
+) -> Iterator[T]:
+    """Yield each result as soon as it is there.
+
+    Only so many ``together`` are under way, so that whoever stops waits for those alone.
+    """
+    waiting = iter(arguments)
+    running: set[Future[T]] = set()
+    while True:
+        running |= {executor.submit(call, *a) for a in islice(waiting, together - len(running))}
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        yield from (future.result() for future in done)
