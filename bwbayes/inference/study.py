@@ -27,12 +27,10 @@ from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import OFFSET, Actuator
-from bwbayes.model.creep import MOST_TIMES, Creep
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
-from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Span
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
+from bwbayes.model.registry import PARTS
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.record import Record
 from bwbayes.shown import brief
@@ -311,16 +309,11 @@ def declarations_of(spec: ModelSpec, extent: Extent) -> tuple[Declaration, ...]:
 
 def every_declaration() -> Iterator[Declaration]:
     """Yield what all parts of the package declare, whatever the model."""
-    for operator in HYSTERESIS.values():
-        yield from operator().parameters
-    for dynamics in DYNAMICS.values():
-        yield from dynamics().parameters
+    for make in chain.from_iterable(makers.values() for makers in PARTS.values()):
+        yield from make().parameters
     for noise in NOISES.values():
         yield from noise(interval=1.0).declarations
-    for stage in STAGES.values():
-        yield from stage().parameters
-    creep = Creep(tuple(float(t) for t in range(1, MOST_TIMES + 1)), growing=True)
-    yield from (*PolynomialNonlinearity().parameters, *creep.parameters, OFFSET)
+    yield OFFSET
 
 
 def require_known(

@@ -9,10 +9,13 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from bwbayes.errors import InputError, suggestion
+from bwbayes.model.creep import Creep
 from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
+from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
@@ -81,6 +84,15 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
         Step,
         Oscillation,
     )
+}
+
+# All of these by the key of a config's [model] that chooses them, in the order of the signal's way.
+PARTS: Mapping[str, Mapping[str, Callable[..., Any]]] = {
+    "hysteresis": HYSTERESIS,
+    "nonlinearity": {name: partial(PolynomialNonlinearity, (name,)) for name in TERMS},
+    "creep": {"creep": partial(Creep, tuple(10.0**n for n in range(-2, 6)), growing=True)},
+    "dynamics": DYNAMICS,
+    "stages": STAGES,
 }
 
 

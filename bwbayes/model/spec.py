@@ -18,10 +18,10 @@ from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.linear import Hold
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES, build_part
+from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS, STAGES, build_part
 from bwbayes.model.stage import Side, Stage
 
-Slot = Literal["input", "operator", "nonlinearity", "dynamics", "creep", "output"]
+Slot = Literal["input", "hysteresis", "nonlinearity", "dynamics", "creep", "output"]
 """Where a stage stands; the slots are in the order of the signal's way."""
 
 
@@ -56,8 +56,8 @@ class StageSpec(NamedTuple):
 
     @property
     def place(self) -> str:
-        """What two stages of a chain cannot both have: the slot of operator or dynamics, a name."""
-        return self.slot if self.slot in ("operator", "dynamics") else self.name
+        """What no two stages of a chain have in common: hysteresis or dynamics, or their name."""
+        return self.slot if self.slot in ("hysteresis", "dynamics") else self.name
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ModelSpec:
     """
 
     stages: tuple[StageSpec, ...] = (
-        StageSpec("operator", "bouc-wen"),
+        StageSpec("hysteresis", "bouc-wen"),
         StageSpec("dynamics", "lag"),
     )
     hold: Hold | str = "auto"
@@ -112,7 +112,7 @@ class ModelSpec:
         keys = cls().keys | {key: value for key, value in said.items() if value is not None}
         stages = [
             StageSpec.of(
-                "operator", keys["hysteresis"], {name: keys.get(name) for name in OPTIONS}
+                "hysteresis", keys["hysteresis"], {name: keys.get(name) for name in OPTIONS}
             ),
             StageSpec("dynamics", keys["dynamics"]),
             *(StageSpec("nonlinearity", term) for term in keys["nonlinearity"]),
@@ -150,7 +150,7 @@ class ModelSpec:
     @property
     def operator(self) -> StageSpec:
         """The hysteresis operator."""
-        return next(stage for stage in self.stages if stage.slot == "operator")
+        return next(stage for stage in self.stages if stage.slot == "hysteresis")
 
     @property
     def chain(self) -> tuple[str, ...]:
@@ -200,7 +200,7 @@ class ModelSpec:
         """
         operator, creep = actuator.hysteresis, actuator.creep
         options = {name: getattr(operator, name, None) for name in OPTIONS}
-        stages = [StageSpec.of("operator", self.operator.name, options)]
+        stages = [StageSpec.of("hysteresis", self.operator.name, options)]
         if creep is not None:
             stages.append(_creep(creep.times, creep.growing))
         return self.with_stages(*stages)
@@ -251,13 +251,8 @@ def _creep(times: Any, growth: bool) -> StageSpec:
 
 
 def _slot_of(name: str) -> Slot:
-    slots: dict[Slot, Any] = {
-        "operator": HYSTERESIS,
-        "nonlinearity": TERMS,
-        "dynamics": DYNAMICS,
-        "creep": ("creep",),
-    }
-    return next((slot for slot, names in slots.items() if name in names), None) or _side_of(name)
+    slots = (slot for slot in get_args(Slot) if name in PARTS.get(slot, ()))
+    return next(slots, None) or _side_of(name)
 
 
 def _side_of(name: str) -> Side:

@@ -26,7 +26,7 @@ def specs(draw: st.DrawFn) -> ModelSpec:
     ).with_stages(*names, draw(st.sampled_from([*DYNAMICS])), draw(st.sampled_from([*HYSTERESIS])))
     if draw(st.booleans()):
         passive = draw(st.booleans())
-        spec = spec.with_stages(StageSpec.of("operator", "bouc-wen", {"passive": passive}))
+        spec = spec.with_stages(StageSpec.of("hysteresis", "bouc-wen", {"passive": passive}))
     if draw(st.booleans()):
         times = draw(st.lists(st.floats(0.1, 1e3), min_size=1, max_size=3))
         spec = spec.with_stages(
@@ -56,7 +56,7 @@ def test_a_stage_is_added_replaced_and_left_out(spec: ModelSpec, name: str) -> N
         assert added.without(name) == spec
     for operator in HYSTERESIS:
         other = added.with_stages(operator)
-        assert other.operator == StageSpec("operator", operator)
+        assert other.operator == StageSpec("hysteresis", operator)
         assert other == spec.with_stages(operator).with_stages(name)
     assert [stage for stage in added.chain if stage in STAGES] == [
         stage for stage in STAGES if stage in added.chain

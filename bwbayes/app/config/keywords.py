@@ -27,8 +27,7 @@ from bwbayes.app.config.keys import one_line, synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.nonlinearity import TERMS
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, OPTIONS, STAGES
+from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS
 from bwbayes.model.spec import ModelSpec, StageSpec
 from bwbayes.record.record import Record
 
@@ -178,12 +177,12 @@ def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
         if key not in OPTIONS:
             raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
     words = [term.strip() for term in others]
-    stages = [*TERMS, "creep", *DYNAMICS, *STAGES]
+    stages = [name for key in PARTS if key != "hysteresis" for name in PARTS[key]]
     for word in words:
         if word not in (*stages, *NOISES):
             hint = suggestion(word, [*stages, *NOISES])
             raise InputError(f"models: {name!r}: {word!r} is unknown; {hint}")
-    core = StageSpec.of("operator", operator, stated), StageSpec("dynamics", base.dynamics)
+    core = StageSpec.of("hysteresis", operator, stated), StageSpec("dynamics", base.dynamics)
     spec = ModelSpec(core).with_stages(*(word for word in words if word in stages))
     noise = " + ".join(word for word in words if word in NOISES)
     return dict.fromkeys(OPTIONS) | spec.keys | {"hold": base.hold, "noise": noise or base.noise}

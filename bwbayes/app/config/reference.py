@@ -19,32 +19,25 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.config.keys import ANY, Key, keys, synonyms
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.creep import Creep
+from bwbayes.model import registry
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
-from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
-from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES, build_part
+from bwbayes.model.registry import build_part
 from bwbayes.record.true_values import RING_BENDER
 from bwbayes.record.waveforms import signal_names
 
 Maker = Callable[..., Any]
 
-# The kinds of parts by the key that chooses them, in the order of the signal's way.
+# The kinds of parts by the key that chooses them.
 PARTS: Mapping[str, Mapping[str, Maker]] = {
-    "hysteresis": HYSTERESIS,
-    "nonlinearity": {name: partial(PolynomialNonlinearity, (name,)) for name in TERMS},
-    "creep": {"creep": partial(Creep, (0.1, 1.0, 10.0), growing=True)},
-    "dynamics": DYNAMICS,
-    "stages": STAGES,
+    **registry.PARTS,
     "noise": {name: partial(maker, interval=1e-3) for name, maker in NOISES.items()},
 }
 
 # What a text in a config may be, by its key's name, besides a choice of its own.
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "hysteresis": (*HYSTERESIS, "or module:Class"),
-    "nonlinearity": tuple(TERMS),
-    "dynamics": (*DYNAMICS, "or module:Class"),
-    "stages": (*STAGES, "or module:Class"),
+    "nonlinearity": tuple(PARTS["nonlinearity"]),
+    **{key: (*PARTS[key], "or module:Class") for key in ("hysteresis", "dynamics", "stages")},
     "noise": ("auto", *NOISES, "or module:Class"),
     "prior": (*(f"{n}({', '.join(a)})" for n, a in FAMILIAR.items()), "or one of scipy.stats"),
     "signal": signal_names(),
