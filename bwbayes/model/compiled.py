@@ -62,10 +62,6 @@ class FormulaType(types.Type):
 
     kind: Any
 
-    def __init__(self, name: str, *_: object) -> None:
-        # What an earlier version kept has the class, and a digest: found again by nobody.
-        super().__init__(name=str(name))
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Let what is kept on disk be found again by the class's name."""
         return FormulaType, (self.name,)

@@ -2,7 +2,8 @@
 
 What the likelihood does sample by sample, without its noise: the same stages, nonlinearity and
 dynamics, for ``LANES`` models side by side. Where stages before the hysteresis give each model a
-voltage of its own, hysteresis and nonlinearity are worked out one model after the other.
+voltage of its own, hysteresis and nonlinearity are worked out one model after the other. So are all
+stages: what stands behind the dynamics is seldom there, and not worth a place among the lanes.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
-from bwbayes.inference.compiled.passes import advance_stage, drive_of_own
 from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
 from bwbayes.model.actuator import Actuator, each_model
+from bwbayes.model.compiled import formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
-from bwbayes.model.stage import pass_stages
+from bwbayes.model.stage import Stage, pass_stages
+from bwbayes.model.step import HysteresisStep
 
 
 def walk(
@@ -58,7 +60,7 @@ def walk(
         if memories is None:
             memories = actuator.begin_outputs(column, moved[:, 0], piece, from_rest=from_rest)
         moved, memories = pass_stages(
-            actuator.outputs, column, moved, memories, piece, actuator.timing, advance_stage
+            actuator.outputs, column, moved, memories, piece, actuator.timing, _advance_stage
         )
         return moved + column["offset"][:, np.newaxis]
 
@@ -140,11 +142,11 @@ def _of_own(
 
     def advance(piece: Inputs, memories: Any) -> tuple[FloatArray, Any]:
         before, memory = memories
-        driven, before = actuator.pass_inputs(column, piece, before, advance_stage)
+        driven, before = actuator.pass_inputs(column, piece, before, _advance_stage)
         if step is None:
             drive, memory = actuator.drive(column, driven, memory)
         else:
-            drive, memory = drive_of_own(step, memory, driven)
+            drive, memory = _drive_of_own(step, memory, driven)
             if actuator.nonlinearity is not None:
                 drive += actuator.nonlinearity.displacement(column, driven)
         return drive, (before, memory)
@@ -177,3 +179,66 @@ def _walk(
             for i in range(models):
                 for t in range(now, end):
                     displacement[group * LANES + i, t - first] = drive[(t - now) * LANES + i]
+
+
+def _advance_stage(
+    stage: Stage,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    seen: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what :meth:`~bwbayes.model.stage.Stage.advance` does."""
+    result, after = np.empty(values.shape), memory.copy()
+    seen = np.empty(0) if seen is None else seen.copy()  # of one type, for which one is compiled
+    _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)
+    return result, after
+
+
+def _drive_of_own(
+    step: HysteresisStep, memory: FloatArray, voltage: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the drive (models, samples), um, along voltages (models, samples), V.
+
+    And what the step remembers after them, (models, any), as ``memory`` is before.
+    """
+    drive, after = np.empty(voltage.shape), memory.copy()
+    _step(step, step.parameters, after, np.ascontiguousarray(voltage), drive)
+    return drive, after
+
+
+@compile_cached()
+def _pass(
+    stage: Stage,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    seen: FloatArray,
+    result: FloatArray,
+) -> None:
+    """Write what comes out of values, and move the memory on."""
+    after = np.empty(memory.shape[1])
+    for i in range(values.shape[0]):
+        for t in range(values.shape[1]):
+            if seen.size > 0:
+                numbers[i, -1] = seen[t]
+            result[i, t] = formula(stage, numbers[i], memory[i], values[i, t], after)
+            for k in range(after.size):
+                memory[i, k] = after[k]
+
+
+@compile_cached()
+def _step(
+    step: HysteresisStep,
+    parameters: FloatArray,
+    memory: FloatArray,
+    voltage: FloatArray,
+    drive: FloatArray,
+) -> None:
+    """Write the drive along voltages, and move the memory on."""
+    after = np.empty(memory.shape[1])
+    for i in range(voltage.shape[0]):
+        for t in range(voltage.shape[1]):
+            drive[i, t], _ = formula(step, parameters[i], memory[i], voltage[i, t], after)
+            for k in range(after.size):
+                memory[i, k] = after[k]
