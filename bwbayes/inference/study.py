@@ -26,7 +26,7 @@ from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.model.actuator import OFFSET, Actuator
+from bwbayes.model.actuator import OFFSET
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
@@ -183,7 +183,7 @@ class Study:
                 training.record.inputs,
                 training.displacement,
                 training.windows,
-                actuator_for(self.spec, training.record, self.extent),
+                self.spec.actuator(training.record.interval, training.record.hold, self.extent),
                 noise_model(self.spec.noise, training.record.interval),
                 training.from_rest,
                 name,
@@ -294,11 +294,6 @@ def extent_of(records: Collection[Record]) -> Extent:
     span = Span(float(min(map(np.min, paths))), float(max(map(np.max, paths))))
     shortest = min(record.interval for record in records)
     return Extent(span, shortest, max(record.duration for record in records))
-
-
-def actuator_for(spec: ModelSpec, record: Record, extent: Extent) -> Actuator:
-    """Put the actuator of a model together for a record, which is held if it is a command."""
-    return spec.actuator(record.interval, record.hold, extent)
 
 
 def declarations_of(spec: ModelSpec, extent: Extent) -> tuple[Declaration, ...]:

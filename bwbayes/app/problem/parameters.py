@@ -15,7 +15,6 @@ from bwbayes.inference.study import (
     Stated,
     Study,
     TrainingRecord,
-    actuator_for,
     declarations_of,
     extent_of,
 )
@@ -112,7 +111,8 @@ def stand_of(config: Config, training: Sequence[Record]) -> VirtualTestStand:
     """
     stand = config.stand
     try:
-        actuator = actuator_for(stand.model.spec, training[0], extent_of(training))
+        first, extent = training[0], extent_of(training)
+        actuator = stand.model.spec.actuator(first.interval, first.hold, extent)
     except InputError as error:
         raise InputError(f"stand.{error}") from None
     return VirtualTestStand(
