@@ -15,7 +15,8 @@ where u and I are the likelihood's gradient and Fisher information in z, the noi
 between the strengths, which are alike. Strengths c are drawn from the normal distribution of that
 mode, and each draw of the fit moves with its own, by the mode's move and −H_φφ⁻¹ H_φc (c − ĉ): the
 gain of a fast drive gives way to the creep in it, and what is predicted of such a drive stays as it
-was.
+was. Such a record cannot tell either whether there is any creep: half of the draws do without. The
+evidence of each against these chooses the draws in the end.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import multivariate_normal
 
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.importance import resample
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
@@ -60,13 +63,13 @@ def add_prior_creep(
     places = extended.prior.unconstrain(np.stack([columns[n] for n in extended.names], axis=1))
     target = Target(extended)
     moving = target.physical
-    crept = np.array([moving.tolist().index(extended.names.index(n)) for n in creep.names])
-    unmoved = np.setdiff1d(np.arange(moving.size), crept)
-    strengths, others = moving[crept], moving[unmoved]
+    added = np.array([moving.tolist().index(extended.names.index(n)) for n in creep.names])
+    unmoved = np.setdiff1d(np.arange(moving.size), added)
+    strengths, others = moving[added], moving[unmoved]
     # Creep goes with the logarithm of the time: strengths a decade of it apart are alike.
     decades = np.abs(np.subtract.outer(np.log10(creep.times), np.log10(creep.times)))
     prior = np.eye(moving.size)
-    prior[np.ix_(crept, crept)] = np.linalg.inv(0.9**decades)
+    prior[np.ix_(added, added)] = np.linalg.inv(0.9**decades)
 
     begin = places.mean(axis=0)
     mode, hessian = begin.copy(), prior
@@ -74,14 +77,29 @@ def add_prior_creep(
         linear = target.linearize(mode[np.newaxis])
         hessian = linear.fisher_information[0] + prior
         mode[moving] += np.linalg.solve(hessian, linear.gradient[0] - prior @ mode[moving])
-    across = hessian[np.ix_(unmoved, crept)]
+    across = hessian[np.ix_(unmoved, added)]
     follow = np.linalg.solve(hessian[np.ix_(unmoved, unmoved)], across)
-    precision = hessian[np.ix_(crept, crept)] - across.T @ follow
+    precision = hessian[np.ix_(added, added)] - across.T @ follow
     covariance = np.linalg.inv((precision + precision.T) / 2)
-    drawn = generator.multivariate_normal(mode[strengths], covariance, size=len(draws))
-    places[:, others] += (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
-    places[:, strengths] = drawn
-    return extended, extended.prior.constrain(places)[0]
+    # Half of the draws do without: this record cannot tell whether there is any.
+    crept = np.arange(len(draws)) % 2 == 1
+    drawn = generator.multivariate_normal(mode[strengths], covariance, size=int(crept.sum()))
+    moved = places[crept]
+    moved[:, others] += (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
+    moved[:, strengths] = drawn
+    # By their evidence against those without.
+    evidence = np.zeros(len(draws))
+    evidence[crept] = (
+        extended.log_density(moved)
+        - posterior.log_density(posterior.prior.unconstrain(draws[crept]))
+        - multivariate_normal(mode[strengths], covariance).logpdf(drawn)
+        # The extended posterior takes strengths as independent, and leaves constants out.
+        + 0.5 * np.sum(drawn**2, axis=1)
+        + multivariate_normal(cov=0.9**decades).logpdf(drawn)
+    )
+    places[crept] = moved
+    rows = resample(evidence, generator)
+    return extended, extended.prior.constrain(places[rows])[0]
 
 
 def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:

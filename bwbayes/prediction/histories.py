@@ -24,8 +24,6 @@ from bwbayes.watching import Watch, part, parts, unwatched, watched
 # Draws that are asked about each of many histories.
 FEW = 50
 
-# Draws that a lead-in leaves at least, in effect.
-EFFECTIVE = 100
 
 # Nodes of the grid of hysteretic states.
 NODES = 17
@@ -231,35 +229,6 @@ def _by_importance(
             likelihoods, theta[uncovered], generator
         )
     return which, quantile, evidence
-
-
-def weigh(evidence: FloatArray, generator: np.random.Generator) -> IntArray:
-    """Choose as many draws by their log evidence (draws,), some several times; return their rows.
-
-    A lead-in tells of what the training record left open, and evidence may single out a few draws:
-    then it counts by a power below one, with which the weights w leave (Σ w)² / Σ w² =
-    :data:`EFFECTIVE` draws, or all of fewer. So bands have enough of them, and are rather too wide.
-    """
-    draws, best = evidence.size, np.max(evidence)
-    if draws <= EFFECTIVE or not np.isfinite(best):
-        return np.arange(draws)
-
-    def effective(power: float) -> float:
-        weights = np.exp(power * (evidence - best))
-        return float(np.sum(weights) ** 2 / np.sum(weights**2))
-
-    low, power = 0.0, 1.0
-    if effective(power) < EFFECTIVE:
-        # Draws that are not possible never count.
-        high = power
-        for _ in range(50):
-            power = (low + high) / 2
-            low, high = (power, high) if effective(power) > EFFECTIVE else (low, power)
-    total = np.cumsum(np.exp(power * (evidence - best)))
-    # Evenly: of equal weights, each draw once.
-    levels = (np.arange(draws) + generator.uniform()) / draws
-    rows: IntArray = np.minimum(np.searchsorted(total, levels * total[-1]), draws - 1)
-    return rows
 
 
 def _grid(

@@ -17,6 +17,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
+from bwbayes.inference.importance import resample
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
@@ -25,7 +26,7 @@ from bwbayes.model.linear import Hold
 from bwbayes.model.operator import Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
-from bwbayes.prediction.histories import Histories, choose_histories, uniform, weigh
+from bwbayes.prediction.histories import Histories, choose_histories, uniform
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched
@@ -218,7 +219,7 @@ def estimate_initial_states(
     for _ in range(SWEEPS if redrawn else 0):
         theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
         histories, start_theta, evidence = choose_histories(likelihoods, theta, generator)
-    rows = weigh(evidence, generator)
+    rows = resample(evidence, generator)
     theta, start_theta = theta[rows], start_theta[rows]
     histories = replace(histories, which=histories.which[rows])
     informed = _informed(histories, start_theta, record, window, generator)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from scipy.signal import fftconvolve
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference import prior_creep
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
 from bwbayes.model.actuator import Actuator
@@ -134,6 +136,38 @@ def test_a_hold_is_covered_that_was_not_before(
     )
     assert coverage(predicted(posterior, draws, plan), truth) < 0.2
     assert coverage(extended(posterior, draws, plan), truth) > 0.7
+
+
+def share_without(posterior: Posterior, draws: FloatArray) -> float:
+    """Return the share of draws that are the fit's own, without any creep."""
+    model, rows = add_prior_creep(posterior, draws, 3600.0, np.random.default_rng(1))
+    creep = [model.names.index(name) for name in model.names if name.startswith("creep")]
+    without = np.all(np.abs(rows[:, creep]) < 1e-12, axis=1)
+    own = np.delete(rows[without], creep, axis=1).round(9)
+    assert {tuple(row) for row in own} <= {tuple(row) for row in draws.round(9)}
+    return float(np.mean(without))
+
+
+def test_what_the_readings_say_of_creep_decides(
+    fit: tuple[Posterior, FloatArray, float, float, np.random.Generator],
+) -> None:
+    """A fast drive leaves both kinds of draws, one with holds and no creep those without it.
+
+    Twin: half of them if their evidence does not count.
+    """
+    posterior, draws, *_ = fit
+    assert 0.1 < share_without(posterior, draws) < 0.9
+    source = np.random.default_rng(3)
+    voltage = held([60.0, 20.0, 80.0, 0.0], 4, INTERVAL)
+    readings = moved(voltage, INTERVAL, "lag") + 0.02 * source.standard_normal(SAMPLES)
+    still = posterior_of(voltage, readings, Actuator("lag", interval=INTERVAL), "white", FIXED)
+    still = replace(still, engine="numba")
+    point = pointfit.fit(still, source)
+    places = source.multivariate_normal(point.mode, point.covariance, size=DRAWS)
+    draws = still.prior.constrain(places)[0]
+    assert share_without(still, draws) > 0.95
+    with patch.object(prior_creep, "resample", lambda evidence, _: np.arange(evidence.size)):
+        assert share_without(still, draws) == 0.5
 
 
 def test_an_ordinary_plan_keeps_its_band(

@@ -18,12 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.inference.importance import MIN_EFFECTIVE, resample
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.creep import Creep
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.histories import EFFECTIVE, weigh
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
@@ -87,7 +87,7 @@ def test_bands_of_a_staircase_contain_an_actuator_that_hardly_creeps(posterior: 
     strengths = np.full((RECORDS, len(CREEP.times)), 0.0025)
     every = staircases(posterior, strengths)
     assert coverage(every) > 0.8
-    with patch.object(initial_state, "weigh", as_they_are):
+    with patch.object(initial_state, "resample", as_they_are):
         taken = staircases(posterior, strengths)
     assert coverage(taken) < 0.8
     assert np.mean([width(b, "sensor") for b in every]) < np.mean(
@@ -99,26 +99,26 @@ def test_bands_of_a_staircase_contain_an_actuator_that_hardly_creeps(posterior: 
 def test_lead_in_leaves_enough_draws(logs: list[float], seed: int) -> None:
     """Of a hundred draws or fewer all stay; of more, those of more evidence come oftener."""
     evidence = np.array(logs)
-    rows = weigh(evidence, np.random.default_rng(seed))
+    rows = resample(evidence, np.random.default_rng(seed))
     times = np.bincount(rows, minlength=evidence.size)
     assert times.sum() == evidence.size
-    if evidence.size <= EFFECTIVE:
+    if evidence.size <= MIN_EFFECTIVE:
         assert np.all(times == 1)
     # Whole numbers of times may leave fewer than weights do, by less than one a draw.
     best = evidence.argsort(kind="stable")
     assert np.all(np.diff(times[best]) >= -1)
-    assert np.count_nonzero(times) > min(evidence.size, EFFECTIVE) / 4
+    assert np.count_nonzero(times) > min(evidence.size, MIN_EFFECTIVE) / 4
 
 
 def test_draws_of_equal_evidence_stay_as_they_are() -> None:
     evidence = np.full(1000, -3.0)
-    np.testing.assert_array_equal(weigh(evidence, np.random.default_rng(0)), np.arange(1000))
+    np.testing.assert_array_equal(resample(evidence, np.random.default_rng(0)), np.arange(1000))
     impossible = np.full(1000, -np.inf)
-    np.testing.assert_array_equal(weigh(impossible, np.random.default_rng(0)), np.arange(1000))
+    np.testing.assert_array_equal(resample(impossible, np.random.default_rng(0)), np.arange(1000))
 
 
 def test_draws_are_as_many_as_their_evidence_says() -> None:
     """Where enough draws remain, the evidence counts in full."""
     evidence = np.log(np.repeat([1.0, 3.0], 500))
-    times = np.bincount(weigh(evidence, np.random.default_rng(0)), minlength=1000)
+    times = np.bincount(resample(evidence, np.random.default_rng(0)), minlength=1000)
     assert abs(times[500:].sum() - 750) <= 1
