@@ -45,6 +45,7 @@ window = [4.0, 6.0]
 KEYS: dict[str, Any] = {
     "dynamics": "none",
     "noise": "white",
+    "stages": [],
     "from_rest": True,
     "ess": 200,
     "train": (0, 4),

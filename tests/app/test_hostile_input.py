@@ -32,6 +32,7 @@ from bwbayes.app.config.config import load
 from bwbayes.app.jobs import check as app_check
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
+from bwbayes.app.running import explaining
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
@@ -72,7 +73,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pointfit, "fit", best_draw)
-    monkeypatch.setattr(app_check, "explained", lambda *_, **__: ())
+    monkeypatch.setattr(explaining, "explain", lambda *_, **__: ())
     monkeypatch.setattr(app_check, "save", lambda *_, **__: [])
 
 

@@ -210,7 +210,7 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     write: Write, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where `check` shows what a run refuses; what its misfit comes from takes longer than all."""
-    monkeypatch.setattr("bwbayes.app.jobs.check.explained", lambda *_, **__: ())
+    monkeypatch.setattr("bwbayes.app.running.explaining.explain", lambda *_, **__: ())
     path = write(change=_turned)
     done = command("check", path, "--out", path.parent / "page")
     assert 0 == done.return_value
