@@ -204,13 +204,14 @@ class SampledModel:
         InputError
             The hysteresis has no step of bounded time, or a stage sees what a controller does not.
         """
+        column = {name: values.copy() for name, values in actuator.columns(theta).items()}
+        actuator = actuator.without_events
         for stage in actuator.stages:
             if stage.sees:
                 raise InputError(
                     f"stages: {stage.name} needs {stage.sees} at every sample, which a controller "
                     "does not tell a model; fit without it"
                 )
-        column = {name: values.copy() for name, values in actuator.columns(theta).items()}
         sections = actuator.sections(column).taps
         return cls(actuator, column, actuator.hysteresis.step(column), sections)
 

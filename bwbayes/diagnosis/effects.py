@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from bwbayes.diagnosis.record_checks import late_fix, settle_fix
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate
+from bwbayes.inference.study import Stated
+from bwbayes.model.stages.additions import Drift, Oscillation
+from bwbayes.model.stages.gain import MovingGain
 from bwbayes.record.record import Record
 
 # Prior sd of an addition to the displacement, as a fraction of its range.
@@ -35,13 +39,25 @@ def add_shapes(shapes: FloatArray, size: float) -> Effect:
     return _add(lambda sizes: size * (sizes @ shapes), np.zeros((1, len(shapes))))
 
 
+def _as_stage(scene: ResidualAnalysis, name: str, **fixed: float) -> dict[str, Any]:
+    """Return the model in which a stage is the effect, as facts of an explanation.
+
+    ``fixed`` are values of its parameters. It has such a stage once, and only of a record alone.
+    """
+    if scene.study is None or name in scene.study.spec.chain:
+        return {}
+    stated = {parameter: Stated(fixed=value) for parameter, value in fixed.items()}
+    return {"spec": scene.study.spec.with_stages(name), "stated": stated}
+
+
 def drift(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try A₁ t/T + A₂ (t/T)²."""
     along = scene.time / scene.duration
     fit = scene.extended(add_shapes(np.stack([along, along**2]), SIZE * scene.extent))
     size = SIZE * scene.extent * float(np.sum(fit.sizes))
     text = f"drift of the readings by {size:.2g} um"
-    yield scene.explained("drift", text, "measure again after a longer warm-up", fit, foreign=True)
+    fix, facts = Drift.advice, _as_stage(scene, "drift")
+    yield scene.explained("drift", text, fix, fit, foreign=True, **facts)
 
 
 def transient(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -62,7 +78,8 @@ def transient(scene: ResidualAnalysis) -> Iterator[Explanation]:
     window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
     settled = int(np.searchsorted(scene.time[: scene.voltage.size], until))
     fix = settle_fix(scene.voltage, settled, window)
-    yield scene.explained("transient", text, fix, fit, removes=True, foreign=True)
+    facts = _as_stage(scene, "transient")
+    yield scene.explained("transient", text, fix, fit, removes=True, foreign=True, **facts)
 
 
 def step(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -85,7 +102,8 @@ def step(scene: ResidualAnalysis) -> Iterator[Explanation]:
     text = f"jump of the offset by {size:.2g} um at {time} s"
     cost = float(np.log(rows.size))
     fix = f"fit one side: set train to end or begin at {time}"
-    yield scene.explained("step", text, fix, fit, cost, foreign=True)
+    facts = _as_stage(scene, "step", step_time=row * scene.interval)
+    yield scene.explained("step", text, fix, fit, cost, foreign=True, **facts)
 
 
 def oscillation(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -100,7 +118,8 @@ def oscillation(scene: ResidualAnalysis) -> Iterator[Explanation]:
     size = sd * float(np.hypot(*fit.sizes))
     text = f"oscillation of {size:.2g} um at {line.frequency:.4g} Hz{line.source}"
     cost = float(np.log(rows.size / 2))
-    fix = "look for the source: mains, ground loops, vibration"
+    fix = Oscillation.advice
+    # No stage for it: mains are in the next record too, where their phase is not known.
     yield scene.explained("oscillation", text, fix, fit, cost, noise=True)
 
 
@@ -113,7 +132,9 @@ def moving_gain(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
     fit = scene.extended(Effect(np.zeros((1, 1)), read=scaled))
     text = f"gain that changes by {100 * SIZE * fit.sizes[0]:.2g}% along the record (temperature)"
-    yield scene.explained("moving gain", text, "measure at a constant temperature", fit)
+    yield scene.explained(
+        "moving gain", text, MovingGain.advice, fit, **_as_stage(scene, "moving-gain")
+    )
 
 
 def reversed_sign(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -125,7 +146,7 @@ def reversed_sign(scene: ResidualAnalysis) -> Iterator[Explanation]:
     turned = scene.posterior.altered(displacement=-record.displacement)
     fit = climb(turned, map_estimate.local_minima(turned, scene.generator))
     text, fix = "reversed sign of the displacement", "change its sign in the file"
-    yield scene.explained("sign", text, fix, fit)
+    yield scene.explained("sign", text, fix, fit, **_as_stage(scene, "reversed-sign"))
 
 
 def delay(scene: ResidualAnalysis) -> Iterator[Explanation]:

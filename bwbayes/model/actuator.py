@@ -260,6 +260,16 @@ class Actuator:
         return replace(self, dynamics="none", hold="first", creep=None, stages=stages)
 
     @property
+    def without_events(self) -> Actuator:
+        """The same without the stages of what happened once, in a record alone."""
+        stages = (
+            stage
+            for stage in self.stages
+            if all(declared.scope != "event" for declared in stage.parameters)
+        )
+        return replace(self, stages=tuple(stages))
+
+    @property
     def timing(self) -> Timing:
         """How its samples follow each other."""
         return Timing(self.interval, self.hold)

@@ -30,10 +30,14 @@ from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
 from tests.stand import autoregressive, play
 from tests.test_sampling_rates import records
+
+SLOW_EVENTS = ("transient", "moving gain")
 
 
 def config_of(kind: str, folder: Path) -> Config:
@@ -79,16 +83,42 @@ def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -
     assert again.problem.config.model.nonlinearity == fit.problem.config.model.nonlinearity
 
 
-@pytest.mark.parametrize("kind", [pytest.param("good", marks=pytest.mark.slow), "transient"])
-def test_nothing_is_added_to_a_right_model_or_for_what_the_actuator_did_not_do(
-    kind: str, tmp_path: Path
-) -> None:
-    """The twin: a transient of many nats, which parts of a model could follow."""
-    problem = resolve_config(config_of(kind, tmp_path), tmp_path)
+@pytest.mark.slow
+def test_nothing_is_added_to_a_right_model(tmp_path: Path) -> None:
+    problem = resolve_config(config_of("good", tmp_path), tmp_path)
     chosen = search_stages(problem)
     assert chosen.steps == ()
     assert chosen.problem.posterior is problem.posterior
     assert chosen.problem.config.model.stages == []
+
+
+@pytest.mark.parametrize(
+    "kind", ["drift", "step", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)]
+)
+def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_of_the_next(
+    kind: str, tmp_path: Path
+) -> None:
+    """The next record is covered, by a band that is no wider than that of a good record's fit."""
+    found, widths = {}, []
+    for plant_kind in (kind, "good"):
+        problem = resolve_config(config_of(plant_kind, tmp_path), tmp_path)
+        if plant_kind == kind:
+            chosen = search_stages(problem)
+            problem, point = chosen.problem, chosen.point
+            assert problem.config.model.stages == [kind.replace(" ", "-")]
+        else:
+            point = pointfit.fit(problem.posterior, np.random.default_rng(1))
+        posterior, rng = problem.posterior, np.random.default_rng(2)
+        coordinates = rng.multivariate_normal(point.mode, point.covariance, 200)
+        draws, density = posterior.prior.constrain(coordinates)
+        following = plant("good", (8, 1), 8.0)
+        assert following.displacement is not None
+        start = InitialConditions(from_rest=True)
+        bands = predict_record(posterior, draws[np.isfinite(density)], following, start, rng)
+        widths.append(np.mean((bands.upper["sensor", 95] - bands.lower["sensor", 95])[-400:]))
+        found[plant_kind] = np.mean(bands.covers("sensor", 95, following.displacement)[-400:])
+    assert min(found.values()) > 0.85
+    assert widths[0] < 1.3 * widths[1]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""An actuator whose gain follows a temperature that is recorded beside the voltage.
+"""An actuator whose gain follows a temperature, which is recorded beside the voltage or not.
 
 The plant is simulated without the stage: the displacement of an actuator, multiplied.
 """
@@ -19,8 +19,12 @@ import bwbayes as bw
 from bwbayes.app.config.config import load
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.running.explaining import search_stages
 from bwbayes.arrays import FloatArray
+from bwbayes.inference import map_estimate
 from bwbayes.model.actuator import Actuator
+from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.io.hdf5 import record_arrays
 
 INTERVAL, PER_KELVIN, REFERENCE = 0.02, 0.002, 22.0
@@ -150,3 +154,44 @@ def test_files_bring_covariates_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"record.{suffix}"
     bw.write_record(TRAINED, path)
     assert bw.read_record(path).sha256 == TRAINED.sha256
+
+
+# An actuator that heats itself: no temperature is recorded, and the search finds out
+
+SPEED, WARM_UP = 320.0, 6.0  # V/s that heat by 15 K, and s
+
+
+def heated(frequencies: list[float], seed: int) -> bw.Record:
+    """Return a record of sines of 80 V, four seconds of each frequency, Hz, from cold."""
+    frequency = np.repeat(frequencies, round(4 / INTERVAL))
+    voltage = 80 * np.sin(2 * np.pi * np.cumsum(frequency) * INTERVAL)
+    heat = [0.0]
+    for moved in np.abs(np.diff(voltage)) / INTERVAL:
+        now = heat[-1]
+        for _ in range(20):
+            now += INTERVAL / 20 / WARM_UP * (moved / SPEED - now)
+        heat.append(now)
+    reading = plant(voltage, REFERENCE + 15 * np.array(heat), seed)
+    return bw.Record(voltage, reading, interval=INTERVAL)
+
+
+def test_self_heating_is_found_and_carried_to_another_drive() -> None:
+    """The twin without it covers less than half, by a band three times as wide."""
+    record = heated([2, 0.3, 1, 2, 0.2, 1.5, 0.3], 21)
+    config, records = config_of(record, {"dynamics": "none", "from_rest": True})
+    problem = resolve_config(config, Path(), records)
+    chosen, rng = search_stages(problem), np.random.default_rng(3)
+    assert chosen.problem.config.model.stages == ["heating"]
+    other, found = heated([0.2, 2, 2, 0.3, 2], 22), []
+    without = problem.posterior, map_estimate.fit(problem.posterior, rng)
+    for posterior, point in ((chosen.problem.posterior, chosen.point), without):
+        coordinates = rng.multivariate_normal(point.mode, point.covariance, 200)
+        draws, density = posterior.prior.constrain(coordinates)
+        start = InitialConditions(from_rest=True)
+        bands = predict_record(posterior, draws[np.isfinite(density)], other, start, rng)
+        scored = slice(bands.scored_from, None)
+        width = np.mean((bands.upper["sensor", 95] - bands.lower["sensor", 95])[scored])
+        found.append((covered(bands, other), width))
+    assert found[0][0] > 0.9
+    assert found[1][0] < 0.5
+    assert found[0][1] < found[1][1] / 2

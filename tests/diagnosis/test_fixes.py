@@ -77,7 +77,7 @@ def followed(
     made = bench(kind, (6, seed))
     (record,) = config.records.values()
     records: Sequence[Record] = made.records
-    if cause.spec is not None:
+    if cause.spec is not None and "[model]" in cause.fix:
         return with_model(config, cause.spec, problem.records, cause.stated)
     if "set outliers = true" in cause.fix:
         model = config.model.model_copy(update={"outliers": True})

@@ -383,6 +383,8 @@ def test_an_event_is_not_expected_of_the_next_record(name: str) -> None:
     _, memory = stage.settled(numbers, x[:1])
     result, _ = stage.advance(numbers, memory, x[np.newaxis], stage.seen(inputs_of(x)))
     np.testing.assert_array_equal(result[0], x)
+    made = actuator(name)
+    assert not SampledModel.of(made, theta(made)).actuator.stages
 
 
 def _extent() -> Extent:

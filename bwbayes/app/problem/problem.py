@@ -268,7 +268,7 @@ def resolve_config(
     actuator = study.posterior.datasets[0].actuator
     remarks += [
         f"loops and step responses leave out what {stage.name} makes of {stage.sees}"
-        for stage in actuator.stages
+        for stage in actuator.without_events.stages
         if stage.sees and not stage.rate_independent
     ]
     truth = recoverable(stand, actuator) if stand else {}

@@ -198,7 +198,8 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
             del notes[chosen.kind]
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(found)):
-            chosen, chain = parts[0], problem.study.spec.chain
+            # Of those that tie the one with the fewest parameters.
+            chosen, chain = min(parts, key=partial(_size, problem)), problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
@@ -224,6 +225,12 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     spec = problem.study.spec
     problem = problem.with_model(spec, remarks=remarks, stages=spec.keys["stages"])
     return ChosenModel(problem, point, tuple(steps), None if is_over else {name: found})
+
+
+def _size(problem: Problem, cause: Explanation) -> int:
+    """Return how many free parameters a problem has with the model of a cause."""
+    assert cause.spec is not None
+    return problem.study.with_model(cause.spec, cause.stated).posterior.prior.dimensions
 
 
 def _relative_discrepancy(problem: Problem, point: MAPEstimate) -> float:
