@@ -96,16 +96,9 @@ PARTS: Mapping[str, Mapping[str, Callable[..., Any]]] = {
 }
 
 
-def resolve_part[Part](
+def _maker_of[Part](
     where: str, name: str, registry: Mapping[str, Callable[..., Part]]
 ) -> Callable[..., Part]:
-    """Return what makes the part of that name, or of that import path ``module:Class``.
-
-    Raises
-    ------
-    InputError
-        No part has that name, or nothing can be imported from that path; ``where`` says where.
-    """
     if name in registry:
         return registry[name]
     module, _, attribute = name.partition(":")
@@ -131,15 +124,15 @@ def build_part[Part](
     options: Mapping[str, Any],
     kind: type | None = None,
 ) -> Part:
-    """Return the part of that name, with those ``options`` that are not None.
+    """Return the part of that name or import path, with those ``options`` that are not None.
 
     Raises
     ------
     InputError
-        As :func:`choose`; or the part does not take an option, cannot be made, or is not of the
-        ``kind`` that is asked for.
+        No part has that name, or nothing can be imported from that path; the part does not take an
+        option, cannot be made, or is not of the ``kind`` that is asked for. ``where`` says where.
     """
-    maker = resolve_part(where, name, registry)
+    maker = _maker_of(where, name, registry)
     arguments = {key: value for key, value in options.items() if value is not None}
     takes = inspect.signature(maker).parameters
     for key in arguments:
