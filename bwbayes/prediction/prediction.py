@@ -24,7 +24,6 @@ from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
 from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.inputs import Inputs
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import (
@@ -152,19 +151,10 @@ def forecast(
 def continued(record: Record, voltage: FloatArray) -> Record:
     """Return a record as it goes on into a planned voltage (samples,), V, without readings.
 
-    Raises
-    ------
-    InputError
-        The record has covariates: what follows would need them too.
+    What was recorded beside its voltage is not known of what follows.
     """
-    followed = record.inputs.followed_by(Inputs(voltage, interval=record.interval))
-    return replace(
-        record,
-        voltage=followed.voltage,
-        covariates=followed.covariates,
-        displacement=None,
-        truth=None,
-    )
+    whole = np.concatenate([record.path.voltage, voltage])
+    return replace(record, voltage=whole, covariates={}, displacement=None, truth=None)
 
 
 def predict_record(

@@ -115,6 +115,20 @@ def test_what_does_not_know_the_temperature_refuses_in_one_line(
     assert "\n" not in str(refused.value)
 
 
+def test_a_model_that_does_not_see_the_temperature_needs_none() -> None:
+    """Although the record brings it: of a forecast, and of a command."""
+    keys = {"stages": [], "noise": "white", "from_rest": True, "ess": 200, "progress": False}
+    fit = bw.fit(measured(22.0, 22.01, 4), dynamics="none", **keys)  # type: ignore[arg-type]
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", bw.InputWarning
+        )  # other drives are, which is not asked here
+        ahead = fit.predict(signal="step50", after=True)
+        command = fit.compensate("sine", amplitude=20, frequency=1)
+    assert np.isfinite(ahead.mean).all()
+    assert np.isfinite(command.voltage).all()
+
+
 def test_both_engines_give_one_log_density() -> None:
     config, records = config_of(TRAINED, {"stages": ["temperature"], "dynamics": "lag"})
     posterior = resolve_config(config, Path(), records).posterior
