@@ -15,8 +15,8 @@ where u and I are the likelihood's gradient and Fisher information in z, the noi
 between the strengths, which are alike. Strengths c are drawn from the normal distribution of that
 mode, and each draw of the fit moves with its own, by the mode's move and −H_φφ⁻¹ H_φc (c − ĉ): the
 gain of a fast drive gives way to the creep in it, and what is predicted of such a drive stays as it
-was. Such a record cannot tell either whether there is any creep: half of the draws do without. The
-evidence of each against these chooses the draws in the end.
+was. Such a record cannot tell either whether there is any creep: one in eight draws does without,
+in case a lead-in shows that there is none.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import multivariate_normal
 
 from bwbayes.arrays import FloatArray
-from bwbayes.inference.importance import resample
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
@@ -81,25 +79,13 @@ def add_prior_creep(
     follow = np.linalg.solve(hessian[np.ix_(unmoved, unmoved)], across)
     precision = hessian[np.ix_(added, added)] - across.T @ follow
     covariance = np.linalg.inv((precision + precision.T) / 2)
-    # Half of the draws do without: this record cannot tell whether there is any.
-    crept = np.arange(len(draws)) % 2 == 1
+    # One in eight does without: enough for a lead-in to choose among them alone.
+    crept = np.arange(len(draws)) % 8 > 0
     drawn = generator.multivariate_normal(mode[strengths], covariance, size=int(crept.sum()))
-    moved = places[crept]
-    moved[:, others] += (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
-    moved[:, strengths] = drawn
-    # By their evidence against those without.
-    evidence = np.zeros(len(draws))
-    evidence[crept] = (
-        extended.log_density(moved)
-        - posterior.log_density(posterior.prior.unconstrain(draws[crept]))
-        - multivariate_normal(mode[strengths], covariance).logpdf(drawn)
-        # The extended posterior takes strengths as independent, and leaves constants out.
-        + 0.5 * np.sum(drawn**2, axis=1)
-        + multivariate_normal(cov=0.9**decades).logpdf(drawn)
-    )
-    places[crept] = moved
-    rows = resample(evidence, generator)
-    return extended, extended.prior.constrain(places[rows])[0]
+    shift = (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
+    places[np.ix_(crept, others)] += shift
+    places[np.ix_(crept, strengths)] = drawn
+    return extended, extended.prior.constrain(places)[0]
 
 
 def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:
