@@ -76,7 +76,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
     """The loop has the widest range and turns; an offset's prior is from its own record."""
-    changes = ('dynamics = "none"', 'dynamics = "none"\ngain = ["quadratic"]')
+    changes = ('dynamics = "none"', 'dynamics = "none"\nnonlinearity = ["quadratic"]')
     both = problem(changes, ("ess = 150", "ess = 151"))
     lone = TEXT[: TEXT.index("[record.step]")] + TEXT[TEXT.index("[stand]") :]
     lone = lone.replace("[record.loops]", "[record]").replace('of = "loops"\n', "")
