@@ -245,6 +245,8 @@ class Run(Shown, Stages):
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
             shutil.copyfile(self.folder.backend, copied.backend)
+            if self.folder.search.exists():
+                shutil.copyfile(self.folder.search, copied.search)
             run.write_files(self, copied, FigureWorker())
         return copied.path
 
