@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,6 +44,9 @@ Curve = Callable[[FloatArray], FloatArray]
 
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
+
+# Passes at most that undo what a stage makes of the command itself.
+PASSES = 40
 
 
 def inverse(
@@ -106,7 +109,22 @@ def inverse(
     for row, samples in enumerate(target):
         column = {name: values[row : row + 1] for name, values in columns.items()}
         single = _Single(actuator, column, from_rest)
-        result[row] = single.voltage(samples, limits or Limits(), nearest)
+        known = Inputs(np.zeros(samples.size), interval=actuator.interval)
+        result[row] = single.voltage(samples, known, limits or Limits(), nearest)
+        # A stage that sees the command is undone with that of the pass before.
+        follows = [stage.name for stage in actuator.stages if stage.sees == "voltage"]
+        for _ in range(PASSES if follows else 0):
+            known = replace(known, voltage=result[row].copy())
+            result[row] = single.voltage(samples, known, limits or Limits(), nearest)
+            change = np.abs(result[row] - known.voltage)
+            if np.max(change) <= 1e-9 * np.ptp(result[row]):
+                break
+        else:
+            if follows:
+                raise InputError(
+                    f"reference: what {follows[0]} makes of the command cannot be undone; fit "
+                    "without it"
+                )
     return result
 
 
@@ -124,10 +142,11 @@ class _Single:
         span = self.actuator.span or UNIT
         return abs(float(np.ravel(self.actuator.hysteresis.typical_slope(self.column, span))[0]))
 
-    def voltage(self, displacement: FloatArray, limits: Limits, nearest: bool) -> FloatArray:
-        """Return the voltage (samples,) for a displacement."""
+    def voltage(
+        self, displacement: FloatArray, known: Inputs, limits: Limits, nearest: bool
+    ) -> FloatArray:
+        """Return the voltage (samples,) for a displacement; stages see the ``known`` inputs."""
         actuator, interval = self.actuator, self.actuator.interval
-        known = self._known(displacement.size)
         rest_value = actuator.level_at_rest(self.column, known) if self.from_rest else None
         drive = (displacement - self.column["offset"][0])[np.newaxis]
         drive = undo_stages(
@@ -140,8 +159,8 @@ class _Single:
         if nearest:
             low, high = max(limits.low, -extent), min(limits.high, extent)
             voltage = self._undo(drive, Limits(low, high, limits.rate))
-            return np.clip(self._command(voltage), low, high)
-        voltage = self._command(self._undo(drive, Limits(-extent, extent)))
+            return np.clip(self._command(voltage, known), low, high)
+        voltage = self._command(self._undo(drive, Limits(-extent, extent)), known)
         edges = np.abs(voltage) >= extent
         if edges.any():
             sample = int(np.argmax(edges))
@@ -156,18 +175,14 @@ class _Single:
             )
         return voltage
 
-    def _command(self, voltage: FloatArray) -> FloatArray:
+    def _command(self, voltage: FloatArray, known: Inputs) -> FloatArray:
         """Return the command (samples,), V, that makes a voltage at the hysteresis."""
         rest_value = np.zeros(1) if self.from_rest else None
-        actuator, path, known = self.actuator, voltage[np.newaxis], self._known(voltage.size)
+        actuator, path = self.actuator, voltage[np.newaxis]
         command = undo_stages(
             actuator.inputs, self.column, path, known, actuator.timing, rest_value
         )
         return np.asarray(command[0])
-
-    def _known(self, samples: int) -> Inputs:
-        """Return what is known of the inputs, which is their times."""
-        return Inputs(np.full(samples, np.nan), interval=self.actuator.interval)
 
     def _undo(self, displacement: FloatArray, within: Limits) -> FloatArray:
         """Undo dynamics and creep, then hysteresis and nonlinearity.

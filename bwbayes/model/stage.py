@@ -180,8 +180,8 @@ class Stage(ABC):
         return 1.0
 
     def require_inverse(self) -> None:
-        """Raise an InputError if the stage has no ``undo``, or sees the command itself."""
-        if type(self).undo is Stage.undo or self.sees == "voltage":
+        """Raise an InputError if the stage has no ``undo``."""
+        if type(self).undo is Stage.undo:
             raise InputError(f"inverse: no command undoes the stage {self.name}; leave it out")
 
 
@@ -229,7 +229,7 @@ def undo_stages(
 ) -> FloatArray:
     """Return the values (models, samples) with which these come out behind stages in a row.
 
-    ``inputs``, but for the voltage, and ``rest_value`` as in :func:`begin_stages`.
+    ``inputs`` and ``rest_value`` as in :func:`begin_stages`.
 
     Raises
     ------

@@ -193,3 +193,9 @@ class Heating(Stage):
         heat = parameters[1] * memory[0] + parameters[2] * moved
         after[0], after[1] = heat, parameters[3]
         return value * (1.0 + parameters[0] * heat)
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:
+        """Return x."""
+        heat = parameters[1] * memory[0] + parameters[2] * np.abs(parameters[3] - memory[1])
+        return value / (1.0 + parameters[0] * heat)
