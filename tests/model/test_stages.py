@@ -447,7 +447,7 @@ def test_what_is_not_known_of_a_command_is_refused_in_one_line(
     """Nothing is taken at a reference."""
     made = Actuator("lag", "first", INTERVAL, BoucWen(), span=SPAN, stages=(kind(),))
     models = theta(made, 1)
-    with pytest.raises(InputError, match=f"stages: .* needs {seen} at every sample"):
+    with pytest.raises(InputError, match=f"stages: .* follows {seen}, which a model"):
         SampledModel.of(made, models)
     refused = "temperature_degC: the model needs it at every sample"
     for command in (made.displacement, lambda *given: inverse(made, *given)):
