@@ -189,8 +189,9 @@ class ActuatorConfig(ConfigTable):
     """The linear dynamics behind the hysteresis."""
     stages: Literal["auto"] | Texts = key("auto", example='["backlash"]')
     """What else is between command and reading, see `bwbayes models`; auto: what the record has
-    evidence for, in a search that may also add a nonlinearity, creep or other dynamics. A drift,
-    transient or step is fitted in its record and not expected of the next.
+    evidence for, in a search that may also add a nonlinearity or creep, or take another operator
+    or other dynamics. A drift, transient or step is fitted in its record and not expected of
+    the next.
     """
     passive: bool | None = key(None, example="false")
     """For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true)."""
