@@ -57,7 +57,7 @@ def test_the_voltage_is_one_that_the_record_has_nearby(voltage: FloatArray, stri
 @given(
     amplitudes=st.lists(st.floats(0.1, 50.0), min_size=1, max_size=9),
     samples=st.integers(1, 60),
-    first=st.integers(0, 50),
+    first=st.integers(0, 30),
 )
 def test_a_long_record_begins_until_its_voltage_has_been_nearly_everywhere(
     amplitudes: list[float], samples: int, first: int
