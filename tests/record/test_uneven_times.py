@@ -129,6 +129,7 @@ def test_samples_are_uniform_whose_clock_ticks_too_slowly(
     st.booleans(),
 )
 @example(20_000, 44_100.0, 5, "g", 0.0, False)
+@example(100, 1 / 3, 3, "g", 0.2, True)  # late times are rounded to the second
 @settings(max_examples=150, deadline=None)
 def test_times_of_a_fixed_number_of_digits_are_uniform(
     samples: int, rate: float, digits: int, form: str, start: float, is_stated: bool

@@ -215,7 +215,20 @@ def _uniform_interval(
     tolerance = max(0.01 * interval, min(max(printed, rounding), 0.4 * interval))
     if (np.abs(elapsed - interval * positions) > tolerance).any():
         return _printed_interval(table, elapsed, positions)
+    if (stated := _stated_interval(table, elapsed, positions)) is not None:
+        return stated
     return _exact_interval(table, interval, tolerance, rounding, int(positions[-1]))
+
+
+def _stated_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
+    """Return the interval, s, of the rate that a file states, if all times as printed are on it."""
+    column, rate = table.columns["time"], table.source.stated_rate()
+    half = _half_units(np.asarray(column.values, dtype=np.float64))
+    if not rate or half is None or "interval_s" in table.notes:
+        return None
+    half = column.scaled(half, "time")
+    is_on_it = np.abs(elapsed - positions / rate) <= half + half[0]
+    return 1 / rate if is_on_it.all() else None
 
 
 def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
