@@ -198,7 +198,7 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
             del notes[chosen.kind]
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(found)):
-            # Of those that tie the one with the fewest parameters.
+            # Of those that tie a stage before another hold, and the one with the fewest parameters.
             chosen, chain = min(parts, key=partial(_size, problem)), problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
@@ -227,10 +227,11 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     return ChosenModel(problem, point, tuple(steps), None if is_over else {name: found})
 
 
-def _size(problem: Problem, cause: Explanation) -> int:
-    """Return how many free parameters a problem has with the model of a cause."""
+def _size(problem: Problem, cause: Explanation) -> tuple[bool, int]:
+    """Return whether the model of a cause has the same stages, and how many free parameters."""
     assert cause.spec is not None
-    return problem.study.with_model(cause.spec, cause.stated).posterior.prior.dimensions
+    spec, study = problem.study.spec, problem.study.with_model(cause.spec, cause.stated)
+    return cause.spec.chain == spec.chain, study.posterior.prior.dimensions
 
 
 def _relative_discrepancy(problem: Problem, point: MAPEstimate) -> float:
