@@ -28,7 +28,7 @@ from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.operators.prandtl_ishlinskii import Plays, PrandtlIshlinskii
 from bwbayes.model.operators.preisach import Preisach
 from bwbayes.model.stage import Stage
-from bwbayes.model.stages.additions import Drift, Oscillation, Step, Transient
+from bwbayes.model.stages.additions import Drift, OffsetStep, Oscillation, Transient
 from bwbayes.model.stages.backlash import Backlash
 from bwbayes.model.stages.gain import Heating, MovingGain, Temperature
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
@@ -81,7 +81,7 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
         ReversedSign,
         Drift,
         Transient,
-        Step,
+        OffsetStep,
         Oscillation,
     )
 }

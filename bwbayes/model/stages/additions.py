@@ -97,7 +97,7 @@ class Transient(_Addition):
         return value - parameters[0] * np.exp(-parameters[2] / parameters[1])
 
 
-class Step(_Addition):
+class OffsetStep(_Addition):
     """Step of the mount or the sensor: y = x + A from the time t₁ on, of displacement x, um."""
 
     name: ClassVar = "step"
