@@ -24,6 +24,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
+from tests.prediction.runs import no_rivals
 from tests.sampled import sampled
 
 CONFIG = Path(__file__).resolve().parents[1] / "runs" / "ring_bender.toml"
@@ -51,7 +52,7 @@ def replicate(seed: int, discrepancy: str) -> Replicate:
     outcome, chain = sampled(problem)
     assert outcome.converged, outcome.stop_reason
     kept = draws(posterior, chain)
-    bands = predictions(problem, kept.reshape(-1, kept.shape[-1]))[-1]
+    bands = predictions(problem, kept.reshape(-1, kept.shape[-1]), no_rivals)[-1]
     # A stand without discrepancy has none to cover: its sd and time are no truths.
     truth = problem.config.truth
     ranks = [np.mean(kept[..., i] < truth[n]) for i, n in enumerate(posterior.names) if n in truth]

@@ -8,14 +8,14 @@ creep or none. Where all of them agree, the drive leaves no room for what they d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.laplace import LocalFit, climb
+from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import READINGS
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
@@ -24,15 +24,50 @@ from bwbayes.inference.study import Study
 from bwbayes.inference.thinning import stride_of, thin, thin_posterior
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.spec import ModelSpec
-from bwbayes.prediction.initial_state import InitialConditions
-from bwbayes.prediction.prediction import predict_record
-from bwbayes.record import Record
+from bwbayes.prediction.bands import Bands
+from bwbayes.shown import brief
+from bwbayes.watching import Watch, unwatched, watched
 
 # Rivals miss at most so many times what the best of them misses.
 MISSES = 3.0
 
 # Draws of each model, whose mean is its prediction.
 DRAWS = 40
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A model of another family at its fit of a training record, by Laplace's approximation.
+
+    Attributes
+    ----------
+    spec
+        The model.
+    coordinates, covariance
+        Its mode (free,) and the covariance (free, free) about it, in the sampling's coordinates.
+    rmse
+        Root mean square of the training readings less its displacement, um.
+    """
+
+    __repr__ = brief
+
+    spec: ModelSpec
+    coordinates: FloatArray
+    covariance: FloatArray
+    rmse: float
+
+    def posterior(self, study: Study) -> Posterior:
+        """Return its posterior of the record that it was fitted to, which a ``study`` has."""
+        return study.with_model(self.spec).posterior
+
+    def draw(self, posterior: Posterior, rng: np.random.Generator) -> FloatArray:
+        """Draw (draws, free) parameters in their own units; the mode if no draw is possible."""
+        prior = posterior.prior
+        scores = rng.multivariate_normal(self.coordinates, self.covariance, DRAWS, method="eigh")
+        free, density = prior.constrain(scores)
+        if not np.isfinite(density).any():
+            return prior.constrain(self.coordinates[np.newaxis])[0]
+        return free[np.isfinite(density)]
 
 
 def families(spec: ModelSpec) -> Iterator[ModelSpec]:
@@ -51,37 +86,42 @@ def families(spec: ModelSpec) -> Iterator[ModelSpec]:
             yield rival
 
 
-def fit_rivals(study: Study, rng: np.random.Generator) -> tuple[LocalFit, ...]:
+def fit_rivals(
+    study: Study, rng: np.random.Generator, watch: Watch = unwatched
+) -> tuple[Rival, ...]:
     """Fit a rival of each family to the record of a study, of long ones to some thousand readings.
 
-    Each starts at what it has in common with the model, and at its own valley.
+    Each starts at what it has in common with the model, and at its own valley. ``watch`` is called
+    with the share that is done.
     """
     posterior_full = study.posterior
     origin = map_estimate.local_minima(posterior_full, rng, 1)[0]
     theta = posterior_full.prior.theta(posterior_full.prior.constrain(origin[np.newaxis])[0])
     stride = stride_of(thin_posterior(posterior_full, theta, READINGS), posterior_full)
     known_values = dict(zip(posterior_full.names, origin.tolist(), strict=True))
-    fits = []
-    for spec in families(study.spec):
+    rivals = []
+    for spec in watched([*families(study.spec)], watch):
         # One that needs a prior that is not stated is no rival.
         with suppress(InputError):
             posterior = study.with_model(spec).posterior
             posterior = replace(posterior, datasets=(thin(posterior.single_record, stride),))
             start = np.array([[known_values.get(name, 0.0) for name in posterior.names]])
             places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
-            fits.append(climb(posterior, places))
-    return tuple(fit for fit in fits if fit.follows)
+            fit = climb(posterior, places)
+            if fit.follows:
+                rivals.append(Rival(spec, fit.coordinates, fit.covariance, fit.rmse))
+    return tuple(rivals)
 
 
 def disagreement(
     posterior: Posterior,
     draws: FloatArray,
-    rivals: Sequence[LocalFit],
-    record: Record,
-    start: InitialConditions,
+    study: Study,
+    rivals: Sequence[Rival],
+    predict: Callable[[Posterior, FloatArray], Bands],
     rng: np.random.Generator,
 ) -> float:
-    """Return by how much more rivals differ from a model on another record than in training, um.
+    """Return by how much more rivals differ from a model on another drive than in training, um.
 
     The root of the mean square over rivals and readings, less that in training, which the
     discrepancy has in it; of those rivals that fit the training about as well as the best.
@@ -90,35 +130,26 @@ def disagreement(
     ----------
     posterior, draws
         The model: a posterior of one record, and draws (draws, free).
-    rivals
-        Other fits of that record.
-    record, start
-        The other record, and what is known of its start.
+    study, rivals
+        The study of that record, and other fits of it.
+    predict
+        Returns the bands of the other drive, from a posterior and draws of it.
     rng
-        Draws rivals' parameters and initial states.
+        Draws rivals' parameters.
     """
     draws = draws[rng.integers(len(draws), size=DRAWS)]
-    trained = posterior.single_record
-    theta = posterior.prior.theta(draws)
-    fitted = np.mean(posterior.simulate(theta), axis=0)
-    missed = trained.readings.values - fitted[trained.readings.rows]
-    limit = MISSES * min([float(np.std(missed)), *(rival.rmse for rival in rivals)])
-    predicted = predict_record(posterior, draws, record, start, rng)
+    readings = posterior.single_record.readings
+    fitted = np.mean(posterior.simulate(posterior.prior.theta(draws), readings.rows), axis=0)
+    limit = MISSES * min([float(np.std(readings.values - fitted)), *(r.rmse for r in rivals)])
+    predicted = predict(posterior, draws)
     scored = slice(predicted.scored_from, None)
     excess = []
     for rival in rivals:
         if rival.rmse > limit:
             continue
-        rows = rival.posterior.single_record.readings.rows * stride_of(rival.posterior, posterior)
-        training = np.mean((rival.displacement - fitted[rows]) ** 2)
-        other = predict_record(rival.posterior, _laplace(rival, rng), record, start, rng)
-        difference = other.mean[scored] - predicted.mean[scored]
-        excess.append(np.mean(difference**2) - training)
+        other = rival.posterior(study)
+        free = other.prior.constrain(rival.coordinates[np.newaxis])[0]
+        trained = other.simulate(other.prior.theta(free), readings.rows)[0]
+        difference = (predict(other, rival.draw(other, rng)).mean - predicted.mean)[scored]
+        excess.append(np.mean(difference**2) - np.mean((trained - fitted) ** 2))
     return float(np.sqrt(max(np.mean(excess), 0.0))) if excess else 0.0
-
-
-def _laplace(fit: LocalFit, rng: np.random.Generator) -> FloatArray:
-    """Draw (draws, free) of a fit by Laplace's approximation; its mode if none is possible."""
-    scores = rng.multivariate_normal(fit.coordinates, fit.covariance, DRAWS, method="eigh")
-    free, density = fit.posterior.prior.constrain(scores)
-    return free[np.isfinite(density)] if np.isfinite(density).any() else fit.free[np.newaxis]

@@ -118,6 +118,7 @@ def forecast(
     generator: np.random.Generator,
     name: str = "forecast",
     watch: Watch = unwatched,
+    model_error_sd: float | None = None,
 ) -> Bands:
     """Predict what follows on the training record: its last sample goes on into a planned voltage.
 
@@ -126,7 +127,7 @@ def forecast(
     first, and as wide as ever later. Creep with a time longer than the record is known by its prior
     alone: the model needs times up to the forecast's length.
 
-    Parameters are as in :func:`predict_windows`; ``voltage`` is (samples,), V, at the record's
+    Parameters are as in :func:`predict_record`; ``voltage`` is (samples,), V, at the record's
     sampling interval.
 
     Raises
@@ -145,7 +146,10 @@ def forecast(
         start_states, posterior.likelihood, theta, generator, part(watch, 0.0, STATES_SHARE)
     )
     predicting = part(watch, STATES_SHARE, 1.0)
-    return _bands(name, posterior, theta, start_states, longer, after, predicting)
+    bands = _bands(
+        name, posterior, theta, start_states, longer, after, predicting, model_error_sd or 0.0
+    )
+    return replace(bands, model_error_sd=model_error_sd)
 
 
 def continued(record: Record, voltage: FloatArray) -> Record:

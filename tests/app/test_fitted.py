@@ -17,6 +17,9 @@ from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running import run
+from bwbayes.app.running.folder import RunFolder
+from bwbayes.diagnosis.drive_lock import DriveLock
+from bwbayes.diagnosis.rivals import Rival
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.record import Record, read_record
 from bwbayes.report.outputs import write_bands
@@ -360,3 +363,25 @@ def test_what_is_no_record_is_one_line(record: Record) -> None:
         bw.fit(record.voltage)  # type: ignore[arg-type]
     with pytest.raises(bw.InputError, match="fit: record: has no displacement"):
         bw.fit(replace(record, displacement=None, truth=None))
+
+
+def test_rivals_are_fitted_once_and_kept_with_the_run(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None are fitted unless the model's error follows the drive."""
+
+    def rivals(p_value: float) -> tuple[Rival, ...] | None:
+        lock = DriveLock(0.5, p_value)
+        return bw.open_run(copy.path).with_cache(drive_locks={"record": lock}).rivals("record")
+
+    assert rivals(1.0) is None
+    assert not copy.rivals.exists()
+    fitted = rivals(0.0)
+    # Fitting again would raise.
+    monkeypatch.setattr("bwbayes.diagnosis.rivals.fit_rivals", None)
+    kept = rivals(0.0)
+    assert fitted
+    assert kept
+    for before, after in zip(fitted, kept, strict=True):
+        assert before.spec == after.spec
+        np.testing.assert_array_equal(before.coordinates, after.coordinates)

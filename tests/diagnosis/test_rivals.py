@@ -10,10 +10,17 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.running.predictions import Prediction, predict_another
+from bwbayes.app.problem.records import generator
+from bwbayes.app.running.predictions import (
+    Prediction,
+    RivalsOf,
+    predict_after,
+    predict_another,
+)
 from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.laplace import climb
-from bwbayes.diagnosis.rivals import families
+from bwbayes.diagnosis.rivals import Rival, families, fit_rivals
 from bwbayes.inference import map_estimate
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.bands import KINDS, LEVELS
@@ -63,23 +70,38 @@ def fitted(kind: str, folder: Path) -> tuple[Problem, FloatArray]:
     return problem, free[np.isfinite(density)]
 
 
-def predicted(problem: Problem, draws: FloatArray, name: str) -> Prediction:
-    return predict_another(problem, draws, problem.validations[name], name)
+class Rivals:
+    """The rivals of a problem's model, fitted once, if its error follows the drive."""
+
+    def __init__(self, problem: Problem, draws: FloatArray) -> None:
+        self.problem = problem
+        lock = drive_locks(problem.posterior, draws, generator(1, "drive lock"))["record"]
+        self.locked = lock.locked
+        self.fitted: tuple[Rival, ...] | None = None
+
+    def __call__(self, of: str, _: object) -> tuple[Rival, ...] | None:
+        """Return them, or None."""
+        if self.locked and self.fitted is None:
+            self.fitted = fit_rivals(self.problem.study.for_record(of), generator(1, "rivals"))
+        return self.fitted
 
 
-def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None:
-    """Like drives have not; the parameters' bands stay, and a note says both widths."""
-    problem, draws = fitted("backlash", tmp_path)
-    assert predicted(problem, draws, "like").model_error_sd is None
-    wide = predicted(problem, draws, "unlike")
+def agreeing(*_: object) -> tuple[Rival, ...]:
+    """Return no rival that differs."""
+    return ()
+
+
+def predicted(problem: Problem, draws: FloatArray, name: str, rivals: RivalsOf) -> Prediction:
+    return predict_another(problem, draws, problem.validations[name], name, rivals)
+
+
+def require_wider(wide: Prediction, narrow: Prediction) -> None:
+    """Assert that displacement and sensor bands have the error in them, and nothing else."""
     assert wide.model_error_sd is not None
     assert wide.model_error_sd > 0
     assert [note for note in wide.remarks if "um wide instead of" in note] == [
         wide.model_error_note
     ]
-    # Rivals that agree.
-    object.__setattr__(problem, "rivals", {"record": ()})
-    narrow = predicted(problem, draws, "unlike")
     assert narrow.model_error_sd == 0.0
     assert not narrow.model_error_note
     for level in LEVELS:
@@ -90,18 +112,36 @@ def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None
         added = wide.sd(kind) ** 2 - narrow.sd(kind) ** 2
         assert np.mean(added) == pytest.approx(wide.model_error_sd**2, rel=0.1)
     assert np.array_equal(wide.mean, narrow.mean)
+
+
+def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None:
+    """Like drives have not; forecasts have; the parameters' bands stay, a note says both widths."""
+    problem, draws = fitted("backlash", tmp_path)
+    rivals = Rivals(problem, draws)
+    assert predicted(problem, draws, "like", rivals).model_error_sd is None
+    assert rivals.fitted is None
+    wide, narrow = (predicted(problem, draws, "unlike", found) for found in (rivals, agreeing))
+    require_wider(wide, narrow)
     assert covered(wide) > covered(narrow)
-    assert covered(wide) > covered(narrow)
+    plan = problem.validations["unlike"].record
+    assert plan is not None
+    require_wider(
+        *(
+            predict_after(problem, draws, plan.voltage, "later", "record", found)
+            for found in (rivals, agreeing)
+        )
+    )
 
 
 def test_right_model_keeps_its_bands(tmp_path: Path) -> None:
-    """No rival is fitted: the property would be there."""
+    """No rival is fitted."""
     problem, draws = fitted("good", tmp_path)
+    rivals = Rivals(problem, draws)
     for name in ("like", "unlike"):
-        prediction = predicted(problem, draws, name)
+        prediction = predicted(problem, draws, name, rivals)
         assert prediction.model_error_sd is None
         assert not any("follows the drive" in remark for remark in prediction.remarks)
-    assert "rivals" not in vars(problem)
+    assert rivals.fitted is None
 
 
 @pytest.mark.parametrize(

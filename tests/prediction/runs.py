@@ -141,6 +141,10 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
     return Judged(problem, draws, {one.name: one for one in bands}, validation)
 
 
+def no_rivals(*_: object) -> None:
+    """Return no rivals of a model whose error does not follow the drive."""
+
+
 def covered(bands: Bands, level: int = 95) -> float:
     """Part of the judged readings inside the sensor band."""
     assert bands.measured is not None

@@ -245,8 +245,10 @@ class Run(Shown, Stages):
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
             shutil.copyfile(self.folder.backend, copied.backend)
-            if self.folder.search.exists():
-                shutil.copyfile(self.folder.search, copied.search)
+            pairs = ((self.folder.search, copied.search), (self.folder.rivals, copied.rivals))
+            for kept, copy in pairs:
+                if kept.exists():
+                    shutil.copyfile(kept, copy)
             run.write_files(self, copied, FigureWorker())
         return copied.path
 

@@ -225,7 +225,7 @@ def _candidate(
     bands = [
         prediction
         for prediction in predictions(
-            problem, flat, partial(watch, f"{name}: predictions"), training=False
+            problem, flat, fit.rivals, partial(watch, f"{name}: predictions"), training=False
         )
         if prediction.measured is not None
     ]

@@ -35,9 +35,7 @@ from bwbayes.app.problem.records import (
 from bwbayes.arrays import IntArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.laplace import LocalFit
 from bwbayes.diagnosis.record_checks import isolated_outliers
-from bwbayes.diagnosis.rivals import fit_rivals
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import Parameter
@@ -182,12 +180,6 @@ class Problem:
                 each for each in beyond if not (is_window and each.kind == "reversals")
             ]
         return beyond_by_name
-
-    @cached_property
-    def rivals(self) -> dict[str, tuple[LocalFit, ...]]:
-        """Models of other families, fitted to each training record alone, by its name."""
-        rng = generator(self.config.seed, "rivals")
-        return {name: fit_rivals(self.study.for_record(name), rng) for name in self.records}
 
     def with_noise(self, chosen: str) -> Problem:
         """Return the problem of a run whose noise, ``auto``, came to this one.

@@ -152,6 +152,7 @@ class RunFolder(Folder):
     chain = FileOf("chain")  # a folder, which grows by a file a block
     backend = FileOf("chain.h5")  # the same as emcee stores it
     search = FileOf("search.npz")  # what explains the readings better than the chosen model
+    rivals = FileOf("rivals.npz")  # other models of the same readings, once they were needed
     result = FileOf("result.npz")  # what was worked out of the chain
     summary = FileOf("summary.json")  # the numbers, written last of all
     replicates = FileOf("replicates.jsonl")  # of a calibration alone

@@ -1,13 +1,15 @@
 """Predictions of a run: its windows, the records it holds out, and any other one.
 
 :func:`predictions` predicts what a config names, :func:`predict_another` any record or planned
-voltage; what comes of either is judged by the readings, if there are any. Their random numbers hang
-on the data alone: the same record under another name gets the same bands.
+voltage, :func:`predict_after` what follows on a training record; what comes of them is judged by
+the readings, if there are any. Where the model's error follows the drive, its rivals widen the
+bands of unlike drives. Random numbers hang on the data alone: the same record under another name
+gets the same bands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise, zip_longest
 from typing import Any
@@ -17,11 +19,10 @@ import numpy as np
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.extrapolation import beyond_training
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
-from bwbayes.diagnosis.rivals import disagreement
+from bwbayes.diagnosis.rivals import Rival, disagreement
 from bwbayes.diagnosis.validation import (
     BandValidation,
     ValidationContext,
@@ -49,6 +50,11 @@ from bwbayes.report.figures import draw_styled
 from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
 from bwbayes.report.tables import scores_table
 from bwbayes.watching import Watch, part, unwatched
+
+type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]
+"""Rivals of the model on a training record, by its name; None unless its error follows the drive.
+
+To be called with a watch: they may have to be fitted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,13 +151,15 @@ def predict_another(
     flat: FloatArray,
     other: Validation,
     name: str,
+    rivals: RivalsOf,
     watch: Watch = unwatched,
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
     ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
     which a thousand are used. The ``other`` record may have any sampling interval; ``name`` is that
-    of the bands. ``watch`` is called with the share that is done.
+    of the bands, and ``rivals`` returns those of a training record. ``watch`` is called with the
+    share that is done.
 
     Raises InputError: a lead-in or window that does not fit into the record.
     """
@@ -161,11 +169,11 @@ def predict_another(
     path = other.record.path
     beyond = beyond_training(posterior, other.record.inputs)
     subset = thin_draws(flat, generator(problem.config.seed, "draws"))
-    bands = _of_another(problem, subset, other, name, beyond, part(watch, 0.0, 0.8))
+    bands = _of_another(problem, subset, other, name, beyond, rivals, part(watch, 0.0, 0.8))
     background = ValidationContext.of(posterior, flat)
     verdict = validate_bands(bands, background, beyond=beyond)
     scores = None if verdict is None else score(bands, background.extent)
-    from_rest_note = _from_rest_remark(problem, subset, other, bands, beyond)
+    from_rest_note = _from_rest_remark(problem, subset, other, bands, beyond, rivals)
     watch(1.0)
     noise = path.remark or planned_noise(other.record)
     held = _held_lead_in_remark(problem, other, bands)
@@ -193,7 +201,12 @@ def planned_noise(record: Record) -> str:
 
 
 def _from_rest_remark(
-    problem: Problem, draws: FloatArray, other: Validation, bands: Bands, beyond: Iterable[Finding]
+    problem: Problem,
+    draws: FloatArray,
+    other: Validation,
+    bands: Bands,
+    beyond: Iterable[Finding],
+    rivals: RivalsOf,
 ) -> str:
     """Say what it would change to declare a record from rest.
 
@@ -205,7 +218,7 @@ def _from_rest_remark(
     if start.from_rest or start.after or not record.starts_at_zero:
         return ""
     rested = replace(other, start=replace(start, from_rest=True))
-    declared = _of_another(problem, draws[::4], rested, bands.name, beyond)
+    declared = _of_another(problem, draws[::4], rested, bands.name, beyond, rivals)
     scored = slice(max(bands.scored_from, declared.scored_from), None)
     widths, shares = [], []
     for predicted in (bands, declared):
@@ -253,6 +266,7 @@ def predict_after(
     voltage: FloatArray,
     name: str,
     of: str,
+    rivals: RivalsOf,
     watch: Watch = unwatched,
 ) -> Prediction:
     """Predict what follows on a training record whose last sample goes on into a planned voltage.
@@ -268,23 +282,36 @@ def predict_after(
     planned = Record(voltage, None, interval=record.interval)
     source = generator(seed, f"forecast {planned.sha256}")
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
-    bands = forecast(alone, own_draws, record, voltage, source, name, watch)
-    remarks = [finding.note for finding in beyond]
-    if beyond and _locked(problem, subset, of):
-        remarks.insert(0, "what the model misses follows the drive: this one may be missed by more")
-    return Prediction(**vars(bands), remarks=tuple(remarks))
+
+    error, found = None, _rivals(rivals, of, beyond, part(watch, 0.0, 0.5))
+    if found is not None:
+        rng = generator(seed, f"rivals {planned.sha256}")
+
+        def follow(posterior: Posterior, draws: FloatArray) -> Bands:
+            return forecast(posterior, draws, record, voltage, rng)
+
+        study = problem.study.for_record(of)
+        error = disagreement(alone, own_draws, study, found, follow, rng)
+    predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
+    bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
+    remarks = (
+        *[bands.model_error_note] * bool(bands.model_error_note),
+        *(finding.note for finding in beyond),
+    )
+    return Prediction(**vars(bands), remarks=remarks)
 
 
 def predictions(
     problem: Problem,
     flat: FloatArray,
+    rivals: RivalsOf,
     watch: Watch = unwatched,
     *,
     training: bool = True,
 ) -> tuple[Bands, ...]:
     """Predict everything held out, and the ``training`` windows of all records, from flat draws.
 
-    ``watch`` is called with the share that is done.
+    ``rivals`` returns those of a training record. ``watch`` is called with the share that is done.
     """
     posterior, seed = problem.posterior, problem.config.seed
     subset = thin_draws(flat, generator(seed, "draws"))
@@ -303,7 +330,8 @@ def predictions(
     for name, held_out in problem.validations.items():
         if held_out.record is not None:
             beyond = problem.extrapolations[name]
-            bands.append(_of_another(problem, subset, held_out, name, beyond, next(watches)))
+            predicting = next(watches)
+            bands.append(_of_another(problem, subset, held_out, name, beyond, rivals, predicting))
     watch(1.0)
     return tuple(bands)
 
@@ -314,27 +342,34 @@ def _of_another(
     other: Validation,
     name: str,
     beyond: Iterable[Finding],
+    rivals: RivalsOf,
     watch: Watch = unwatched,
 ) -> Bands:
     """Return the bands of a record that was not fitted, from the draws of one that was."""
     record = other.record
     assert record is not None
     alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
-    source = generator(problem.config.seed, f"predict {record.sha256}")
-    error = None
-    if beyond and _locked(problem, draws, other.of):
+    error, found = None, _rivals(rivals, other.of, beyond, part(watch, 0.0, 0.5))
+    if found is not None:
         rng = generator(problem.config.seed, f"rivals {record.sha256}")
-        rivals = problem.rivals[other.of]
-        error = disagreement(alone, own_draws, rivals, record, other.start, rng)
+
+        def predict(posterior: Posterior, draws: FloatArray) -> Bands:
+            return predict_record(posterior, draws, record, other.start, rng)
+
+        study = problem.study.for_record(other.of)
+        error = disagreement(alone, own_draws, study, found, predict, rng)
+    source = generator(problem.config.seed, f"predict {record.sha256}")
+    predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     return predict_record(
-        alone, own_draws, record, other.start, source, name, other.judged, watch, error
+        alone, own_draws, record, other.start, source, name, other.judged, predicting, error
     )
 
 
-def _locked(problem: Problem, draws: FloatArray, of: str) -> bool:
-    """Tell whether what the model misses of a training record follows the drive."""
-    rng = generator(problem.config.seed, "drive lock")
-    return drive_locks(problem.posterior, draws, rng)[of].locked
+def _rivals(
+    rivals: RivalsOf, of: str, beyond: Iterable[Finding], watch: Watch
+) -> Sequence[Rival] | None:
+    """Return the rivals that widen the bands of a drive; None of a drive like those of training."""
+    return rivals(of, watch) if beyond else None
 
 
 def _reaching(

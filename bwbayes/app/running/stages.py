@@ -7,6 +7,7 @@ knows of them. To open a run is to read files: a stage loads what it needs when 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, wraps
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from bwbayes.diagnosis.innovations import Innovations
     from bwbayes.diagnosis.predictive_checks import PredictiveChecks
     from bwbayes.diagnosis.residual_analysis import Explanation
+    from bwbayes.diagnosis.rivals import Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext
     from bwbayes.prediction.bands import Bands
     from bwbayes.prediction.loops import Loops
@@ -235,7 +237,7 @@ class Stages:
         """Return the bands of all that was held out, and of the training windows."""
         from bwbayes.app.running.predictions import predictions
 
-        return predictions(self.problem, self.flat_draws, watch)
+        return predictions(self.problem, self.flat_draws, self.rivals, watch)
 
     @RunStage
     def scores(self, watch: Watch) -> dict[str, Scores]:
@@ -282,6 +284,29 @@ class Stages:
 
         source = generator(self.problem.config.seed, "drive lock")
         return drive_locks(self.problem.posterior, self.subset, source)
+
+    def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
+        """Return rivals of the model on a training record; None unless its error follows the drive.
+
+        They are fitted when first needed, and kept in the folder. ``watch`` is called with the
+        share that is done.
+        """
+        from bwbayes.app.problem.records import generator
+        from bwbayes.app.running.fingerprint import fingerprint, load, save
+        from bwbayes.diagnosis.rivals import fit_rivals
+
+        if not self.drive_locks[of].locked:
+            return None
+        problem, path, state = self.problem, self.folder.rivals, fingerprint(self.problem)
+        fitted = load(path, state) or {}
+        if of not in fitted:
+            rng = generator(problem.config.seed, f"rivals of {problem.records[of].sha256}")
+            fitted[of] = fit_rivals(problem.study.for_record(of), rng, watch)
+            # What predicts elsewhere may only read the folder.
+            with suppress(OSError):
+                save(path, state, fitted)
+        rivals: tuple[Rival, ...] = fitted[of]
+        return rivals
 
     @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
