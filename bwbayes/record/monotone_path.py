@@ -159,7 +159,9 @@ def _leveled(
         nearest = np.argsort(away, kind="stable")
         count = np.arange(1, nearest.size + 1)
         outermost = away[nearest] - np.cumsum(away[nearest]) / count
-        inside = nearest[: np.flatnonzero(outermost <= ABOUT * noise_sd / np.sqrt(count))[-1] + 1]
+        # As far as the first that lies outside: more samples at another level agree again.
+        outside = outermost > ABOUT * noise_sd / np.sqrt(count)
+        inside = nearest[: np.argmax(outside) if outside.any() else None]
         part = slice(before + inside.min(), before + inside.max() + 1)
         near = voltage[part]
         level, error = np.full(near.size, np.mean(near)), noise_sd / sqrt(near.size)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -122,7 +122,8 @@ VOLTAGES = st.lists(
 
 
 @pytest.mark.parametrize("name", HYSTERESIS)
-@given(VOLTAGES, st.integers(0, 2**32 - 1), st.booleans())
+@given(path=VOLTAGES, seed=st.integers(0, 2**32 - 1), from_rest=st.booleans())
+@example(path=[10.0, 0.0, 2e-309], seed=0, from_rest=True)  # a step whose inverse overflows
 @settings(deadline=None, max_examples=8)
 def test_engines_agree_on_any_path(
     name: str, path: list[float], seed: int, from_rest: bool

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
@@ -102,15 +102,17 @@ def test_of_a_noisy_voltage_the_real_path_is_left(
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.sampled_from(["triangle", "staircase"]), SEEDS)
+@given(kind=st.sampled_from(["triangle", "staircase"]), seed=SEEDS)
+@example(kind="staircase", seed=10_000)  # whose first sample alone is at the first level
 def test_its_reversals_are_the_true_ones(kind: str, seed: int) -> None:
-    """Wherever the voltage comes back by ten times the noise's sd."""
+    """Wherever the voltage comes back by ten times the noise's sd, which is known to two of it."""
     sd = 1e-3
     clean = drive(kind, 1000.0, np.random.default_rng(seed))
     path = estimate_path(noisy(clean, sd, seed))
-    assert large_turns(path.voltage, 10 * sd) == large_turns(clean, 10 * sd)
+    found = large_turns(path.voltage, 10 * sd)
+    assert large_turns(clean, 12 * sd) <= found <= large_turns(clean, 8 * sd)
     # Those that are left beside them are flat.
-    assert turns(path.voltage) <= turns(clean) + 4
+    assert large_turns(path.voltage, 3 * sd) <= turns(clean)
 
 
 def large_turns(voltage: FloatArray, threshold: float) -> int:

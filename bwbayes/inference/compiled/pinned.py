@@ -63,7 +63,8 @@ def _follow(
             u = s * voltage[first : last + 1]
             # The mirrored model rises.
             fixed, out = s * fixed, np.empty(u.size)
-            here, end = max(moves_from(spins, group, fixed), u[0]), u[-1]
+            end = u[-1]
+            here = moves_from(spins, group, fixed, u[0], end)
             t = 1
             while t < u.size and u[t] <= here:
                 out[t] = at_rest(spins, group, fixed, u[t])

@@ -164,7 +164,7 @@ class Pinned(OneState):
         ``fixed`` is P_irr (models,) at the first.
         """
         # From where P_an reaches P_irr, walls move forward until the voltage turns.
-        here = np.clip(moves_from(self.spins, walls, fixed), u[0], u[-1])
+        here = moves_from(self.spins, walls, fixed, u[0], u[-1])
         resting = int(np.searchsorted(u, np.max(here, initial=u[0]), side="right"))
         along = np.empty((fixed.size, u.size))
         columns = Walls(*(values[:, np.newaxis] for values in walls))

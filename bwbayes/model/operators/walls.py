@@ -117,12 +117,16 @@ def irreversible(spins: bool, walls: Any, p: Any, u: Any) -> Any:
     return (p - walls[4] * walls[0] * level) / (1.0 - walls[4])
 
 
-def moves_from(spins: bool, walls: Any, fixed: Any) -> Any:
-    """Return the voltage from which walls move forward, V: where P_an reaches P_irr."""
+def moves_from(spins: bool, walls: Any, fixed: Any, start: Any, end: Any) -> Any:
+    """Return the voltage from which walls move forward, V: where P_an reaches P_irr.
+
+    From ``start`` on, and until ``end``: there, if the rest is rounding beside the field.
+    """
     # Closer to saturation that field is not sharp: walls are followed from a smaller one on.
     sharp = 1.0 - 1e-6
     level = np.minimum(np.maximum(fixed / walls[0], -sharp), sharp)
-    return walls[1] * field_at(spins, level) - walls[2] * fixed
+    here = np.maximum(walls[1] * field_at(spins, level) - walls[2] * fixed, start)
+    return select(end - here > 1e-15 * walls[1], here, end)
 
 
 def first_step(walls: Any) -> Any:
