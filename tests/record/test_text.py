@@ -116,6 +116,13 @@ def test_a_line_that_is_cut_off_and_words_below_the_numbers_are_skipped_with_a_r
     assert whole.sha256 == record.sha256
 
 
+@pytest.mark.parametrize("times", [["0.31"], ["0.31", "0.32", "0.33"]])
+def test_times_alone_at_the_end_are_skipped_with_a_remark(tmp_path: Path, times: list[str]) -> None:
+    with pytest.warns(InputWarning, match=r"csv:32: \d lines? among the numbers skipped"):
+        record = read(tmp_path, lines(*LINES, *times))
+    assert record.sha256 == read(tmp_path, GOOD).sha256
+
+
 def test_a_row_like_one_above_the_numbers_stays(tmp_path: Path) -> None:
     """Without times, a row left out would move all that follow."""
     rows = ["0.1,OVLD", *(f"{np.sin(i):.4f},{np.cos(i):.4f}" for i in range(250)), "0.1,OVLD"]

@@ -229,9 +229,9 @@ def _samples(
 ) -> list[tuple[int, str]]:
     """Return the lines of samples, with their numbers, without what is no sample at the end.
 
-    That is lines of words, and a last line that is cut off: with fewer fields than the others, or,
-    unless the text ``is_whole``, without its last number or with fewer decimals in it than all
-    those above have alike.
+    That is lines of words, lines of one cell, as times alone, and a last line that is cut off: with
+    fewer fields than the others, or, unless the text ``is_whole``, without its last number or with
+    fewer decimals in it than all those above have alike.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def _samples(
     samples, is_cut = list(numbered), False
     while len(samples) > 1:
         first, last = (cells_of(line, separator) for _, line in (samples[0], samples[-1]))
-        is_short = len(last) < fields and not is_cut
+        is_short = len(last) < fields and (len(last) == 1 or not is_cut)
         begin, end = (next(filter(None, cells), "") for cells in (first, last))
         if not is_short and (re.search(r"\d", end) or not re.search(r"\d", begin)):
             break
@@ -265,7 +265,8 @@ def _samples(
         advice = "complete the line, or remove it"
         if len(cells) > fields:
             advice = f"remove {cells[-1][:30]!r}, or write 1.5 where 1,5 is meant"
-        raise InputError(f"{path}:{number}: {len(cells)} fields for {fields} columns; {advice}")
+        count = f"{len(cells)} field{'s' * (len(cells) != 1)}"
+        raise InputError(f"{path}:{number}: {count} for {fields} columns; {advice}")
     return samples
 
 
