@@ -35,6 +35,12 @@ REVERSED_SIGN = Finding(
     "sign", "reversed sign of the displacement", "change the sign of the displacement in the file"
 )
 REFIT = "fit this record itself, with the same config"
+# Of a training record, whose explanations are fitted: all other causes compare with training.
+UNEXPLAINED = Finding(
+    "unknown",
+    "unknown (no explanation takes most of the error away)",
+    "look at the residuals in the figure, and compare other models of this record",
+)
 
 # What a cause is called, and what to do about it.
 WORDS: Mapping[str, tuple[str, str]] = {

@@ -28,7 +28,7 @@ from typing import Any, Self
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, cause
+from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, UNEXPLAINED, cause
 from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, join_findings
@@ -255,11 +255,11 @@ def validate_bands(
     if reasons:
         missed = any(reason.startswith("NRMSE") for reason in reasons)
         mending = [explanation for explanation in explanations if explanation.mends or not missed]
-        why = join_findings(likely_causes(mending)) or (
-            REVERSED_SIGN
-            if reasons[0].startswith("the readings fall")
-            else cause(bands, background.memory, beyond)
-        )
+        why = join_findings(likely_causes(mending))
+        if why is None and reasons[0].startswith("the readings fall"):
+            why = REVERSED_SIGN
+        elif why is None:
+            why = UNEXPLAINED if bands.training else cause(bands, background.memory, beyond)
         return replace(doubted, passed=False, reasons=tuple(reasons), cause=why)
     doubts = [
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"

@@ -338,6 +338,28 @@ def test_the_cause_of_a_large_error_takes_most_of_it_away() -> None:
     assert "outliers" not in verdict.cause.text
 
 
+@pytest.mark.parametrize("kind", ["gain", "noise"])
+def test_no_cause_of_a_training_record_compares_it_with_training(kind: str) -> None:
+    """What no explanation takes away is unknown there. The twin: a separate record's has a name."""
+    for seed in range(3):
+        record = made(np.random.default_rng(seed), 30, memory=0.2)
+        bands = bands_of(record, training=True)
+        assert bands.measured is not None
+        size = {
+            "gain": 0.3 * (bands.mean - np.mean(bands.mean)),
+            "noise": 6 * (bands.measured - bands.mean),
+        }
+        spoilt = replace(bands, measured=bands.measured + size[kind])
+        context = ValidationContext(record.memory, 0.0, FITTED)
+        kinds = []
+        for training in (True, False):
+            verdict = judged(replace(spoilt, training=training), context)
+            assert verdict.passed is False
+            assert verdict.cause is not None
+            kinds.append(verdict.cause.kind)
+        assert kinds == ["unknown", kind]
+
+
 def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
     """Its noise model has grown to cover what the model misses: the coverage says nothing.
 
