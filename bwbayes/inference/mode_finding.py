@@ -318,7 +318,20 @@ def refine(posterior: Posterior, coordinates: FloatArray, covariance: FloatArray
         is_converged = gained[best] <= 0 or np.linalg.norm(step) < 1e-2
         if is_converged and np.allclose(values, 1.0, atol=0.2):
             break
-    return Mode(coordinates, axes @ axes.T, log_density)
+    return Mode(coordinates, _definite(axes @ axes.T), log_density)
+
+
+def _definite(covariance: FloatArray) -> FloatArray:
+    """Return a covariance (free, free) that rounding leaves positive definite.
+
+    One that is not has grown along directions that bend the wrong way: none is wider than the
+    prior, whose sds are 1.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    if values[0] > 1e-13 * values[-1]:
+        return covariance
+    bounded = np.minimum(values, 1.0)
+    return np.asarray((vectors * np.maximum(bounded, 1e-12 * bounded[-1])) @ vectors.T)
 
 
 def newton_step(gradient: FloatArray, hessian: FloatArray, flattest: float) -> FloatArray:

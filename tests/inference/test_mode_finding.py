@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.mode_finding import Target, climb, refine
 from tests.inference.linear import CASES, Linear, every_case
 from tests.inference.problems import short_posterior
+
+if TYPE_CHECKING:
+    from bwbayes.inference.posterior import Posterior
 
 LINEAR = {noise: Linear(free, noise) for free, noise in CASES}
 
@@ -36,6 +41,26 @@ def test_a_normal_posteriors_mode_is_the_closed_form(
     covariance = mode.covariance * np.outer(model.sd, model.sd) / np.outer(exact.sd, exact.sd)
     correlation = exact.covariance / np.outer(exact.sd, exact.sd)
     np.testing.assert_allclose(covariance, correlation, atol=1e-4)
+
+
+@dataclass
+class Ridge:
+    """A density that is flat along a diagonal, as of a record that does not tell a ratio."""
+
+    width: float
+
+    def log_density(self, coordinates: FloatArray) -> FloatArray:
+        """Return it, up to a constant, at coordinates (points, 2)."""
+        across = (coordinates @ np.array([0.6, 0.8])) / self.width
+        return np.asarray(-0.5 * across**2)
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-5, 1e-7])
+def test_a_direction_without_any_curvature_leaves_a_covariance(width: float) -> None:
+    """Which has a Cholesky factor, and is no wider than the prior if it would have none."""
+    mode = refine(cast("Posterior", Ridge(width)), np.array([0.3, 0.1]), np.eye(2))
+    assert np.isfinite(np.linalg.cholesky(mode.covariance)).all()
+    assert np.linalg.eigvalsh(mode.covariance)[0] > 0
 
 
 @every_case
