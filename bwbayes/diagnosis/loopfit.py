@@ -256,16 +256,20 @@ def _slow(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
 
     Creep of 5% of the gain in each decade of the time from ten samples on, (rows,); and each decade
     by itself, with the states of two Bouc-Wen models, h' = 0.4 u' - b (|u'| h + u' |h| / 2), whose
-    small loops do not close, (rows, decades + 2).
+    small loops do not close, and what starting at their largest changes, (rows, decades + 4).
     """
     times = 10.0 ** np.arange(1.0, max(np.log10(voltage.size), 1.1))
     decades = 0.05 * np.stack([_lagged(voltage, time)[rows] for time in times], axis=1)
     half = max(float(np.ptp(voltage)) / 2, 1e-300)
-    rates, h, states = np.array([1.0, 3.0]), np.zeros(2), np.zeros((rows.size, 2))
+    rates = np.array([1.0, 3.0])
+    h = np.stack([np.zeros(2), 0.4 / (1.5 * rates)])
+    states = np.zeros((rows.size, 2, 2))
+    states[0] = h
     for row, step in enumerate(np.diff(voltage[rows] / half).tolist(), 1):
         h = (h + 0.4 * step) / (1 + rates * (abs(step) + step * np.sign(h) / 2))  # stable
         states[row] = h
-    return decades.sum(axis=1), np.column_stack([decades, half * states])
+    begun = states[:, 1] - states[:, 0]
+    return decades.sum(axis=1), np.column_stack([decades, half * states[:, 0], half * begun])
 
 
 def _best_decay(

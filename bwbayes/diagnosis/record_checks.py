@@ -219,7 +219,9 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
         return
     # Loops of another sign or sense imitate most of what moves by itself along with the drive.
     limit = 0.03 if leads or loop.gain < 0 else 0.3
-    if loop.explained < 0.3 or loop.missed > limit:
+    # Rounding to coarse steps is off by half a step at most.
+    half_step = resolution(displacement) * np.ptp(displacement) / 2
+    if (loop.explained < 0.3 or loop.missed > limit) and np.var(loop.residual) > half_step**2:
         share = min(max(1 - loop.explained, loop.missed), 1)
         text = f"{share:.0%} of the displacement's variance does not follow the voltage"
         yield _whole(record, "no relation", text, "check the columns, the wiring and the amplifier")
@@ -256,7 +258,7 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
     if _leads(voltage, _readings(record)[inside]):
         return None
     name = "displacement" if delay > 0 else "voltage"
-    text = f"the {name} is late by {1e3 * abs(delay):.3g} ms"
+    text = f"the {name} is late by about {1e3 * abs(delay):.2g} ms"
     return _whole(record, f"late {name}", text, late_fix(delay, record.interval))
 
 
@@ -380,11 +382,18 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     """Find a displacement that comes from elsewhere at the start, whatever the voltage does.
 
     Loops would imitate 49 fiftieths of it at most: a drive of one swing shows the initial loading
-    alone, which no other one confirms.
+    alone, which no other one confirms. So it is with what has settled before the first reversal
+    and is less than the voltage moves meanwhile.
     """
     if loop.decay_share < 0.02:
         return
     size, time = loop.decay, loop.decay_time
+    turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
+    first, settled = loop.rows[0], loop.rows[0] + round(3 * time / record.interval)
+    if turns.size and settled <= turns[0]:
+        loaded = abs(loop.gain * (record.voltage[settled] - record.voltage[first]))
+        if max(abs(size), abs(loop.start)) < loaded:
+            return
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
     # A drive before the record leaves a decay too, of at most lag times velocity.
@@ -403,7 +412,7 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         # Another state at the start takes it back: it mends loops that no play follows, as those of
         # an amplifier at its limits.
         return
-    begin = float(record.time[loop.rows[0]])
+    begin = float(record.time[first])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
     over = begin + time * float(np.log(abs(size) / max(0.5 * spread, 0.001 * extent)))
     over = min(over, record.start + 0.9 * record.duration)
@@ -411,8 +420,8 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         f"the displacement starts {abs(size):.3g} um {'above' if size > 0 else 'below'} where the "
         f"voltage would have it, and settles with a time constant of {time:.2g} s"
     )
-    settled = int(np.searchsorted(record.time, over))
-    fix = settle_fix(record.voltage, settled, f"start = {record.clock(over)} under [record]")
+    kept_from = int(np.searchsorted(record.time, over))
+    fix = settle_fix(record.voltage, kept_from, f"start = {record.clock(over)} under [record]")
     yield Finding("switch-on transient", text, fix, begin, over)
 
 

@@ -122,6 +122,21 @@ def test_a_staircase_is_no_coarse_voltage(lag: float) -> None:
             assert [] == findings("coarse resolution", fine, readings)
 
 
+@pytest.mark.parametrize("levels", [2, 3, 5])
+def test_a_displacement_of_few_levels_is_coarse_and_not_unrelated(levels: int) -> None:
+    """The twin: one that moves by itself, rounded alike, is unrelated."""
+    rng, time = np.random.default_rng(levels), np.arange(2000) / 200
+    voltage = 50 + 45 * np.exp(-0.1 * time) * np.sin(2 * np.pi * time)
+    clean = hysteresis(drawn(rng), voltage)
+    alone = np.ptp(clean) * np.sin(2 * np.pi * 1.7 * time + 1)
+    for moved, unrelated in ((clean, False), (alone, levels > 2)):
+        step = np.ptp(moved) / (levels - 1)
+        readings = np.round((moved - moved.min()) / step) * step
+        kinds = {finding.kind for finding in inspect(Record(voltage, readings, interval=1 / 200))}
+        assert "coarse resolution" in kinds
+        assert ("no relation" in kinds) is unrelated
+
+
 @pytest.mark.parametrize("levels", [2, 5, 20, 60])
 def test_a_staircase_whose_readings_are_noise_free_repeats_no_sample(levels: int) -> None:
     """They go on after each jump, as long as a lag has not settled."""
@@ -315,6 +330,38 @@ def test_the_initial_loading_of_a_single_swing_is_no_transient(
     driven = (plays if of_plays else hysteresis)(part, voltage)
     readings = driven + part.offset + part.sensor * rng.standard_normal(voltage.size)
     assert [] == findings_of("switch-on transient", Record(voltage, readings, interval=1 / rate))
+
+
+def loaded(seed: int, *, of_plays: bool, transient: float) -> Record:
+    """Return a decaying sine that begins where a ramp from 0 V has ended, and a transient."""
+    rng, rate = np.random.default_rng(seed), RATE * FINE
+    part, middle = drawn(rng), float(rng.uniform(30, 60))
+    time = np.arange(round(10 * rate)) / rate
+    swing = rng.choice([-1, 1], p=[0.2, 0.8]) * rng.uniform(0.6, 0.95) * np.exp(-0.1 * time)
+    sine = swing * np.sin(2 * np.pi * rng.uniform(0.4, 1.5) * time)
+    voltage = middle * np.concatenate([np.linspace(0, 1, round(1.5 * rate)), 1 + sine])
+    moved = lagged((plays if of_plays else hysteresis)(part, voltage), part.lag)
+    rows = slice(-time.size, None, 2 * FINE)
+    readings, size = moved[rows], float(np.ptp(moved[rows]))
+    elapsed = np.arange(readings.size) * 2 / RATE
+    readings = readings - transient * size * np.exp(-elapsed / rng.uniform(0.2, 0.8))
+    readings += 0.002 * size * rng.standard_normal(readings.size)
+    return Record(voltage[rows], readings, interval=2 / RATE)
+
+
+@pytest.mark.parametrize("of_plays", [False, True])
+def test_a_record_that_begins_while_it_is_loaded_has_no_transient(of_plays: bool) -> None:
+    """Of 12 at most 3, where 8 were; with a transient of 30% of the range, 11 or more."""
+    found = [
+        sum(
+            finding.kind == "switch-on transient"
+            for seed in range(12)
+            for finding in inspect(loaded(seed, of_plays=of_plays, transient=transient))
+        )
+        for transient in (0.0, 0.3)
+    ]
+    assert found[0] <= 3
+    assert found[1] >= 11
 
 
 def crept(seed: int, drift: float) -> Record:
