@@ -37,6 +37,12 @@ def brief(instance: object) -> str:
     )
 
 
+def rounded(value: float, digits: int = 3) -> str:
+    """Return a number with so many digits, without an exponent below a million: 13,600."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):,.0f}" if "e+0" in text and abs(value) < 1e6 else text
+
+
 def head(text: str) -> str:
     """Return the beginning of a text, with what is left out counted."""
     lines = text.splitlines()

@@ -19,6 +19,7 @@ from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
+from bwbayes.shown import rounded
 
 # False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
 # Above the first a failure may be luck, and below the second a success may be none.
@@ -174,6 +175,7 @@ class StandardizedResiduals:
             # The median of a χ² variable of one degree of freedom is 0.4549.
             fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
             rms = float(np.sqrt(np.mean(self._residual**2)))
+            fast = max(fast, rounding_sd(self.bands.measured[self.scored]))
             # Of a sensor's noise, which no model follows, nothing is the model's fault.
             slow = np.sqrt(max(rms**2 - fast**2, 0.0))
             if slow > max(0.05 * extent, fast) and extent:
@@ -187,7 +189,7 @@ class StandardizedResiduals:
         chance = scipy.stats.f.cdf(square, self.square_size, self.noise_size)
         if square < 0.25 and chance < ALARM:
             ratio = 1 / max(np.sqrt(square), 1e-9)
-            reasons.append(f"the sensor band is {ratio:.2g} times too wide")
+            reasons.append(f"the sensor band is {rounded(ratio, 2)} times too wide")
         return reasons
 
     @property
@@ -216,8 +218,8 @@ class StandardizedResiduals:
         if ratio < 3:
             return ""
         return (
-            f"the 95% sensor band is {ratio:.2g} times as wide as the sensor's noise alone; most "
-            "of it is the model's error"
+            f"the 95% sensor band is {rounded(ratio, 2)} times as wide as the sensor's noise "
+            "alone; most of it is the model's error"
         )
 
     @property

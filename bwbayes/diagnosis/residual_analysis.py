@@ -30,6 +30,7 @@ from bwbayes.inference.thinning import (
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
+from bwbayes.shown import rounded
 
 # Readings that are looked at: an explanation takes some hundred passes over them, and what a model
 # misses shows in fewer.
@@ -72,7 +73,7 @@ class Explanation(Finding):
             for (before, after), name in errors
             if np.isfinite(after)
         ]
-        return ", ".join([f"{self.nats:.3g} nats", *texts])
+        return ", ".join([f"{rounded(self.nats)} nats", *texts])
 
     @property
     def numbers(self) -> dict[str, object]:

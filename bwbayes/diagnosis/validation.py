@@ -37,7 +37,7 @@ from bwbayes.errors import ExitStatus, InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import Bands, title_of
 from bwbayes.record.io.grid import clock
-from bwbayes.shown import brief
+from bwbayes.shown import brief, rounded
 
 
 @dataclass(frozen=True)
@@ -270,12 +270,15 @@ def validate_bands(
     )
     if followed is not None:
         doubts.append(
-            f"the fit may have followed what the actuator did not do ({followed.nats:.3g} nats)"
+            "the fit may have followed what the actuator did not do "
+            f"({rounded(followed.nats)} nats)"
         )
     elif better is not None:
         parts = any(explanation.spec is not None for explanation in better_models(explanations))
         remedy = '; stages = "auto" adds it' if parts else ", which no key of [model] adds"
-        doubts.insert(0, f"a better model is known ({better.kind}, {better.nats:.3g} nats){remedy}")
+        doubts.insert(
+            0, f"a better model is known ({better.kind}, {rounded(better.nats)} nats){remedy}"
+        )
     if standard.idle and not bands.training:
         doubts.append(standard.idle)
     minimum = 5.0  # worth fewer independent readings a record cannot show that bands hold

@@ -18,7 +18,7 @@ from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.population.population import population
-from bwbayes.shown import LONGEST, MOST_LINES, brief
+from bwbayes.shown import LONGEST, MOST_LINES, brief, rounded
 from tests.control import cases
 from tests.population.test_population import drawn
 
@@ -105,6 +105,21 @@ def test_anything_is_shown_shortly(one: Any, another: Any) -> None:
     for thing in (Anything(one, another), Anything(Anything(one, another), [one] * 50)):
         assert repr(thing).count("\n") < MOST_LINES
         assert len(repr(thing)) <= LONGEST
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (13612.0, 3, "13,600"),
+        (670.4, 2, "670"),
+        (41.26, 3, "41.3"),
+        (0.0012, 2, "0.0012"),
+        (2.5e7, 3, "2.5e+07"),
+        (99_990.0, 2, "100,000"),
+    ],
+)
+def test_a_number_has_no_exponent_below_a_million(value: float, digits: int, text: str) -> None:
+    assert rounded(value, digits) == text
 
 
 def test_dir_has_public_names_alone() -> None:

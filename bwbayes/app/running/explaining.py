@@ -30,6 +30,7 @@ from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
+from bwbayes.shown import rounded
 from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 
 # A search that has found the mechanism adds no more stages, and leaves no more discrepancy, in sds
@@ -124,13 +125,14 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     if evidence[best] < evidence[default] + TIED:
         best = default
     against = [
-        f"{lead:+.3g} nats against {noise}" if lead > TIED else f"a tie with {noise}"
+        f"+{rounded(lead)} nats against {noise}" if lead > TIED else f"a tie with {noise}"
         for noise, lead in ((noise, evidence[best] - nats) for noise, nats in evidence.items())
         if noise != best
     ]
     if p >= colored:
         against.append(f"innovations are white, p = {p:.2g}")
-    return best, f"noise: {best} ({', '.join(against)})"
+    why = ", ".join(against) or "with no other does the model follow the readings"
+    return best, f"noise: {best} ({why})"
 
 
 class ChosenModel(NamedTuple):
