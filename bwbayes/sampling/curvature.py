@@ -4,12 +4,12 @@ Along a ridge that a record hardly tells, other parameters follow the one that i
 in a straight line: the ridge is a hundred times as long as wide, and bent by many times its width.
 Tails are longer on one side, and an offset is the less known the larger the discrepancy. No few
 ellipsoids cover that, least of all where there are few draws. Three maps take it out, one after the
-other. Of two sds a record may tell hardly more than what they are together: the ridge is then two
-legs at a right angle, which a :class:`TotalRatioMap` puts in line. A :class:`SkewMap` makes both
-tails of each coordinate alike. A :class:`QuadraticMap` takes of each coordinate what those before
-it leave open, longest first, and lets it bend quadratically with them, and widen. Each tells how
-much it stretches, so that a distribution of the straight coordinates is one of the bent ones,
-density and all.
+other. Of two sds, or of two lags in a row, a record may tell hardly more than what they are
+together: the ridge is then two legs at a right angle, which a :class:`TotalRatioMap` puts in line.
+A :class:`SkewMap` makes both tails of each coordinate alike. A :class:`QuadraticMap` takes of each
+coordinate what those before it leave open, longest first, and lets it bend quadratically with them,
+and widen. Each tells how much it stretches, so that a distribution of the straight coordinates is
+one of the bent ones, density and all.
 """
 
 from __future__ import annotations
@@ -25,10 +25,15 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.sampling.secant import SecantMap
 
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
+
+# Parameters that add up, by name: the squares of sds, and the time constants of lags in a row.
+SDS = SENSOR_SD.name, DISCREPANCY_SD.name
+LAGS = "lag", AmplifierLag.parameters[0].name, SensorLag.parameters[0].name
 
 
 @dataclass(frozen=True)
@@ -223,11 +228,12 @@ class SkewMap:
 
 @dataclass(frozen=True)
 class TotalRatioMap:
-    """The map from straight coordinates y to those x of pairs of sds a and b that add up.
+    """The map from straight coordinates y to those x of pairs a and b that add up.
 
-    With ln a = c₁ + s₁ x₁ and ln b = c₂ + s₂ x₂,
+    Of sds the squares add up, p = 2; of time constants these themselves, p = 1. With
+    ln a = c₁ + s₁ x₁ and ln b = c₂ + s₂ x₂,
 
-        s₁ y₁ = ln √(a² + b²),   s₂ y₂ = ln (b / a),
+        s₁ y₁ = ln (aᵖ + bᵖ) / p,   s₂ y₂ = ln (b / a),
 
     and all other coordinates stay what they are.
 
@@ -239,38 +245,45 @@ class TotalRatioMap:
         c, (pairs, 2).
     scale
         s, (pairs, 2).
+    powers
+        p, (pairs,).
     """
 
     rows: IntArray
     center: FloatArray
     scale: FloatArray
+    powers: FloatArray
 
     @classmethod
-    def of_noise(cls, prior: JointPrior) -> TotalRatioMap | None:
-        """Take the sds of each record's sensor and discrepancy, where both are free and lognormal.
+    def of_prior(cls, prior: JointPrior) -> TotalRatioMap | None:
+        """Take the sds of each record's sensor and discrepancy, and the first two lags in a row.
 
-        None if there are no such pairs.
+        Where both are free and lognormal. None if there are no such pairs.
         """
         forms = {
             (p.plain, p.record): (row, p.formula)
             for row, p in enumerate(prior.free)
             if p.formula is not None and p.formula.logarithmic
         }
-        records = dict.fromkeys(record for _, record in forms)
-        wanted = [[(sd.name, record) for sd in (SENSOR_SD, DISCREPANCY_SD)] for record in records]
-        pairs = [[forms[key] for key in pair] for pair in wanted if forms.keys() >= {*pair}]
+        pairs, powers = [], []
+        for record in dict.fromkeys(record for _, record in forms):
+            for names, power in ((SDS, 2.0), (LAGS, 1.0)):
+                pair = [forms[name, record] for name in names if (name, record) in forms][:2]
+                if len(pair) == 2:
+                    pairs.append(pair)
+                    powers.append(power)
         if not pairs:
             return None
         rows = [[row for row, _ in pair] for pair in pairs]
         scales = [[(math.log(form.center), form.scale) for _, form in pair] for pair in pairs]
         center, scale = np.moveaxis(np.array(scales), -1, 0)
-        return cls(np.array(rows), center, scale)
+        return cls(np.array(rows), center, scale, np.array(powers))
 
     def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of y (..., free), and log |∂x/∂y| (...), which is zero."""
         x = whitened.copy()
         total, ratio = np.moveaxis(self.scale * whitened[..., self.rows], -1, 0)
-        a = total - 0.5 * np.logaddexp(0.0, 2 * ratio)
+        a = total - np.logaddexp(0.0, self.powers * ratio) / self.powers
         x[..., self.rows] = (np.stack([a, a + ratio], axis=-1) - self.center) / self.scale
         return x, np.zeros(whitened.shape[:-1])
 
@@ -278,7 +291,8 @@ class TotalRatioMap:
         """Return y (..., free) of x (..., free), and log |∂y/∂x| (...), which is zero."""
         y = bent.copy()
         a, b = np.moveaxis(self.center + self.scale * bent[..., self.rows], -1, 0)
-        together = np.stack([0.5 * np.logaddexp(2 * a, 2 * b), b - a], axis=-1)
+        total = np.logaddexp(self.powers * a, self.powers * b) / self.powers
+        together = np.stack([total, b - a], axis=-1)
         y[..., self.rows] = together / self.scale
         return y, np.zeros(bent.shape[:-1])
 
@@ -286,9 +300,10 @@ class TotalRatioMap:
         """Return ∂y/∂x (places, free, free) at x (places, free)."""
         free = bent.shape[1]
         slopes = np.broadcast_to(np.eye(free), (len(bent), free, free)).copy()
-        for (i, j), center, (s_i, s_j) in zip(self.rows, self.center, self.scale, strict=True):
+        pairs = zip(self.rows, self.center, self.scale, self.powers, strict=True)
+        for (i, j), center, (s_i, s_j), power in pairs:
             a, b = (center + (s_i, s_j) * bent[:, [i, j]]).T
-            share = scipy.special.expit(2 * (b - a))
+            share = scipy.special.expit(power * (b - a))
             slopes[:, i, i], slopes[:, i, j] = 1 - share, share * s_j / s_i
             slopes[:, j, i] = -s_i / s_j
         return slopes

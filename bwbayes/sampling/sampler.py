@@ -95,7 +95,7 @@ def init_chain(
         )
     seeds = generator.spawn(plan.ensembles)
     chain = Chain([start(posterior, point, e, plan.walkers, g) for e, g in enumerate(seeds)])
-    totals = TotalRatioMap.of_noise(posterior.prior)
+    totals = TotalRatioMap.of_prior(posterior.prior)
     chain.freeze(
         "pilot", StudentMixture.around(point.optima, *mode_weights(posterior, point), totals)
     )

@@ -59,7 +59,7 @@ def proposal(phase: Phase) -> StudentMixture:
         return StudentMixture(weights, centers, factors)
     bends, scales = np.zeros((FREE * (FREE + 1) // 2, FREE)), np.zeros((FREE, FREE))
     bends[0, 1], scales[0, 1] = generator.standard_normal(2)
-    totals = TotalRatioMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)))
+    totals = TotalRatioMap(np.array([[1, 0]]), centers[:1, :2], np.ones((1, 2)), np.array([2.0]))
     skew = SkewMap(centers[1], np.exp(centers[2]), np.full(FREE, 0.8))
     bend = QuadraticMap(centers[0], factors[0], bends, scales)
     return StudentMixture(weights, centers, factors, (totals, skew, bend))

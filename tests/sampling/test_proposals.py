@@ -19,6 +19,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Declaration, lognormal
+from bwbayes.model.filters import Lag
+from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.sampling import proposals
 from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalRatioMap, fit_maps
 from bwbayes.sampling.proposals import StudentMixture
@@ -118,7 +120,7 @@ def log_banana(x: FloatArray) -> FloatArray:
 def any_totals(free: int, generator: np.random.Generator) -> TotalRatioMap:
     rows = generator.permutation(free)[: free // 2 * 2].reshape(-1, 2)
     center, scale = generator.normal(0, 5, rows.shape), np.exp(generator.normal(0, 1, rows.shape))
-    return TotalRatioMap(rows, center, scale)
+    return TotalRatioMap(rows, center, scale, generator.choice([1.0, 2.0], len(rows)))
 
 
 def any_skew(free: int, generator: np.random.Generator) -> SkewMap:
@@ -280,7 +282,9 @@ def test_the_density_is_that_of_the_draws(
 
 
 # Logarithms of two sds, of which 100 readings tell the sum of the squares, beside two others.
-TOTAL = TotalRatioMap(np.array([[2, 1]]), np.array([[-1.0, -7.0]]), np.array([[2.0, 4.0]]))
+TOTAL = TotalRatioMap(
+    np.array([[2, 1]]), np.array([[-1.0, -7.0]]), np.array([[2.0, 4.0]]), np.array([2.0])
+)
 READINGS = 100
 
 
@@ -304,15 +308,16 @@ def legs(count: int, seed: int) -> FloatArray:
 
 
 @given(st.integers(0, 10**6))
-def test_total_and_ratio_are_those_of_the_sds_and_change_no_volume(seed: int) -> None:
+def test_total_and_ratio_are_those_of_sds_or_lags_and_change_no_volume(seed: int) -> None:
     generator = np.random.default_rng(seed)
     rows = generator.permutation(5)[:4].reshape(2, 2)
     center, scale = generator.normal(0, 5, (2, 2)), np.exp(generator.normal(0, 1, (2, 2)))
-    map_, x = TotalRatioMap(rows, center, scale), generator.normal(0, 2, (3, 5))
+    map_ = TotalRatioMap(rows, center, scale, np.array([2.0, 1.0]))
+    x = generator.normal(0, 2, (3, 5))
     y, log_slope = map_.forward(x)
-    for (i, j), c, s in zip(rows, center, scale, strict=True):
+    for (i, j), c, s, total in zip(rows, center, scale, (np.hypot, np.add), strict=True):
         a, b = np.exp(c[0] + s[0] * x[:, i]), np.exp(c[1] + s[1] * x[:, j])
-        np.testing.assert_allclose(y[:, i], np.log(np.hypot(a, b)) / s[0], atol=1e-9)
+        np.testing.assert_allclose(y[:, i], np.log(total(a, b)) / s[0], atol=1e-9)
         np.testing.assert_allclose(y[:, j], np.log(b / a) / s[1], atol=1e-9)
     np.testing.assert_array_equal(log_slope, 0.0)
     step = 1e-5 * np.eye(5)
@@ -356,9 +361,19 @@ def test_the_sds_of_each_record_are_put_in_line_where_both_are_free_and_lognorma
             free(SENSOR_SD, "c"),
         )
     )
-    map_ = TotalRatioMap.of_noise(prior)
+    map_ = TotalRatioMap.of_prior(prior)
     assert map_ is not None
     np.testing.assert_array_equal([[2, 0]], map_.rows)
     np.testing.assert_allclose(np.full((1, 2), np.log(0.5)), map_.center)
     np.testing.assert_array_equal([[2.0, 2.0]], map_.scale)
-    assert TotalRatioMap.of_noise(JointPrior((free(SENSOR_SD, "a"),))) is None
+    np.testing.assert_array_equal([2.0], map_.powers)
+    assert TotalRatioMap.of_prior(JointPrior((free(SENSOR_SD, "a"),))) is None
+
+
+def test_the_first_two_lags_in_a_row_are_put_in_line() -> None:
+    declared = Lag().parameters[0], SensorLag.parameters[0], AmplifierLag.parameters[0]
+    prior = JointPrior(tuple(Parameter.of(each, lognormal(0.01, 1.0)) for each in declared))
+    map_ = TotalRatioMap.of_prior(prior)
+    assert map_ is not None
+    np.testing.assert_array_equal([[0, 2]], map_.rows)
+    np.testing.assert_array_equal([1.0], map_.powers)
