@@ -187,16 +187,6 @@ class _EffectTarget(Target):
             )[:, readings.where]
         return moved
 
-    def simulated_density(self, theta: FloatArray, displacement: FloatArray) -> FloatArray:
-        # What an effect does to the displacement is taken from the readings.
-        if self.effect is NONE:
-            return super().simulated_density(theta, displacement)
-        likelihood = self.posterior.likelihood
-        plain = self.posterior.displacement(theta[:1], np.zeros(1))[0]
-        values = likelihood.readings.values + (plain - displacement)
-        readings = replace(likelihood.readings, values=values)
-        return replace(likelihood, readings=readings).log_density(theta)
-
     def _sizes(self, coordinates: FloatArray) -> FloatArray:
         """Return the effect's sizes (models, sizes)."""
         return coordinates[:, len(self.posterior.names) :]

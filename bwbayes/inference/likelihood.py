@@ -142,13 +142,16 @@ class Likelihood:
         gaps[self.readings.rows] = self.readings.gaps[1]
         return gaps
 
-    def log_density(self, theta: FloatArray) -> FloatArray:
-        """Log density (models,) of the readings at θ (models, parameters)."""
-        if self.noise.tailed:
-            return self._followed(theta).log_density
-        return self.start(theta).log_density
+    def log_density(self, theta: FloatArray, displacement: FloatArray | None = None) -> FloatArray:
+        """Log density (models,) of the readings at θ (models, parameters).
 
-    def start(self, theta: FloatArray) -> LinearStart:
+        ``displacement`` is as in :meth:`score`.
+        """
+        if self.noise.tailed:
+            return self._followed(theta, displacement).log_density
+        return self.start(theta, displacement).log_density
+
+    def start(self, theta: FloatArray, displacement: FloatArray | None = None) -> LinearStart:
         """Integrate the unknown start out at θ (models, parameters), and say where it lies.
 
         With whitened series z₀ of the residual and Z of the responses, P = diag(σ²):
@@ -157,10 +160,11 @@ class Likelihood:
             μ = C Zᵀ z₀,   C = (P⁻¹ + Zᵀ Z)⁻¹.
 
         Where the sensor's noise has heavy tails, by the filter of
-        :mod:`~bwbayes.inference.heavy_tails`, to which the start is a state.
+        :mod:`~bwbayes.inference.heavy_tails`, to which the start is a state. ``displacement`` is
+        as in :meth:`score`.
         """
         if self.noise.tailed:
-            followed, states = self._followed(theta), self.noise.states
+            followed, states = self._followed(theta, displacement), self.noise.states
             scores = heavy_tails.normal_scores(self.spaced, self.table.noise(theta), followed)
             return LinearStart(
                 followed.log_density,
@@ -169,12 +173,13 @@ class Likelihood:
                 followed.covariance[:, states:, states:],
             )
         if self.engine == "numpy":
-            products = self.products_of_series(theta, np.empty((0, self.readings.rows.size)))
+            nothing = np.empty((0, self.readings.rows.size))
+            products = self.products_of_series(theta, nothing, displacement)
         else:
             # Here, because numba may not be installed, and takes half a second to load.
             from bwbayes.inference import compiled  # noqa: PLC0415
 
-            products = compiled.products(self, theta)
+            products = compiled.products(self, theta, displacement)
         return self._integrated(theta, *products)
 
     def score(
@@ -191,7 +196,7 @@ class Likelihood:
         that it has in effect.
 
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
-        at θ, if it is given.
+        at θ, if it is given; or (1, readings), that of all models.
         """
         products, log_determinant = self.products_of_series(theta, shapes, displacement)
         start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
@@ -311,6 +316,8 @@ class Likelihood:
         # models in the time of one.
         elements = 1 << 16 if shapes.size and self.engine == "numpy" else 1 << 23
         shapes_of_models = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
+        if displacement is not None:
+            displacement = np.broadcast_to(displacement, (len(theta), readings.rows.size))
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:

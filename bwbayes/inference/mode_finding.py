@@ -117,28 +117,12 @@ class Target:
         """Displacement (models, readings), um, nan where the prior is zero."""
         return self.posterior.displacement(theta, log_prior)
 
-    def simulated_density(
-        self,
-        theta: FloatArray,
-        displacement: FloatArray,  # noqa: ARG002  # which is the posterior's
-    ) -> FloatArray:
-        """Log likelihood (models,) of a displacement (readings,), by simulating it once more."""
-        return self.posterior.log_likelihood(theta)
-
     def noise_density(self, coordinates: FloatArray, displacement: FloatArray) -> FloatArray:
         """Log density (models,) where all models have the displacement (readings,)."""
         theta, density = self.prior(coordinates)
         possible = np.isfinite(density)
         if possible.any():
-            likelihoods = self.posterior.likelihoods
-            dense = any(2 * of.readings.rows.size > of.readings.samples for of in likelihoods)
-            if dense and self.posterior.engine == "numba":
-                # To simulate again is faster than to pass whitened series through the memory.
-                density[possible] += self.simulated_density(theta[possible], displacement)
-            else:
-                moved = np.tile(displacement, (int(np.sum(possible)), 1))
-                score = self.posterior.score(theta[possible], moved[:0], moved)
-                density[possible] += score.log_density
+            density[possible] += self.posterior.log_likelihood(theta[possible], displacement)
         return np.where(np.isfinite(density), density, -np.inf)
 
     def at(self, coordinates: FloatArray) -> list[Iterate]:

@@ -201,11 +201,19 @@ class Posterior:
             result[possible] += self.log_likelihood(self.prior.theta(free[possible]))
         return np.where(np.isfinite(result), result, -np.inf)
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood (models,) at θ (models, parameters): the sum over the records."""
+    def log_likelihood(
+        self, theta: FloatArray, displacement: FloatArray | None = None
+    ) -> FloatArray:
+        """Log likelihood (models,) at θ (models, parameters): the sum over the records.
+
+        ``displacement`` (readings,), um, takes the place of what all models do from rest, if it is
+        known; its readings are those of all records, one after the other.
+        """
         total = np.zeros(len(theta))
-        for dataset, likelihood in zip(self.datasets, self.likelihoods, strict=True):
-            total += likelihood.log_density(self.table.of(theta, dataset.name))
+        of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
+        for dataset, likelihood, columns in of_records:
+            moved = None if displacement is None else displacement[np.newaxis, columns]
+            total += likelihood.log_density(self.table.of(theta, dataset.name), moved)
         return total
 
     @cached_property

@@ -253,6 +253,11 @@ class Actuator:
         result += level[:, np.newaxis]
         return result, equilibrium, filtered
 
+    @cached_property
+    def linear(self) -> Actuator:
+        """Dynamics and creep alone: what follows the drive without further stages."""
+        return replace(self, nonlinearity=None, stages=())
+
     @property
     def static(self) -> Actuator:
         """The same, as far as only the path of the voltage counts, not its pace."""

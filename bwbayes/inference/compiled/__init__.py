@@ -9,7 +9,6 @@ others the drive comes from NumPy, and the rest of the work is compiled still.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,14 +43,19 @@ def warm_up(posterior: Posterior) -> None:
     likelihood.whiten(likelihood.table.noise(theta), series)
 
 
-def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def products(
+    likelihood: Likelihood, theta: FloatArray, displacement: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return Σ zᵢ zⱼ of whitened series, and log determinants, as the NumPy likelihood does.
 
     At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
+    ``displacement`` is as in :meth:`~bwbayes.inference.likelihood.Likelihood.score`.
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
-    if noise.states > LANE_STATES:
-        return likelihood.products_of_series(theta, np.empty((0, likelihood.readings.rows.size)))
+    readings, is_known = likelihood.readings, displacement is not None
+    # Where readings are few, to pass over all samples takes longer than to whiten the readings.
+    if noise.states > LANE_STATES or (is_known and 2 * readings.rows.size < readings.samples):
+        return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
     voltage = likelihood.inputs_read.voltage
     offset = int(likelihood.offset_sd > 0)
     free = likelihood.unknowns - offset
@@ -62,10 +66,11 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
     record, sections = (voltage, likelihood.values, gaps), actuator.sections(column)
-    # What further stages leave is simulated beforehand, and only follows here.
-    core = replace(actuator, nonlinearity=None, stages=()) if actuator.stages else actuator
-    together, make = shared(core, voltage), simulated if actuator.stages else physics
-    for rows, stage in _staged(likelihood, column, voltage):
+    # What is simulated beforehand only follows here.
+    simulates = bool(actuator.stages) or is_known
+    core, make = (actuator.linear, simulated) if simulates else (actuator, physics)
+    together = shared(core, voltage)
+    for rows, stage in _staged(likelihood, column, voltage, displacement):
         equilibrium = np.zeros(len(theta))
         equilibrium[rows] = stage.equilibrium
         named = make(actuator, sections, column, equilibrium, voltage) | filtering
@@ -78,7 +83,7 @@ def products(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, Flo
     pairs = np.empty((len(theta), size, size))
     i, j = np.tril_indices(size)
     pairs[:, i, j] = pairs[:, j, i] = sums[: i.size].T
-    typical = likelihood.readings.rows.size * np.log(filtering["q_11"] + filtering["sensor"])
+    typical = readings.rows.size * np.log(filtering["q_11"] + filtering["sensor"])
     return pairs, typical + sums[lanes.LOG_DETERMINANT]
 
 
@@ -172,10 +177,18 @@ def _over_gaps(steps: FloatArray) -> FloatArray:
 
 
 def _staged(
-    likelihood: Likelihood, column: Values, voltage: FloatArray
+    likelihood: Likelihood, column: Values, voltage: FloatArray, displacement: FloatArray | None
 ) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
-    """Yield which models go together, and the stage that makes their drive."""
+    """Yield which models go together, and the stage that makes their drive.
+
+    That is the ``displacement`` (models, readings), or (1, readings), where it is known.
+    """
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
+    if displacement is not None:
+        moved = np.zeros((len(displacement), voltage.size))
+        moved[:, likelihood.readings.where] = displacement
+        yield slice(None), given(moved, column["offset"].size)
+        return
     if actuator.stages:
         theta = np.stack([column[name] for name in actuator.parameters], axis=1)
         for batch in batches(len(theta), voltage.size):

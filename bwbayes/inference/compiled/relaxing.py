@@ -12,7 +12,8 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.lanes import LANES, inner
 from bwbayes.model import relaxing as formulas
-from bwbayes.model.compiled import compiled
+from bwbayes.model.compiled import compiled, formula
+from bwbayes.model.elementwise import gone
 from bwbayes.model.relaxing import BENT, SHORT, RelaxingStep
 
 relax, bent = compiled(formulas.relax), compiled(formulas.bent)
@@ -182,3 +183,54 @@ def _phi(group: FloatArray, s: float, v: float, steepest: float, curved: bool) -
             z, phi_1 = group[Z + i], group[PHI_1 + i]
             group[PHI_1 + i] = phi_1 * (1.0 - 0.5 * z * phi_1)
             group[Z + i] = 2.0 * z
+
+
+@inner()
+def steps_moved(
+    step: RelaxingStep,
+    numbers: FloatArray,
+    memory: FloatArray,
+    voltage: FloatArray,
+    after: FloatArray,
+    w: FloatArray,
+) -> None:
+    """Move models to voltages (lanes,) of their own; write w and the memory after them.
+
+    ``numbers`` have a further row, whether any model's f, a or rate is more than a constant.
+    """
+    each = numbers[-1, 0] > 0.0
+    passed = 0 if each else _moved_apart(numbers, memory, voltage, after, w)
+    if each or passed > 0:
+        for i in range(LANES):
+            # Where h passed zero its rate has changed on the way.
+            if each or memory[1, i] * after[1, i] < 0.0:
+                w[i], _ = formula(step, numbers[:, i], memory[:, i], voltage[i], after[:, i])
+
+
+@inner(fastmath={"contract", "nsz"}, error_model="numpy")
+def _moved_apart(
+    numbers: FloatArray,
+    memory: FloatArray,
+    voltage: FloatArray,
+    after: FloatArray,
+    w: FloatArray,
+) -> int:
+    """Move models with a constant strength and one rate; return how many passed zero."""
+    passed = 0
+    for i in range(LANES):
+        d, alpha, against, ahead = numbers[0, i], numbers[3, i], numbers[6, i], numbers[10, i]
+        before, h, u = memory[0, i], memory[1, i], voltage[i]
+        s = 1.0 if u >= before else -1.0
+        v = abs(u - before)
+        g = s * h
+        rate = against if g < 0.0 else ahead
+        z = rate * v
+        is_short = abs(z) <= SHORT
+        # As in phi, h has left any start long before a negative rate has grown it by so much.
+        far = gone(max(z, -100.0)) / (1.0 if is_short else z)
+        new = relax(g, v, alpha, rate, series(z) if is_short else far)
+        passed += (g < 0.0) & (new > 0.0)
+        after[0, i] = u
+        after[1, i] = s * new
+        w[i] = d * u - s * new
+    return passed

@@ -24,6 +24,7 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.stage import Stage
 from bwbayes.model.step import HysteresisStep
 
 Kind = HysteresisStep | RemembersExtrema | None
@@ -67,10 +68,13 @@ def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
     return pinned.drive if integrated else type(operator).advance
 
 
-def given(drive: FloatArray) -> CompiledDrive:
-    """Take a known drive (models, samples), um."""
-    equilibrium = drive[:, 0]
-    group = np.stack([np.arange(equilibrium.size), equilibrium], axis=1)
+def given(drive: FloatArray, models: int | None = None) -> CompiledDrive:
+    """Take a known drive (models, samples), um; of so many ``models`` it may be one for all."""
+    number = np.arange(len(drive))
+    if models is not None:
+        number = np.broadcast_to(number, models)
+    equilibrium = drive[number, 0]
+    group = np.stack([number, equilibrium], axis=1)
     # All that follows would be compiled once more for another layout.
     return CompiledDrive(None, equilibrium, group, np.ascontiguousarray(drive))
 
@@ -100,6 +104,54 @@ def _compiled_drive_of(
     return lambda kind, group, plan, voltage, first, last, out: stage(  # noqa: PLW0108  # a source
         kind, group, plan, voltage, first, last, out
     )
+
+
+def move_lanes(kind: Any, numbers: Any, memory: Any, values: Any, after: Any, result: Any) -> None:
+    """Write what comes out of a sample's values (lanes,), and the memory after it.
+
+    Of a stage, or of an operator's step along voltages of the models' own; ``numbers``, ``memory``
+    and ``after`` are (any, lanes).
+    """
+    raise NotImplementedError
+
+
+@overload(move_lanes, strict=False)
+def _compiled_move_lanes(
+    kind: Any, numbers: Any, memory: Any, values: Any, after: Any, result: Any
+) -> Any:
+    del numbers, memory, values, after, result
+    move: Any = _stages_moved if issubclass(kind.kind, Stage) else _steps_moved
+    if issubclass(kind.kind, RelaxingStep):
+        move = relaxing.steps_moved
+    return lambda kind, numbers, memory, values, after, result: move(  # noqa: PLW0108  # a source
+        kind, numbers, memory, values, after, result
+    )
+
+
+@inner()
+def _stages_moved(
+    stage: Stage,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    after: FloatArray,
+    result: FloatArray,
+) -> None:
+    for i in range(LANES):
+        result[i] = formula(stage, numbers[:, i], memory[:, i], values[i], after[:, i])
+
+
+@inner()
+def _steps_moved(
+    step: HysteresisStep,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    after: FloatArray,
+    result: FloatArray,
+) -> None:
+    for i in range(LANES):
+        result[i], _ = formula(step, numbers[:, i], memory[:, i], values[i], after[:, i])
 
 
 @inner(fastmath={"contract", "nsz"})

@@ -1,32 +1,40 @@
 """The displacement on the compiled engine: models that walk along a voltage, piece by piece.
 
 What the likelihood does sample by sample, without its noise: the same stages, nonlinearity and
-dynamics, for ``LANES`` models side by side. Where stages before the hysteresis give each model a
-voltage of its own, hysteresis and nonlinearity are worked out one model after the other. So are all
-stages: what stands behind the dynamics is seldom there, and not worth a place among the lanes.
+dynamics, for ``LANES`` models side by side. Further stages, and the hysteresis where stages before
+it give each model a voltage of its own, take whole pieces one after the other, models side by side
+too: what is seldom there is not worth a place in the loop that all others share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes
+from bwbayes.inference.compiled.lanes import LAG, LANES, STATE, X1, by_rows, in_lanes, inner
 from bwbayes.inference.compiled.motion import PIECE, displace, physics, shared
-from bwbayes.inference.compiled.stages import Kind, advance_of, drive_of, given, prepared
+from bwbayes.inference.compiled.relaxing import planned
+from bwbayes.inference.compiled.stages import (
+    Kind,
+    advance_of,
+    drive_of,
+    given,
+    move_lanes,
+    prepared,
+)
 from bwbayes.model.actuator import Actuator, each_model
-from bwbayes.model.compiled import formula
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
+from bwbayes.model.operators.scalar_memory import OneState
+from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.stage import Stage, pass_stages
-from bwbayes.model.step import HysteresisStep
+from bwbayes.model.step import HysteresisStep, OneStateStep
 
 
 def walk(
@@ -48,9 +56,8 @@ def walk(
     if not actuator.stages:
         return _walk_core(actuator, column, inputs, initial_transient, from_rest)
     # The offset comes last.
-    inner = replace(actuator, stages=actuator.inputs)
     without_offset = column | {"offset": np.zeros(len(theta))}
-    core = _walk_core(inner, without_offset, inputs, initial_transient, from_rest)
+    core = _walk_core(actuator, without_offset, inputs, initial_transient, from_rest)
     memories: tuple[FloatArray, ...] | None = None
     now = 0
 
@@ -78,7 +85,7 @@ def _walk_core(
     operator, voltage, compiled = actuator.hysteresis, inputs.voltage, None
     if actuator.inputs:
         advance, memory = _of_own(actuator, column, inputs, from_rest)
-        actuator = replace(actuator, nonlinearity=None)  # it is in the drive
+        actuator = actuator.linear  # the nonlinearity is in the drive
     else:
         along = advance_of(operator)
 
@@ -130,15 +137,18 @@ def _of_own(
     before = actuator.begin_inputs(column, inputs, from_rest=from_rest)
     first, _ = actuator.pass_inputs(column, inputs[:1], before)
     span = actuator.range_of(inputs.voltage)
-    memory = actuator.begin(column, first, from_rest=from_rest, span=span)
-    step = None
+    step, memory = None, None
     # Those that remember extrema have another memory than their step has.
     if type(operator).step is not Operator.step and not isinstance(operator, RemembersExtrema):
         step = operator.step(column)
-    if step is not None:
-        steps = (operator.step(values) for values in each_model(column))
-        remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
-        memory = np.concatenate(remembered)
+    if isinstance(operator, OneState) and isinstance(step, OneStateStep):
+        memory = operator.begin_apart(column, step, first[:, 0], from_rest=from_rest)
+    else:
+        memory = actuator.begin(column, first, from_rest=from_rest, span=span)
+        if step is not None:
+            steps = (operator.step(values) for values in each_model(column))
+            remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
+            memory = np.concatenate(remembered)
 
     def advance(piece: Inputs, memories: Any) -> tuple[FloatArray, Any]:
         before, memory = memories
@@ -202,43 +212,58 @@ def _drive_of_own(
 
     And what the step remembers after them, (models, any), as ``memory`` is before.
     """
-    drive, after = np.empty(voltage.shape), memory.copy()
-    _step(step, step.parameters, after, np.ascontiguousarray(voltage), drive)
+    drive, after, numbers = np.empty(voltage.shape), memory.copy(), step.parameters
+    if isinstance(step, RelaxingStep):
+        # Its lanes know which of them are straight and unsigned.
+        numbers = np.column_stack([numbers, np.full(len(numbers), planned(step).any())])
+    _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty(0), drive)
     return drive, after
 
 
 @compile_cached()
 def _pass(
-    stage: Stage,
+    kind: Stage | HysteresisStep,
     numbers: FloatArray,
     memory: FloatArray,
     values: FloatArray,
     seen: FloatArray,
     result: FloatArray,
 ) -> None:
-    """Write what comes out of values, and move the memory on."""
-    after = np.empty(memory.shape[1])
-    for i in range(values.shape[0]):
-        for t in range(values.shape[1]):
-            if seen.size > 0:
-                numbers[i, -1] = seen[t]
-            result[i, t] = formula(stage, numbers[i], memory[i], values[i, t], after)
-            for k in range(after.size):
-                memory[i, k] = after[k]
+    """Write what comes out of values (models, samples), and move the memory on."""
+    models, samples = values.shape
+    rows = np.empty((numbers.shape[1], LANES))
+    now, after = np.empty((memory.shape[1], LANES)), np.empty((memory.shape[1], LANES))
+    entering, leaving = np.empty((PIECE, LANES)), np.empty((PIECE, LANES))
+    for group in range(0, models, LANES):
+        _enter(numbers, group, 0, rows)
+        _enter(memory, group, 0, now)
+        for first in range(0, samples, PIECE):
+            last = min(first + PIECE, samples)
+            _enter(values, group, first, entering[: last - first])
+            for t in range(last - first):
+                if seen.size > 0:
+                    rows[-1, :] = seen[first + t]
+                move_lanes(kind, rows, now, entering[t], after, leaving[t])
+                now[:] = after
+            _leave(leaving[: last - first], group, first, result)
+        _leave(now, group, 0, memory)
 
 
-@compile_cached()
-def _step(
-    step: HysteresisStep,
-    parameters: FloatArray,
-    memory: FloatArray,
-    voltage: FloatArray,
-    drive: FloatArray,
-) -> None:
-    """Write the drive along voltages, and move the memory on."""
-    after = np.empty(memory.shape[1])
-    for i in range(voltage.shape[0]):
-        for t in range(voltage.shape[1]):
-            drive[i, t], _ = formula(step, parameters[i], memory[i], voltage[i, t], after)
-            for k in range(after.size):
-                memory[i, k] = after[k]
+@inner()
+def _enter(rows: FloatArray, group: int, first: int, lanes: FloatArray) -> None:
+    """Put columns of some models (models, any) side by side, (columns, lanes).
+
+    Lanes to spare repeat the last model.
+    """
+    for i in range(LANES):
+        model = min(group + i, rows.shape[0] - 1)
+        for k in range(lanes.shape[0]):
+            lanes[k, i] = rows[model, first + k]
+
+
+@inner()
+def _leave(lanes: FloatArray, group: int, first: int, rows: FloatArray) -> None:
+    """Put what is side by side (columns, lanes) back into rows (models, any)."""
+    for i in range(min(LANES, rows.shape[0] - group)):
+        for k in range(lanes.shape[0]):
+            rows[group + i, first + k] = lanes[k, i]

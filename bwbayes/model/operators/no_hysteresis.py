@@ -34,7 +34,7 @@ class NoHysteresis(OneState):
         slope = replace(d(), default=lambda c: lognormal(c.ranges.slope, 0.6), bounds=None)
         return slope, replace(initial(), default=lambda _: 0.0)
 
-    def first_state(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002  # any
+    def first_state(self, column: Values, voltage: float | FloatArray) -> FloatArray:  # noqa: ARG002  # any
         """Return zero."""
         return np.zeros_like(column["d"])
 

@@ -123,7 +123,7 @@ class Pinned(OneState):
         """Return U/k."""
         return half_range / column["pinning"]
 
-    def first_state(self, column: Values, voltage: float) -> FloatArray:
+    def first_state(self, column: Values, voltage: float | FloatArray) -> FloatArray:
         """Return P_irr (models,) of walls that lag behind P_an by ``initial``, um.
 
         P = P_an − (1 − c) (P_an − P_irr), so that P_an is what all walls would do in another field.

@@ -28,7 +28,7 @@ Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 class StateMemory(NamedTuple):
     """The last voltage, V, and the state (models,) there, um."""
 
-    voltage: float
+    voltage: float | FloatArray
     state: FloatArray
 
 
@@ -73,7 +73,16 @@ class OneState(Operator):
             state = self.trace(column, np.array([0.0, voltage]), state)[1]
         return StateMemory(voltage, state)
 
-    def first_state(self, column: Values, voltage: float) -> FloatArray:  # noqa: ARG002  # any
+    def begin_apart(
+        self, column: Values, step: OneStateStep, voltage: FloatArray, *, from_rest: bool
+    ) -> FloatArray:
+        """Return the memory of the operator's step at first voltages (models,) of their own."""
+        if not from_rest:
+            return step.remembered(StateMemory(voltage, self.first_state(column, voltage)))
+        at_zero = step.remembered(StateMemory(0.0, self.first_state(column, 0.0)))
+        return step.apply(at_zero, voltage).memory
+
+    def first_state(self, column: Values, voltage: float | FloatArray) -> FloatArray:  # noqa: ARG002  # any
         """Return the state (models,) that ``initial`` means at a voltage, V: by default itself."""
         return column["initial"]
 
