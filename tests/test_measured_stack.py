@@ -94,7 +94,9 @@ def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any, folder: Pat
     held_out = honest["validation"]["held_out"]
     fit = open_finished(RunFolder.open(folder))
     flat = fit.result.flat_draws
-    sets = [predictions(fit.problem, flat[i::8], fit.rivals, training=False) for i in range(8)]
+    sets = [
+        predictions(fit.problem, flat[i::8], fit.widening_rivals, training=False) for i in range(8)
+    ]
     covered = [np.mean(bands.covers("sensor", 95, np.asarray(bands.measured))) for (bands,) in sets]
     error = held_out["coverage_error"]["sensor"]["95"]
     assert abs(float(np.mean(covered)) - 0.95) <= 2 * error

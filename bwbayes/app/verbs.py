@@ -39,6 +39,8 @@ class Verb:
         The ways to give the argument after the fit: a word, an option, or an option with a FILE;
         and how the error for none or two of them calls each. The argument's description has a
         sentence on each way, in their order.
+    instead
+        The option that takes the place of that argument.
     below
         Subfolder of FOLDER for the files, by default the verb's name; NAME is the argument's.
     """
@@ -46,6 +48,7 @@ class Verb:
     place: str
     flags: Mapping[str, str] = field(default_factory=dict)
     either: Mapping[str, str] = field(default_factory=dict)
+    instead: str = ""
     below: str = ""
 
     @property
@@ -90,15 +93,21 @@ class Verb:
 
     @property
     def product(self) -> str:
-        """The type of what it returns."""
-        return ast.unparse(self._source.returns) if self._source.returns else ""
+        """The type of what it returns; of several, the first."""
+        returned = ast.unparse(self._source.returns) if self._source.returns else ""
+        return returned.partition(" | ")[0]
 
     @property
     def words(self) -> dict[str, str]:
-        """The type hints of the arguments without a default after the fit."""
+        """The type hints of the arguments after the fit without a default, or with None for one."""
         args = self._source.args
-        required = args.args[1 : len(args.args) - len(args.defaults)]
-        return {arg.arg: ast.unparse(arg.annotation) for arg in required if arg.annotation}
+        defaults = [ast.unparse(default) for default in args.defaults]
+        has_value = [False] * (len(args.args) - len(defaults)) + [d != "None" for d in defaults]
+        return {
+            arg.arg: ast.unparse(arg.annotation).removesuffix(" | None")
+            for arg, valued in zip(args.args[1:], has_value[1:], strict=True)
+            if arg.annotation and not valued
+        }
 
     def options(self) -> Iterator[tuple[str, str, Any, str]]:
         """Yield name, type hint, default and help of the keyword arguments.
@@ -123,6 +132,7 @@ VERBS = (
     Verb(
         "bwbayes.app.jobs.design:design",
         either={"--parameter": "a parameter", "--drive FILE": "a drive"},
+        instead="validate",
     ),
     Verb("bwbayes.app.jobs.control:export"),
     Verb("bwbayes.app.jobs.control:track", flags={"frequencies": "frequency"}),

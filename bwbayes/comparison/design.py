@@ -10,23 +10,32 @@ error.
 Every reading counts as often as a fit counts it, which trusts the noise model: what the model is
 wrong about returns with every period of a steady drive, and is not taken for new each time only as
 far as the discrepancy's correlation time says so.
+
+:func:`rank_by_rivals` ranks by what would tell a model from its rivals, other models that fit the
+same record (:mod:`bwbayes.diagnosis.rivals`): by how much they differ along a candidate, and what
+would be left of their differences if they were fitted to it, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.comparison.designed import DesignScore
+from bwbayes.comparison.designed import DesignScore, RivalScore
+from bwbayes.diagnosis.explanations import TIED
+from bwbayes.diagnosis.rivals import DRAWS, Rival, close_rivals
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.model.limits import Limits
+from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
+from bwbayes.record.record import Record
 from bwbayes.watching import Watch, part, unwatched, watched
 
 
@@ -159,3 +168,156 @@ def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:
     """Mean over columns g of √(gᵀ Σ g), for gradients (coordinates, targets)."""
     variances = np.einsum("it,ij,jt->t", gradient, covariance, gradient)
     return float(np.mean(np.sqrt(np.maximum(variances, 0))))
+
+
+# Samples of a candidate that are looked at, and the part of it that only sets the state.
+SAMPLES, SETTLING = 1_000, 0.25
+
+
+class _Paths:
+    """What draws of a model do along candidates: deviations (draws, samples) from their mean."""
+
+    def __init__(
+        self,
+        posterior: Posterior,
+        free: FloatArray,
+        candidates: Mapping[str, FloatArray],
+        rng: np.random.Generator,
+    ) -> None:
+        dataset, theta = posterior.single_record, posterior.prior.theta(free)
+        self.posterior, self.interval = posterior, dataset.actuator.interval
+        self.noise = np.median(dataset.table.noise(theta), axis=0, keepdims=True)
+        self.mean, self.deviations, self.stride = {}, {}, {}
+        for name, voltage in candidates.items():
+            record = Record(voltage, None, interval=self.interval, origin=name)
+            start = InitialConditions(from_rest=True, hold=dataset.actuator.hold)
+            states = estimate_initial_states(posterior, theta, record, start, rng)
+            first = round(SETTLING * voltage.size)
+            self.stride[name] = -(-(voltage.size - first) // SAMPLES)
+            paths = states.displacement(record.inputs)[:, first :: self.stride[name]]
+            # Where a record's sensor was set to zero, nothing says.
+            paths -= paths.mean(axis=1, keepdims=True)
+            self.mean[name] = paths.mean(axis=0)
+            self.deviations[name] = (paths - self.mean[name]) / np.sqrt(max(len(paths) - 1, 1))
+
+    def sd(self, name: str) -> float:
+        """Return the sd of a reading, given what is known of the model, um."""
+        sds = self.posterior.single_record.noise.marginal_sd(self.noise)
+        return float(
+            np.sqrt(
+                np.mean(np.sum(self.deviations[name] ** 2, axis=0)) + sum(s[0] ** 2 for s in sds)
+            )
+        )
+
+    def fit(self, name: str, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Fit readings (records, samples), um, along a candidate, linear in the draws' deviations.
+
+        Returns the sizes (records, draws) of the deviations, and the nats (records,) that their
+        evidence trails that of a model that makes the readings, but for what any fit takes up.
+        """
+        residual, known = readings - self.mean[name], self.deviations[name]
+        constant = np.full((1, residual.shape[1]), self.posterior.single_record.extent)
+        shapes = np.concatenate([known, constant])
+        noise = self.posterior.single_record.noise.at(self.stride[name] * self.interval)
+        series = np.concatenate([shapes, residual])[np.newaxis]
+        white = noise.whiten(self.noise, series)[0][0]
+        inside, outside = white[: len(shapes)], white[len(shapes) :]
+        pull = inside @ outside.T
+        sizes = np.linalg.solve(np.eye(len(shapes)) + inside @ inside.T, pull).T
+        nats = (np.sum(outside**2, axis=1) - np.sum(sizes.T * pull, axis=0)) / 2
+        return sizes[:, :-1], nats
+
+
+def rank_by_rivals(
+    posterior: Posterior,
+    draws: FloatArray,
+    study: Study,
+    rivals: Sequence[Rival],
+    candidates: Mapping[str, FloatArray],
+    amplifier: Limits,
+    rng: np.random.Generator,
+    watch: Watch = unwatched,
+) -> list[RivalScore]:
+    """Rank candidates by what would be left of the rivals' differences, the best first.
+
+    In turn each model, of those that fit the training record about as well as the best, makes the
+    readings of a candidate, and the others are fitted to them, linear in their parameters about
+    their fit of the training record. Those whose evidence trails by odds of more than twenty to one
+    are told apart. What is left is the root mean square, over all other pairs and all candidates,
+    of what a fitted model differs from the one that made the readings, as a part of what they
+    differ now.
+
+    Parameters
+    ----------
+    posterior, draws
+        The model: a posterior of one record, and draws (draws, free).
+    study, rivals
+        The study of that record, and other fits of it.
+    candidates
+        Voltages (samples,) by name, V, at the interval of the fitted record, from rest.
+    amplifier
+        Limits of the amplifier.
+    rng
+        Draws parameters and initial states.
+    watch
+        Called with the share that is done.
+
+    Raises
+    ------
+    InputError
+        No rival fits the record about as well.
+    """
+    refused = {
+        name: amplifier.refuses(voltage, posterior.single_record.actuator.interval)
+        for name, voltage in candidates.items()
+    }
+    possible = {name: voltage for name, voltage in candidates.items() if not refused[name]}
+    scores = [RivalScore(name, np.nan, np.nan, why) for name, why in refused.items() if why]
+    if not possible:
+        return scores
+    draws = draws[rng.integers(len(draws), size=DRAWS)]
+    readings = posterior.single_record.readings
+    fitted = np.mean(posterior.simulate(posterior.prior.theta(draws), readings.rows), axis=0)
+    close = close_rivals(rivals, float(np.std(readings.values - fitted)))
+    if not close:
+        raise InputError("design: no other model fits the training record about as well")
+    models = [(posterior, draws)]
+    for rival in close:
+        model = rival.posterior(study)
+        models.append((model, rival.draw(model, rng)))
+    paths = [_Paths(*model, possible, rng) for model in watched(models, watch)]
+    truths = {name: np.stack([path.mean[name] for path in paths]) for name in possible}
+    now = _pairs_mean_square(
+        {name: [truths[name] - p.mean[name] for p in paths] for name in possible}
+    )
+    for name in possible:
+        remaining: dict[str, list[FloatArray]] = {other: [] for other in possible}
+        told_apart = 0
+        for path in paths:
+            sizes, nats = path.fit(name, truths[name])
+            out = nats > TIED
+            told_apart += int(np.sum(out))
+            for other in possible:
+                learned = path.mean[other] + sizes @ path.deviations[other]
+                remaining[other].append(np.where(out[:, np.newaxis], 0.0, truths[other] - learned))
+        difference = np.sqrt(np.mean((truths[name][1:] - truths[name][0]) ** 2))
+        scores.append(
+            RivalScore(
+                name,
+                float(np.sqrt(_pairs_mean_square(remaining) / now)),
+                np.nan,
+                difference_um=float(difference),
+                sd_um=paths[0].sd(name),
+                told_apart=told_apart / (len(paths) * (len(paths) - 1)),
+            )
+        )
+    return sorted(scores, key=lambda score: (bool(score.refused), score.sd_ratio, score.name))
+
+
+def _pairs_mean_square(differences: Mapping[str, Sequence[FloatArray]]) -> float:
+    """Return the mean square over pairs of models, and over candidates, um².
+
+    A model's own readings do not differ from it.
+    """
+    squares = [np.mean(np.square(of_model)) for all_ in differences.values() for of_model in all_]
+    return float(np.mean(squares))

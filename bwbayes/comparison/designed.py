@@ -58,6 +58,26 @@ class DesignScore:
 
 
 @dataclass(frozen=True)
+class RivalScore(DesignScore):
+    """What a candidate signal tells of a model and its rivals; ``sd_ratio`` is of what they differ.
+
+    Attributes
+    ----------
+    difference_um
+        Root mean square difference of the rivals from the model along it, um.
+    sd_um
+        Sd of a reading along it, as the model's bands have it without the rivals, um.
+    told_apart
+        Part of the pairs of models whose evidence would differ by odds of more than twenty to one,
+        if it was fitted as well.
+    """
+
+    difference_um: float = np.nan
+    sd_um: float = np.nan
+    told_apart: float = np.nan
+
+
+@dataclass(frozen=True)
 class Design(Product, Sequence[DesignScore]):
     """What to measure next, from a run: a sequence of its promises.
 
@@ -219,5 +239,130 @@ class Design(Product, Sequence[DesignScore]):
             "with an offset and an initial state of its own (none where the record that was fitted "
             "starts from rest). The noise model is trusted: what the model is wrong about returns "
             "each time that a signal repeats itself.",
+            on="both",
+        )
+
+
+@dataclass(frozen=True)
+class RivalDesign(Design):
+    """What to measure to tell a model from its rivals: a record to validate on, one to train on."""
+
+    __repr__ = brief
+
+    scores: Sequence[RivalScore]
+
+    @property
+    def validation(self) -> RivalScore:
+        """The candidate along which rivals differ most."""
+        return max(
+            (score for score in self.scores if not score.refused),
+            key=lambda score: score.difference_um,
+        )
+
+    @property
+    def training(self) -> RivalScore:
+        """The candidate that would leave least of the rivals' differences, if it was fitted."""
+        return self.scores[0]
+
+    @property
+    def quantity(self) -> str:
+        """What the promises are parts of, in words."""
+        return "difference of rivals left"
+
+    def records(self) -> dict[str, Record]:
+        """Return both signals as records that a signal generator can play."""
+        return {
+            name: Record(
+                self.signals[score.name], None, interval=self.interval, voltage_is="command"
+            )
+            for name, score in (("validate", self.validation), ("train", self.training))
+        }
+
+    def numbers(self) -> dict[str, object]:
+        """Return what ``design.json`` holds."""
+        return {
+            **super().numbers(),
+            "validate": self.validation.name,
+            "train": self.training.name,
+        }
+
+    def report(self) -> Report:
+        """Return which signals tell the model from its rivals, and by how much, to be shown."""
+        from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415
+
+        validation, training = self.validation, self.training
+        seconds = self.interval * self.signals[validation.name].size
+        differ = (
+            f"along it rivals differ from the model by {validation.difference_um:.2g} um, "
+            f"{validation.difference_um / validation.sd_um:.2g} times the SD of a reading"
+        )
+        left = (
+            f"fitted, too, it would leave {training.sd_ratio:.0%} of the rivals' differences, and "
+            f"tell {training.told_apart:.0%} of all pairs of models apart"
+        )
+        files = {
+            "validate": f"Validation record: {validation.name}",
+            "train": f"Training record: {training.name}",
+        }
+        pictures = [
+            replace(
+                record_pictures(record, (), ())["time"],
+                name=name,
+                title=files[name],
+                caption=f"Its voltage, as {name}.csv has it for the signal generator.",
+            )
+            for name, record in self.records().items()
+        ]
+        facts = [
+            ("Run", self.run),
+            ("Voltages", f"{self.amplifier.low:.4g} to {self.amplifier.high:.4g} V"),
+            ("Fastest", f"{self.amplifier.rate:.4g} V/s"),
+            ("Sampling interval", f"{self.interval:g} s"),
+        ]
+        return Report(
+            title="What to measure next",
+            banners=[
+                *standing_banner(self.standing),
+                Banner(
+                    kind_of(self.standing),
+                    f"Validate on: {validation.name}, {seconds:.3g} s",
+                    [differ],
+                ),
+                Banner("note", f"Train on: {training.name}", [left]),
+                *remarks_banner(
+                    [f"{p.name} {p.refused}" for p in self.scores if p.refused],
+                    "What the amplifier cannot make",
+                ),
+            ],
+            blocks=[
+                self._rivals_table(),
+                *pictures,
+                Section("Request", [Facts(facts)], folded=False),
+            ],
+            numbers=self.numbers(),
+        )
+
+    def _rivals_table(self) -> Table:
+        rows = []
+        for score in self.scores:
+            cells = (
+                f"{score.difference_um:.2g} um",
+                f"{score.difference_um / score.sd_um:.2g}",
+                f"{score.sd_ratio:.0%}",
+                f"{score.told_apart:.0%}",
+            )
+            rows.append((score.name, *("–" if score.refused else cell for cell in cells)))
+        columns = ("Candidate", "Rivals differ by", "Over SD", "Left if fitted", "Told apart")
+        return Table(
+            "candidates",
+            "Rivals along the candidates",
+            columns,
+            rows,
+            records=[asdict(score) for score in self.scores],
+            note="Rivals are models of other families that fit the training record about as well. "
+            "Over SD: their difference from the model, over the SD of a reading without them. Left "
+            "if fitted: the part of all differences between models that would be left if the "
+            "candidate was fitted as well; told apart: the part of the pairs of models whose "
+            "evidence would differ by odds of more than twenty to one.",
             on="both",
         )

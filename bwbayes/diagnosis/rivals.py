@@ -113,6 +113,12 @@ def fit_rivals(
     return tuple(rivals)
 
 
+def close_rivals(rivals: Sequence[Rival], rmse: float) -> list[Rival]:
+    """Return those that fit the training about as well as the best, or as a model of that rmse."""
+    limit = MISSES * min([rmse, *(rival.rmse for rival in rivals)])
+    return [rival for rival in rivals if rival.rmse <= limit]
+
+
 def disagreement(
     posterior: Posterior,
     draws: FloatArray,
@@ -140,13 +146,10 @@ def disagreement(
     draws = draws[rng.integers(len(draws), size=DRAWS)]
     readings = posterior.single_record.readings
     fitted = np.mean(posterior.simulate(posterior.prior.theta(draws), readings.rows), axis=0)
-    limit = MISSES * min([float(np.std(readings.values - fitted)), *(r.rmse for r in rivals)])
     predicted = predict(posterior, draws)
     scored = slice(predicted.scored_from, None)
     excess = []
-    for rival in rivals:
-        if rival.rmse > limit:
-            continue
+    for rival in close_rivals(rivals, float(np.std(readings.values - fitted))):
         other = rival.posterior(study)
         free = other.prior.constrain(rival.coordinates[np.newaxis])[0]
         trained = other.simulate(other.prior.theta(free), readings.rows)[0]

@@ -1,9 +1,10 @@
 """The voltages that drive an actuator: the paper's signals, and parts to build others from.
 
-A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`) times an
-amplitude :class:`Decay`, switched on at a start time and sampled at a rate; a step is a staircase
-of one level. The paper's own signals are made of these, and :func:`signal` finds them by
-name. A value that is not finite, or not what its description says, is an :class:`InputError`.
+A :class:`Waveform` is a carrier (:class:`Sine`, :class:`Triangle`, :class:`Staircase`,
+:class:`Multisine`) times an amplitude :class:`Decay`, switched on at a start time and sampled at a
+rate; a step is a staircase of one level. The paper's own signals are made of these, and
+:func:`signal` finds them by name. A value that is not finite, or not what its description says, is
+an :class:`InputError`.
 """
 
 from __future__ import annotations
@@ -99,11 +100,14 @@ class Staircase:
     levels : tuple of float
         Levels in V, in their order; at least one.
     dwell : float
-        Time on each level, s, above zero.
+        Time from one level to the next, s, above zero.
+    rate : float
+        How fast the voltage goes to the next level, V/s; a jump by default.
     """
 
     levels: tuple[float, ...]
     dwell: float
+    rate: float = math.inf
 
     def __post_init__(self) -> None:
         if not self.levels:
@@ -122,7 +126,39 @@ class Staircase:
         # A sample at the very end of a level belongs to the next one, whatever the rounding.
         passed = np.floor(elapsed / self.dwell + 1e-9)
         index = np.minimum(passed, len(self.levels) - 1).astype(np.int64)
-        return np.asarray(self.levels, dtype=np.float64)[index]
+        levels = np.asarray(self.levels, dtype=np.float64)
+        if math.isinf(self.rate):
+            return levels[index]
+        before = levels[np.maximum(index - 1, 0)]
+        moved = self.rate * (elapsed - self.dwell * index)
+        return before + np.clip(levels[index] - before, -moved, moved)
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """The mean of sines of one amplitude: reversals at many voltages.
+
+    Parameters
+    ----------
+    amplitude : float
+        V.
+    frequencies : tuple of float
+        Hz, above zero, one or more.
+    """
+
+    amplitude: float
+    frequencies: tuple[float, ...]
+
+    @property
+    def highest_frequency(self) -> float:
+        """The highest of the frequencies, Hz."""
+        return max(self.frequencies)
+
+    def __call__(self, elapsed: FloatArray) -> FloatArray:
+        """Voltage (samples,) in V at the times (samples,) in s since the start."""
+        phases = 2 * np.pi * np.multiply.outer(self.frequencies, elapsed)
+        mean: FloatArray = self.amplitude * np.mean(np.sin(phases), axis=0)
+        return mean
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,7 @@ def test_the_preset_keeps_to_the_amplifiers_limits(fit: bw.Run) -> None:
     ("options", "text"),
     [
         ("--drive verification", "give either"),
+        ("--validate", "give either"),
         ("--candidates none.toml", "none.toml: No such file"),
         ("--candidates empty.toml", "has no candidate"),
         ("--candidates odd.toml", "odd.toml: one"),
@@ -78,3 +79,28 @@ def test_what_cannot_be_ranked_is_one_line(
     (tmp_path / "far.toml").write_text(SIGNAL.format("far", 9.0, 0.0), encoding="utf-8")
     bwbayes("design", run, "--parameter", "alpha", *options.split()).assert_refused(text)
     assert not (run / "design").exists()
+
+
+def test_validate_finds_a_record_to_validate_on_and_one_to_train_on(
+    bwbayes: Type, run: Path, tmp_path: Path
+) -> None:
+    """Both within the voltages and speeds of training."""
+    said = bwbayes("design", run, "--validate", "--out", "out")
+    assert said.status == 0
+    numbers = json.loads((tmp_path / "out/design.json").read_text())
+    assert f"Validate on: {numbers['validate']}" in said.out
+    assert f"Train on: {numbers['train']}" in said.out
+    trained = read_record(run / "records/record.h5")
+    fastest = np.max(np.abs(np.diff(trained.voltage))) / trained.interval
+    for name in ("validate", "train"):
+        record = read_record(tmp_path / f"out/{name}.csv", need_displacement=False)
+        assert record.duration <= trained.duration
+        assert trained.voltage.min() - 1e-3 <= record.voltage.min()
+        assert record.voltage.max() <= trained.voltage.max() + 1e-3
+        assert np.max(np.abs(np.diff(record.voltage))) / record.interval <= 1.01 * fastest
+        assert (tmp_path / f"out/{name}.png").exists()
+    scores = [score for score in numbers["candidates"] if not score["refused"]]
+    furthest = max(scores, key=lambda score: score["difference_um"])
+    assert furthest["name"] == numbers["validate"]
+    assert scores[0]["name"] == numbers["train"]
+    assert min(score["sd_ratio"] for score in scores) == scores[0]["sd_ratio"]

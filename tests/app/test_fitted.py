@@ -372,7 +372,11 @@ def test_rivals_are_fitted_once_and_kept_with_the_run(
 
     def rivals(p_value: float) -> tuple[Rival, ...] | None:
         lock = DriveLock(0.5, p_value)
-        return bw.open_run(copy.path).with_cache(drive_locks={"record": lock}).rivals("record")
+        return (
+            bw.open_run(copy.path)
+            .with_cache(drive_locks={"record": lock})
+            .widening_rivals("record")
+        )
 
     assert rivals(1.0) is None
     assert not copy.rivals.exists()

@@ -14,16 +14,22 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.design import rank_designs
-from bwbayes.comparison.designed import DesignScore
+from bwbayes.comparison.design import rank_by_rivals, rank_designs
+from bwbayes.comparison.designed import DesignScore, RivalScore
+from bwbayes.diagnosis.laplace import climb
+from bwbayes.diagnosis.rivals import Rival
 from bwbayes.errors import InputError
+from bwbayes.inference import map_estimate
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study, TrainingRecord
 from bwbayes.model.limits import Limits
+from bwbayes.model.spec import ModelSpec
 from tests.inference.linear import Linear
 from tests.inference.problems import decaying_sine, short_posterior
 from tests.measured import keep
 from tests.prediction.runs import weighted_draws
+from tests.stand import Stand
 
 WIDE = Limits(-100.0, 100.0)
 SAMPLES = 400
@@ -163,6 +169,43 @@ def test_promises_of_eight_signals_are_kept_in_their_order(
     rank = stats.spearmanr(range(len(order)), [means[name] for name in order]).statistic
     assert rank > 0.85
     keep("design", {"rank": float(rank), **ratio})
+
+
+def test_drives_that_tell_rivals_apart_are_told_from_those_that_do_not() -> None:
+    """Duhem and Bouc-Wen, fitted to a decaying sine: the whole range tells, a volt does not.
+
+    What is too far for the amplifier is refused. The same model once more cannot be told apart.
+    """
+    rng = np.random.default_rng(4)
+    stand = Stand(lag=0.005, discrepancy=0.0, sensor=0.5)
+    time = np.arange(SAMPLES) / stand.rate
+    voltage = 50 * (1 - np.cos(2 * np.pi * time)) * np.exp(-0.1 * time)
+    training = TrainingRecord(stand.measure(voltage, rng), (slice(0, SAMPLES),), from_rest=True)
+    study = Study(ModelSpec(noise="smooth"), {"record": training}, engine="numba")
+    posterior = study.posterior
+    fits = {}
+    for spec in (study.spec, study.spec.with_stages("duhem")):
+        model = study.with_model(spec).posterior
+        fit = climb(model, map_estimate.local_minima(model, rng, 1))
+        fits[spec] = Rival(spec, fit.coordinates, fit.covariance, fit.rmse)
+    same, other = fits.values()
+    draws = same.draw(posterior, rng)
+    whole = 50 * (1 - np.cos(2 * np.pi * 0.7 * time))
+    candidates = {"volt": whole / 100, "whole": whole, "far": 1.3 * whole}
+    limits = Limits(-1.0, 101.0)
+
+    def ranked(rival: Rival) -> list[RivalScore]:
+        return rank_by_rivals(posterior, draws, study, [rival], candidates, limits, rng)
+
+    best, second, last = ranked(other)
+    assert (best.name, second.name, last.name) == ("whole", "volt", "far")
+    assert last.refused
+    assert best.sd_ratio < 0.5
+    assert second.sd_ratio > 0.9
+    assert best.difference_um > 10 * second.difference_um
+    alike = ranked(same)[0]
+    assert alike.told_apart == 0.0
+    assert alike.difference_um < 0.1 * best.difference_um
 
 
 def test_what_the_amplifier_cannot_make_is_refused_and_comes_last(

@@ -44,8 +44,9 @@ def command_of(verb: Verb) -> click.Command:
             options["reading"] = reading_of(options, options[str(file.name)], file.opts[0])
         given = [options.pop(str(word.name)) for word in words]
         arguments = [value for value in given if value is not None]
-        if verb.either and len(arguments) != 1:
-            raise InputError(f"{verb.name}: give either {' or '.join(verb.either.values())}")
+        if verb.either and len(arguments) + bool(options.get(verb.instead)) != 1:
+            ways = [*verb.either.values(), *[f"--{verb.instead}"] * bool(verb.instead)]
+            raise InputError(f"{verb.name}: give either {' or '.join(ways)}")
         stem = "".join(Path(str(value)).stem for value in arguments)
         out = out or folder / below.replace("NAME", stem)
         with working() as watch:

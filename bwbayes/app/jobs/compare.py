@@ -225,7 +225,11 @@ def _candidate(
     bands = [
         prediction
         for prediction in predictions(
-            problem, flat, fit.rivals, partial(watch, f"{name}: predictions"), training=False
+            problem,
+            flat,
+            fit.widening_rivals,
+            partial(watch, f"{name}: predictions"),
+            training=False,
         )
         if prediction.measured is not None
     ]

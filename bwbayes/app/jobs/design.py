@@ -1,13 +1,14 @@
 """Experimental design: ``fit.design()``.
 
 Candidates come from a file, a table of a signal each, or are a preset within the amplifier's
-limits. They are ranked by what they would leave of a parameter's standard deviation, or of a
-parameter band's width along a drive.
+limits. They are ranked by what they would leave of a parameter's standard deviation, of a parameter
+band's width along a drive, or of what rivals of the model differ by.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,17 @@ from bwbayes.app.jobs.fit_methods import limits_of
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.comparison.design import rank_designs
-from bwbayes.comparison.designed import Design
+from bwbayes.comparison.design import rank_by_rivals, rank_designs
+from bwbayes.comparison.designed import Design, DesignScore, RivalDesign
+from bwbayes.diagnosis.extrapolation import PART
 from bwbayes.errors import InputError
 from bwbayes.model.limits import Limits
-from bwbayes.model.reversals import time_between_turns, turning_points
+from bwbayes.model.reversals import fastest, time_between_turns, turning_points
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import (
     Carrier,
     Decay,
+    Multisine,
     Sine,
     Staircase,
     Triangle,
@@ -44,8 +47,9 @@ from bwbayes.watching import WatchSteps, unwatched
 
 def design(
     fit: Run,
-    target: str | Path | ArrayLike,
+    target: str | Path | ArrayLike | None = None,
     *,
+    validate: bool = False,
     candidates: Mapping[str, ArrayLike] | str | Path = "standard",
     voltage: tuple[float, float] | None = None,
     slew: float | None = None,
@@ -53,11 +57,13 @@ def design(
     capacitance: float | None = None,
     reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
-) -> Design:
+) -> Design | RivalDesign:
     """Rank input signals by the expected reduction in posterior SD.
 
     What would be left of a parameter's standard deviation, or of a band's width along a drive,
-    after one more record; the best signal within the amplifier's limits goes into best.csv.
+    after one more record; the best signal within the amplifier's limits goes into best.csv. Or,
+    with ``validate``, what would tell the model from its rivals: validate.csv is a short next
+    record along which these differ most, train.csv one that would tell them apart if it was fitted.
 
     Parameters
     ----------
@@ -66,6 +72,8 @@ def design(
     target
         The parameter to know better. Or the drive whose band is to be narrow: a record or a signal.
         In Python the ``Path`` of a record's file or of a signal's name, or voltages (samples,), V.
+    validate
+        Find records that tell the model from its rivals, by default within what training drove.
     candidates
         A TOML file with a table for each signal, or the preset. Its keys are those of a config's
         [record.signal]. In Python also voltages (samples,) by name, V, at the fitted record's
@@ -94,18 +102,31 @@ def design(
 
     Examples
     --------
-    ``fit.design("beta", slew=2000)`` ranks as this does::
+    ``fit.design(validate=True)`` finds a record to validate on, and ``fit.design("beta",
+    slew=2000)`` ranks as this does::
 
         bwbayes design results/ring_bender --parameter beta --slew 2000
     """
+    if (target is None) is not validate:
+        raise InputError("design: give either a parameter, a drive or `validate=True`")
     problem = fit.problem
-    low, high = voltage or limits_of(problem, None)
-    amplifier = Limits(low, high, np.inf if slew is None else slew, current, capacitance)
     # Of several records, what all of them taught of the actuator, seen from the one whose voltage
     # turns most: the new one is to be alike.
     records = problem.records
     record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
-    signals = candidates_of(candidates, records[record], amplifier)
+    low, high = voltage or limits_of(problem, None)
+    if slew is None:
+        slew = _fastest(records[record]) if validate else np.inf
+    amplifier = Limits(low, high, slew, current, capacitance)
+    seconds = records[record].duration
+    if validate:
+        # A short record: ten periods.
+        seconds = min(
+            seconds, 20 * time_between_turns(records[record].voltage, records[record].interval)
+        )
+    signals = candidates_of(candidates, records[record], amplifier, seconds)
+    if validate:
+        return _by_rivals(fit, record, signals, amplifier, watch)
     quantity: str | FloatArray
     parameter, drive = None, None
     if isinstance(target, str):
@@ -124,11 +145,7 @@ def design(
         generator(problem.config.seed, "design"),
         partial(watch, "candidates"),
     )
-    if scores[0].refused:
-        raise InputError(
-            f"design: the amplifier can make none of the candidates; {scores[0].name} "
-            f"{scores[0].refused}"
-        )
+    _require_possible(scores)
     return Design(
         fit.folder.path.name,
         parameter,
@@ -141,17 +158,60 @@ def design(
     )
 
 
+def _fastest(record: Record) -> float:
+    """Return the speed of a record's drive, V/s."""
+    over = PART * time_between_turns(record.path.voltage, record.interval)
+    return fastest(record.path.voltage, record.interval, over)
+
+
+def _by_rivals(
+    fit: Run, record: str, signals: dict[str, FloatArray], amplifier: Limits, watch: WatchSteps
+) -> RivalDesign:
+    """Rank signals by what they would tell of the model of a training record and its rivals."""
+    problem = fit.problem
+    rivals = fit.rivals(record, partial(watch, "rivals"))
+    scores = rank_by_rivals(
+        problem.posterior.for_record(record),
+        problem.posterior.select_draws(fit.flat_draws, record),
+        problem.study.for_record(record),
+        rivals,
+        signals,
+        amplifier,
+        generator(problem.config.seed, "design"),
+        partial(watch, "candidates"),
+    )
+    _require_possible(scores)
+    interval = problem.records[record].interval
+    return RivalDesign(
+        fit.folder.path.name, None, None, amplifier, signals, interval, fit.standing, scores
+    )
+
+
+def _require_possible(scores: Sequence[DesignScore]) -> None:
+    """Refuse candidates that the amplifier cannot make, if it can make none."""
+    if scores[0].refused:
+        raise InputError(
+            f"design: the amplifier can make none of the candidates; {scores[0].name} "
+            f"{scores[0].refused}"
+        )
+
+
 def candidates_of(
-    candidates: Mapping[str, ArrayLike] | str | Path, record: Record, amplifier: Limits
+    candidates: Mapping[str, ArrayLike] | str | Path,
+    record: Record,
+    amplifier: Limits,
+    seconds: float,
 ) -> dict[str, FloatArray]:
     """Return the candidates' voltages (samples,) by name, V, at a record's interval.
+
+    Those of the preset take so many ``seconds``.
 
     Raises InputError: a file that cannot be read, or has no signal.
     """
     if not isinstance(candidates, str | Path):
         return {name: np.asarray(v, dtype=np.float64) for name, v in candidates.items()}
     if str(candidates) == "standard":
-        waveforms = _preset(record, amplifier)
+        waveforms = _preset(record, amplifier, seconds)
     else:
         waveforms = {}
         for name, table in read_toml(Path(candidates)).items():
@@ -166,34 +226,40 @@ def candidates_of(
     return {name: waveform.sample(1 / record.interval)[1] for name, waveform in waveforms.items()}
 
 
-def _preset(record: Record, amplifier: Limits) -> dict[str, Waveform]:
-    """Return sines and triangles, steady and decaying, small and slow, and a staircase.
+def _preset(record: Record, amplifier: Limits, seconds: float) -> dict[str, Waveform]:
+    """Return sines and triangles, steady and decaying, small and slow, a multisine, a staircase.
 
-    They are as long as a record, about the middle of the amplifier's range, and turn as often as
+    They last so many seconds, about the middle of the amplifier's range, and turn as often as
     its drive, or as often as the amplifier allows. A decaying one ends at a tenth of its amplitude.
     """
     half, center = (amplifier.high - amplifier.low) / 2, (amplifier.high + amplifier.low) / 2
     # A sine changes fastest, by 2π f times its amplitude.
-    fastest = min(
+    frequency = min(
         0.5 / time_between_turns(record.voltage, record.interval),
         amplifier.rate / (2 * np.pi * half),
     )
     carriers: dict[str, Carrier] = {
-        "steady sine": Sine(half, fastest),
-        "decaying sine": Sine(half, fastest),
-        "small steady sine": Sine(half / 2, fastest),
-        "slow steady sine": Sine(half, fastest / 4),
-        "slow decaying sine": Sine(half, fastest / 4),
-        "steady triangle": Triangle(half, fastest),
-        "decaying triangle": Triangle(half, fastest),
+        "steady sine": Sine(half, frequency),
+        "decaying sine": Sine(half, frequency),
+        "small steady sine": Sine(half / 2, frequency),
+        "slow steady sine": Sine(half, frequency / 4),
+        "slow decaying sine": Sine(half, frequency / 4),
+        "steady triangle": Triangle(half, frequency),
+        "decaying triangle": Triangle(half, frequency),
     }
-    if not np.isfinite(amplifier.rate):
-        levels = [half * factor for factor in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
-        carriers["staircase"] = Staircase(tuple(levels), record.duration / len(levels))
-    fading, steady = Decay(0.0, 0.9 / record.duration), Decay()
+    # Reversals at all voltages: frequencies that have no common period.
+    golden = (np.sqrt(5) - 1) / 2
+    mean = Multisine(1.0, tuple(frequency * golden ** np.arange(3)))
+    peak = np.max(np.abs(mean(np.arange(0.0, seconds, record.interval))))
+    carriers["multisine"] = replace(mean, amplitude=half / peak)
+    levels = [half * factor for factor in (1, -1, 0.6, -0.6, 0.3, -0.3, 0.8, -0.2, 0.5, 0)]
+    dwell = seconds / len(levels)
+    if 2 * half <= dwell * amplifier.rate:
+        carriers["staircase"] = Staircase(tuple(levels), dwell, amplifier.rate)
+    fading, steady = Decay(0.0, 0.9 / seconds), Decay()
     return {
         name: Waveform(
-            carrier, record.duration, decay=fading if "decaying" in name else steady, bias=center
+            carrier, seconds, decay=fading if "decaying" in name else steady, bias=center
         )
         for name, carrier in carriers.items()
     }

@@ -113,7 +113,9 @@ def predict(
             )
         if after:
             watching = partial(watch, "predictions")
-            return predict_after(problem, fit.flat_draws, voltage, name, of, fit.rivals, watching)
+            return predict_after(
+                problem, fit.flat_draws, voltage, name, of, fit.widening_rivals, watching
+            )
         record = Record(voltage, None, interval=interval, origin=f"{signal} signal")
     elif not isinstance(record, Record | str | Path):
         raise InputError(
@@ -133,7 +135,7 @@ def predict(
     )
     other = Validation((), record, start, window, of)
     name, watching = name or "prediction", partial(watch, "predictions")
-    return predict_another(problem, fit.flat_draws, other, name, fit.rivals, watching)
+    return predict_another(problem, fit.flat_draws, other, name, fit.widening_rivals, watching)
 
 
 def write_prediction(

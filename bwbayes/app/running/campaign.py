@@ -253,7 +253,7 @@ class Campaign(Product):
         draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
         start, like = InitialConditions(from_rest, True, lead_in), next(iter(problem.records))
         other = Validation((), record, start, of=like)
-        return predict_another(problem, draws, other, "next specimen", first.rivals)
+        return predict_another(problem, draws, other, "next specimen", first.widening_rivals)
 
     def plot(self) -> Figure:
         """Draw each parameter's intervals side by side, with the population.

@@ -237,7 +237,7 @@ class Stages:
         """Return the bands of all that was held out, and of the training windows."""
         from bwbayes.app.running.predictions import predictions
 
-        return predictions(self.problem, self.flat_draws, self.rivals, watch)
+        return predictions(self.problem, self.flat_draws, self.widening_rivals, watch)
 
     @RunStage
     def scores(self, watch: Watch) -> dict[str, Scores]:
@@ -285,8 +285,8 @@ class Stages:
         source = generator(self.problem.config.seed, "drive lock")
         return drive_locks(self.problem.posterior, self.subset, source)
 
-    def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
-        """Return rivals of the model on a training record; None unless its error follows the drive.
+    def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...]:
+        """Return rivals of the model on a training record, by its name.
 
         They are fitted when first needed, and kept in the folder. ``watch`` is called with the
         share that is done.
@@ -295,8 +295,6 @@ class Stages:
         from bwbayes.app.running.fingerprint import fingerprint, load, save
         from bwbayes.diagnosis.rivals import fit_rivals
 
-        if not self.drive_locks[of].locked:
-            return None
         problem, path, state = self.problem, self.folder.rivals, fingerprint(self.problem)
         fitted = load(path, state) or {}
         if of not in fitted:
@@ -307,6 +305,10 @@ class Stages:
                 save(path, state, fitted)
         rivals: tuple[Rival, ...] = fitted[of]
         return rivals
+
+    def widening_rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
+        """Return the rivals; None unless the model's error of that record follows the drive."""
+        return self.rivals(of, watch) if self.drive_locks[of].locked else None
 
     @RunStage
     def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
