@@ -35,6 +35,10 @@ from bwbayes.model.reversals import monotone_stretches, turning_points
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 
+# The discrepancy that every fit leaves, as a part of the range, and what that is called.
+USUAL_ERROR = 0.01
+IF_OFF = f"if the model is off by {USUAL_ERROR:.0%} of the range"
+
 # A combination is undetermined when this part of its prior sd or more is left.
 LEFT_OPEN = 1 / 3
 
@@ -67,7 +71,7 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     elif swings.size < 2 or swings.min() > 0.8 * swings.max():
         advice = "vary the amplitude: let it decay to a tenth over ten periods"
     for i in range(min(count, 2)):
-        text = f"{combined(directions[:, i], names)}: {remaining(parts[i])}"
+        text = f"{combined(directions[:, i], names)}: {remaining(parts[i])} {IF_OFF}"
         if i == count - 1 < parts.size - 1:
             text += f" (next {combined(directions[:, i + 1], names)}: {percent(parts[i + 1])})"
         elif i == 1:
@@ -141,9 +145,9 @@ def _information(
     _, sensor = dataset.noise.marginal_sd(noise_parameters)
     rows = np.concatenate([np.arange(w.start, w.stop) for w in dataset.training])
     weights, duration = stretches_once(dataset.voltage, rows)
-    # A percent of the range, which changes along the path: over about half a branch.
+    # It changes along the path: over about half a branch.
     noise = DiscrepancyNoise(1.0)
-    values = np.array([[sensor[0], 0.01 * dataset.extent, duration / 2]])
+    values = np.array([[sensor[0], USUAL_ERROR * dataset.extent, duration / 2]])
     total = np.zeros((len(slopes), len(slopes)))
     for window in dataset.training:
         (white,), _ = noise.whiten(values, slopes[np.newaxis, :, window])

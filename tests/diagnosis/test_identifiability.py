@@ -65,7 +65,8 @@ def test_one_sine_leaves_a_combination_with_gamma_open(
     posterior = measured(sine(amplitude, frequency), discrepancy)
     (finding,) = undetermined(posterior, at_truth(posterior))
     assert finding.text.startswith("gamma")
-    assert "% of the effective prior's SD remains (next alpha" in finding.text
+    assert "% of the effective prior's SD remains if the model is off by 1%" in finding.text
+    assert "(next alpha" in finding.text
     assert finding.fix == "vary the amplitude: let it decay to a tenth over ten periods"
 
 
