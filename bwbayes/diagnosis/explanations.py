@@ -78,13 +78,13 @@ def explain(
                 break
             looked_at = scene.of_beginning()
             rough = rough if looked_at is scene else looked_at.with_rough_noise()
-        found = [] if rough is None else list(kind(rough))
+        found = [] if rough is None else [*_in_time(kind(rough), until)]
         lead = 0.0 if rough is None else rough.lead
         worth = frozenset(cause.kind for cause in found if cause.nats + lead > LIMIT)
         if rough is None:
-            found = list(kind(looked_at))
+            found = [*_in_time(kind(looked_at), until)]
         elif worth:
-            found += kind(replace(looked_at, kinds=worth))
+            found += _in_time(kind(replace(looked_at, kinds=worth)), until)
         for explanation in found:
             known = best.get(explanation.kind, explanation)
             best[explanation.kind] = max(known, explanation, key=lambda either: either.nats)
@@ -95,6 +95,15 @@ def explain(
         best[explanation.kind] = scene.confirmed(explanation)
     watch(1.0)
     return _ranked(best.values())
+
+
+def _in_time(explanations: Iterator[Explanation], until: float) -> Iterator[Explanation]:
+    """Yield explanations as long as the process's CPU time is not over."""
+    while time.process_time() < until:
+        explanation = next(explanations, None)
+        if explanation is None:
+            return
+        yield explanation
 
 
 def _ranked(explanations: Iterable[Explanation]) -> tuple[Explanation, ...]:
@@ -116,9 +125,9 @@ def better_models(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return the likely causes that would change what is predicted of the next drive.
 
     Not noise of another kind, as heavy tails: the bands have its size already, and where that
-    matters to their coverage, they fail.
+    matters to their coverage, they fail. Nor what misleads.
     """
-    return likely_causes([explanation for explanation in ranked if not explanation.noise])
+    return likely_causes([one for one in ranked if not (one.noise or one.misleads)])
 
 
 def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:

@@ -65,6 +65,16 @@ class Explanation(Finding):
         return not with_it**2 > without**2 / 2
 
     @property
+    def misleads(self) -> bool:
+        """Whether the model errs a tenth more with it on readings that were held out.
+
+        Where the noise is not what misfit is like, evidence is too sure, and takes up what helps
+        with the training readings alone.
+        """
+        without, with_it = self.held_out
+        return with_it > 1.1 * without
+
+    @property
     def worth(self) -> str:
         """What it is worth, in words: nats, and errors with it instead of without it."""
         errors = ((self.rmse, "RMSE"), (self.held_out, "held out"))

@@ -22,10 +22,11 @@ from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
+from bwbayes.app.running import explaining
 from bwbayes.app.running.explaining import chosen_noise, lines, search_stages
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
-from bwbayes.diagnosis.explanations import likely_causes
+from bwbayes.diagnosis.explanations import explain, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
@@ -141,6 +142,22 @@ def test_a_search_ends_when_its_time_is_over(tmp_path: Path) -> None:
     chosen = search_stages(resolve_config(config.model_copy(update={"model": model}), tmp_path))
     assert chosen.explanations is None
     assert chosen.steps[-1].startswith("the search for stages ended after 0.001 s")
+
+
+def test_a_stage_that_errs_more_on_held_out_readings_is_not_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever its evidence; the search says what it has refused."""
+
+    def misled(*arguments: Any) -> tuple[Explanation, ...]:
+        return tuple(replace(found, held_out=(0.1, 0.12)) for found in explain(*arguments))
+
+    monkeypatch.setattr(explaining, "explain", misled)
+    problem = resolve_config(config_of("quadratic", tmp_path), tmp_path)
+    chosen = search_stages(problem)
+    assert chosen.problem.study.spec == problem.study.spec
+    assert chosen.steps[0].startswith("not added: quadratic")
+    assert "held out 0.12 um instead of 0.1 um" in chosen.steps[0]
 
 
 def test_several_records_have_no_stage_added(tmp_path: Path) -> None:

@@ -13,7 +13,13 @@ from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import effects, explanations, model
 from bwbayes.diagnosis import residual_analysis as scenes
-from bwbayes.diagnosis.explanations import LIMIT, explain, followed_causes, likely_causes
+from bwbayes.diagnosis.explanations import (
+    LIMIT,
+    better_models,
+    explain,
+    followed_causes,
+    likely_causes,
+)
 from bwbayes.diagnosis.laplace import NONE, climb
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate as pointfit
@@ -249,6 +255,18 @@ def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:
     assert (creep, drift) == likely_causes([start, creep, drift])
     assert (start,) == likely_causes([start, worth("creep", LIMIT + 2)])
     assert () == likely_causes([worth("creep", LIMIT - 1)])
+
+
+def test_what_errs_more_on_held_out_readings_is_no_better_model() -> None:
+    """By more than a tenth; what is not known of an error is no reason against a cause."""
+
+    def worth(nats: float, before: float, after: float) -> Explanation:
+        return Explanation("heating", "heat", "do", nats=nats, held_out=(before, after))
+
+    alike, unknown = worth(LIMIT + 1, 0.13, 0.14), worth(LIMIT + 1, np.nan, np.nan)
+    assert better_models([worth(LIMIT + 200, 0.13, 0.16), alike]) == (alike,)
+    assert better_models([worth(LIMIT + 200, 0.13, 0.16)]) == ()
+    assert better_models([unknown]) == (unknown,)
 
 
 def test_a_fit_has_not_followed_what_a_missing_part_explains_as_well() -> None:
