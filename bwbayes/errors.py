@@ -33,7 +33,12 @@ class ExitStatus(IntEnum):
 
 
 class InputError(ValueError):
-    """Input that cannot be used; the text is one line: where, what, and what to do."""
+    """Input that cannot be used; the text is one line: where, what, and what to do.
+
+    It ``is_said`` once its text is in the words of the record's own quantities.
+    """
+
+    is_said = False
 
     def __init__(self, text: str) -> None:
         line = one_line(text)
@@ -77,7 +82,9 @@ class ColumnsError(InputError):
     def within(self, place: str) -> ColumnsError:
         """Return the error of a file that a table of a config names."""
         guess = self.guess["columns"], self.guess["units"]
-        return ColumnsError(self.problem, *guess, place, self.fs)
+        error = ColumnsError(self.problem, *guess, place, self.fs)
+        error.is_said = self.is_said
+        return error
 
     def in_config(self) -> InputError:
         """Return the error for a config, with the lines to write into its table."""

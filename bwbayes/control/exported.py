@@ -99,7 +99,7 @@ class Exported(Product):
         refuse_existing(files, overwrite=overwrite)
         with refuse_unwritable(folder, "choose another folder"):
             numbers.parent.mkdir(parents=True, exist_ok=True)
-            write_summary(numbers, self.numbers())
+            write_summary(numbers, self.quantities.rendered(self.numbers()))
             code.write_text(self.c_code(), encoding="ascii")
         watch(1.0)
         return files
@@ -206,7 +206,7 @@ class Exported(Product):
         shapes |= dict.fromkeys(("filters", "filtered"), (sections, 2))
         functions: list[Callable[..., Any]] = [settle, advance]
         functions += [search] * (self.without_inverse is None)
-        return environment.get_template("actuator.c.j2").render(
+        code = environment.get_template("actuator.c.j2").render(
             **self.numbers(),
             parts_line=f"Parts: {', '.join(parts)}.",
             warnings=[line for text in self.standing.messages for line in wrap(text, 92)],
@@ -220,6 +220,9 @@ class Exported(Product):
             inputs=[*map(self._stage_in_c, model.inputs[0])],
             outputs=[*map(self._stage_in_c, model.outputs[0])],
         )
+        # What is not code.
+        comments = re.compile(r"/\*.*?\*/", re.DOTALL)
+        return comments.sub(lambda comment: to_ascii(self.quantities.say(comment[0])), code)
 
     def _stage_in_c(self, sampled: SampledStage) -> dict[str, Any]:
         """Return what the template says of a stage before or behind the model's core."""

@@ -45,6 +45,16 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.smooth,
 )
 
+# Those that a record without a clock may have.
+TIMELESS = (
+    effects.reversed_sign,
+    model.prior,
+    model.heavy_tails,
+    model.stages,
+    model.nonlinearity,
+    model.operator,
+)
+
 # Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
 LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *model.SEARCHED))))
@@ -69,11 +79,12 @@ def explain(
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
     looked_at, rough = scene, scene.with_rough_noise()
-    kinds = ADDITIONS + CHANGES
+    has_clock = scene.posterior.single_record.inputs.quantities.has_clock
+    kinds = [kind for kind in ADDITIONS + CHANGES if has_clock or kind in TIMELESS]
     for number, kind in enumerate(kinds):
         if time.process_time() > until:
             break
-        if number == len(ADDITIONS):
+        if number == sum(kind in ADDITIONS for kind in kinds):
             if scene.unexplained <= LIMIT and all(e.nats <= LIMIT for e in best.values()):
                 break
             looked_at = scene.of_beginning()

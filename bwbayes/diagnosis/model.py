@@ -71,7 +71,10 @@ def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
     present = scene.study.spec.chain if scene.study is not None else ()
     for name, make in SEARCHED.items():
         stage, kind = make(), name.replace("-", " ")
-        if name in present or not scene.posterior.single_record.inputs.has(stage.sees):
+        inputs = scene.posterior.single_record.inputs
+        if name in present or not inputs.has(stage.sees):
+            continue
+        if not (stage.rate_independent or inputs.quantities.has_clock):
             continue
         yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
 

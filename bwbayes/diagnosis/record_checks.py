@@ -111,7 +111,7 @@ def _plausibility(record: Record) -> Iterator[Finding]:
         extent = _extent(_readings(record))
         text += f" move the displacement by {extent:.3g} um, {extent / span:.3g} um per volt"
         likely = likely and 0.01 <= extent <= 5000 and 1e-4 <= extent / span <= 1e3
-    if not likely:
+    if not likely and record.quantities.are_default:
         fix = "check the units in the names of the columns (voltage_V, voltage_mV, "
         fix += "displacement_um, displacement_nm, displacement_m), and keep them if they are right"
         yield _whole(record, "unlikely units", text, fix)

@@ -32,6 +32,7 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import PARTS
 from bwbayes.model.spec import Extent, ModelSpec
+from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.shown import brief
 
@@ -105,13 +106,19 @@ class Study:
     shared: tuple[str, ...] = ()
     engine: Engine = "numpy"
 
+    @property
+    def quantities(self) -> Quantities:
+        """What the records are of."""
+        return next(iter(self.records.values())).record.quantities
+
     def with_model(self, spec: ModelSpec, added: Mapping[str, Stated] | None = None) -> Self:
         """Return the study of another model.
 
         It keeps statements about parameters that the other model has too: a parameter of
         another unit is another one, whatever its name. ``added`` is stated of others.
         """
-        units = {declared.name: declared.unit for declared in declarations_of(spec, self.extent)}
+        say = self.quantities.say
+        units = {d.name: say(d.unit) for d in declarations_of(spec, self.extent)}
         stated = {
             name: said
             for name, said in {**(added or {}), **self.stated}.items()
@@ -196,7 +203,7 @@ class Study:
         )
         require_known("parameters", self.stated, table)
         parameters = [
-            _parameter(column, self._said_of(column), self.contexts[column.record])
+            _parameter(column, self._said_of(column), self.contexts[column.record], self.quantities)
             for column in table.layout
         ]
         prior = JointPrior(parameters, first.actuator.hysteresis.holds)
@@ -333,7 +340,9 @@ def require_known(
             raise InputError(f"{where}.{name}: is not in this model; see [model], or remove it")
 
 
-def _parameter(column: Column, stated: Stated, context: Context) -> Parameter:
+def _parameter(
+    column: Column, stated: Stated, context: Context, quantities: Quantities
+) -> Parameter:
     """Put what is stated of a parameter before what its part declares."""
     name, declared, record = column
     prior, fixed = stated.prior, stated.fixed
@@ -351,14 +360,15 @@ def _parameter(column: Column, stated: Stated, context: Context) -> Parameter:
         if value and not 1e-60 < abs(value) < 1e60:
             raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
     unit = declared.unit_in(context.stated)
-    if stated.unit is not None and re.sub("[µμ]", "u", stated.unit) != unit:
+    own = quantities.say(unit)
+    if stated.unit is not None and own not in (stated.unit, re.sub("[µμ]", "u", stated.unit)):
         raise InputError(
-            f"parameters.{name}.unit: its numbers are in {unit}, not {stated.unit}; convert them"
+            f"parameters.{name}.unit: its numbers are in {own}, not {stated.unit}; convert them"
         )
     above = record.replace("_", r"\_")
     return Parameter(
         name,
-        stated.unit or unit,
+        stated.unit if stated.unit and own == unit else unit,
         stated.label or declared.label + (rf"^{{\mathrm{{{above}}}}}" if record else ""),
         stated.description or declared.description + (f" of {record}" if record else ""),
         declared,

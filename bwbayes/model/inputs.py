@@ -15,6 +15,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.linear import Hold
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.shown import brief
 
 VoltageIs = Literal["command", "output"]
@@ -46,6 +47,9 @@ class Inputs:
         which goes straight to it.
     covariates
         Further columns (samples,) by name.
+    quantities
+        What the voltage is, what comes out, and whether there is a clock; all numbers are in their
+        units.
     """
 
     __repr__ = brief
@@ -56,6 +60,7 @@ class Inputs:
     start: float = 0.0
     voltage_is: VoltageIs = "output"
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    quantities: Quantities = field(default=DEFAULT, repr=False)
 
     @property
     def samples(self) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
 from bwbayes.model.inputs import Inputs, VoltageIs, require_voltage_is
+from bwbayes.quantities import DISPLACEMENT, VOLTAGE
 from bwbayes.record.io.columns import Naming, select
 from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.grid import clock
@@ -51,6 +52,8 @@ class Record(Inputs):
         amplifier's output, which is continuous.
     covariates : dict of arrays (samples,)
         Further columns that may act on the actuator, one value a sample, by name.
+    quantities : Quantities
+        What ``voltage`` and ``displacement`` are, and in which units, if they are others.
     origin : str
         Where the record comes from: a file's name or free text. Line breaks and other characters
         that do not print become blanks.
@@ -110,6 +113,8 @@ class Record(Inputs):
         time: ArrayLike | None = None,
         units: Mapping[str, str] | None = None,
         covariates: Mapping[str, ArrayLike] | None = None,
+        input: str | None = None,
+        output: str | None = None,
         voltage_is: VoltageIs = "output",
         origin: str = "arrays",
     ) -> Self:
@@ -128,6 +133,9 @@ class Record(Inputs):
             ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1.
         covariates : dict of arrays as these
             What else was measured and a model may see: ``{"temperature_degC": temperature}``.
+        input, output : str
+            What drives and what is measured, if not a voltage and a displacement: ``"H (A/m)"`` and
+            ``"B (T)"``; then neither interval nor time is needed, and units are by these names.
 
         Raises
         ------
@@ -147,7 +155,9 @@ class Record(Inputs):
         >>> record.interval, round(float(record.displacement.max()), 3)
         (0.001, 0.7)
         """
-        if (time is None) == (interval is None) or (time is not None and start is not None):
+        is_loop = bool(input or output) and time is interval is start is None
+        is_sampled = (time is None) != (interval is None) and (time is None or start is None)
+        if not is_loop and not is_sampled:
             raise InputError(f"{origin}: give either interval (and start), in s, or time, a vector")
         if time is None and "time" in (units or {}):
             raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
@@ -155,8 +165,16 @@ class Record(Inputs):
             raise InputError(f"{origin}: interval: {interval} s is not a positive time")
         arrays = {"time": time, "voltage": voltage, "displacement": displacement}
         source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
+        named: dict[str, Any] = {"units": units, "input": input, "output": output}
+        own = Naming.stated(**named, covariates=tuple(covariates or ()))
         common = {"time": "s", "voltage": "V", "displacement": "um"}
-        naming = Naming(units=common | dict(units or {}), covariates=tuple(covariates or ()))
+        if own.quantities.input != VOLTAGE:
+            del common["voltage"]
+        if own.quantities.output != DISPLACEMENT:
+            del common["displacement"]
+        columns = {q: q for q in ("voltage", "displacement") if arrays[q] is not None}
+        columns = {} if own.quantities.are_default else columns
+        naming = replace(own, units=common | dict(own.units), columns=columns)
         return cls._of(source, naming, voltage_is, displacement is not None)
 
     @classmethod
@@ -170,6 +188,8 @@ class Record(Inputs):
         units: dict[str, str] | None = None,
         fs: float | None = None,
         covariates: Mapping[str, str] | Sequence[str] = (),
+        input: str | None = None,
+        output: str | None = None,
         voltage_is: VoltageIs = "output",
         origin: str = "DataFrame",
     ) -> Self:
@@ -189,12 +209,20 @@ class Record(Inputs):
             The sampling rate, in place of a time column.
         covariates : dict or list of str
             Further columns that a model may see, by name, as of :func:`read_record`.
+        input, output : str
+            What drives and what is measured, as of :func:`read_record`.
 
         Raises and warns as :func:`read_record` does.
         """
         names = {"time": time, "voltage": voltage, "displacement": displacement}
         columns = {quantity: name for quantity, name in names.items() if name is not None}
-        naming = Naming(columns, units or {}, fs, covariates=covariates)
+        named: dict[str, Any] = {
+            "columns": columns,
+            "units": units,
+            "input": input,
+            "output": output,
+        }
+        naming = Naming.stated(**named, fs=fs, covariates=covariates)
         return cls._of(frame_source(frame, origin), naming, voltage_is, displacement is not None)
 
     @classmethod
@@ -202,8 +230,9 @@ class Record(Inputs):
         cls, source: Source, naming: Naming, voltage_is: VoltageIs, need_displacement: bool
     ) -> Self:
         needed = QUANTITIES if need_displacement else ("time", "voltage")
-        table = select(source, naming, needed)
-        return cls(**record_fields(table, require_voltage_is(voltage_is), need_displacement))
+        with naming.quantities.spoken():
+            table = select(source, naming, needed)
+            return cls(**record_fields(table, require_voltage_is(voltage_is), need_displacement))
 
     @cached_property
     def path(self) -> VoltagePath:
@@ -223,6 +252,7 @@ class Record(Inputs):
             interval=self.interval,
             voltage_is=self.voltage_is,
             covariates=self.covariates,
+            quantities=self.quantities,
         )
 
     @property
@@ -271,6 +301,23 @@ class Record(Inputs):
             digest.update(f"{name}\n".encode())
             digest.update(values.astype("<f8").tobytes())
         return digest.hexdigest()
+
+    def like(self, other: Inputs) -> Record:
+        """Return the record as one of another one's quantities, whose units its numbers are in.
+
+        Raises
+        ------
+        InputError
+            It states other quantities.
+        """
+        own, theirs = self.quantities, other.quantities
+        stated = (own.input, own.output) != (theirs.input, theirs.output)
+        if stated and not own.are_default:
+            raise InputError(
+                f"{self.origin}: is of {own.input} and {own.output}, not of {theirs.input} and "
+                f"{theirs.output}; state these as its input and output"
+            )
+        return replace(self, quantities=theirs)
 
     def window_slice(self, start: float, stop: float) -> slice:
         """Return the slice of the samples with start <= time < stop.

@@ -18,6 +18,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.prediction.bands import Bands
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record.io.formats import draft_of
 from bwbayes.record.record import Record
 from bwbayes.report.figures import picture_of, save_pictures
@@ -53,15 +54,17 @@ def posterior_tree(
         return ("chain", "draw"), by_walker, {"units": unit} if unit else {}
 
     converged = {"converged": int(result.outcome.converged)}
-    draws = {p.name: chains(result.draws[..., i], p.unit) for i, p in enumerate(result.free)}
+    say = result.quantities.say
+    draws = {p.name: chains(result.draws[..., i], say(p.unit)) for i, p in enumerate(result.free)}
     measured: dict[str, Any] = {}
     driven: dict[str, Any] = {}
     for name, record in records.items():
         end = f"_{name}" if len(records) > 1 else ""
-        time = xr.Variable(f"time{end}", record.time, {"units": "s"})
+        time = xr.Variable(f"time{end}", record.time, {"units": record.quantities.clock.unit})
+        output, driver = record.quantities.output, record.quantities.input
         for group, series, values, unit in (
-            (measured, f"displacement{end}", record.displacement, "um"),
-            (driven, f"voltage{end}", record.voltage, "V"),
+            (measured, f"{output.name}{end}", record.displacement, output.unit),
+            (driven, f"{driver.name}{end}", record.voltage, driver.unit),
         ):
             dims = [f"time{end}"]
             group[series] = xr.DataArray(
@@ -71,7 +74,7 @@ def posterior_tree(
         {
             "posterior": xr.Dataset(draws, index, converged),
             "sample_stats": xr.Dataset({"lp": chains(result.log_density)}, index),
-            "log_likelihood": xr.Dataset({"displacement": chains(log_likelihood)}, index),
+            "log_likelihood": xr.Dataset({say("displacement"): chains(log_likelihood)}, index),
             "observed_data": xr.Dataset(measured),
             "constant_data": xr.Dataset(driven),
         }
@@ -80,7 +83,12 @@ def posterior_tree(
     return tree
 
 
-def write_bands(path: Path, bands: Sequence[Bands], watch: Watch = unwatched) -> None:
+def write_bands(
+    path: Path,
+    bands: Sequence[Bands],
+    watch: Watch = unwatched,
+    quantities: Quantities = DEFAULT,
+) -> None:
     """Write bands as CSV; of several sets, a first column ``set`` names each.
 
     Every column has seven digits of its range, however far from zero it lies. ``watch`` is called
@@ -91,7 +99,8 @@ def write_bands(path: Path, bands: Sequence[Bands], watch: Watch = unwatched) ->
         for number, predicted in enumerate(bands):
             names, columns = zip(*predicted.columns(), strict=True)
             if number == 0:
-                file.write(",".join((["set"] if len(bands) > 1 else []) + list(names)) + "\n")
+                headings = [*["set"] * (len(bands) > 1), *map(quantities.heading, names)]
+                file.write(",".join(headings) + "\n")
             prefix = f"{predicted.name}," if len(bands) > 1 else ""
             formats = []
             for name, column in zip(names, columns, strict=True):
@@ -138,10 +147,12 @@ def save(
     with refuse_unwritable(folder, "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         blocks = [block for block in report.all_blocks() if isinstance(block, Picture)]
-        drawn = {block.name: picture_of(block.draw) for block in watched(blocks, watch)}
+        quantities = report.quantities
+        drawn = {block.name: picture_of(block.draw, quantities) for block in watched(blocks, watch)}
         if drawn:
             save_pictures(drawn, folder / pictures)
         page.write_text(render(report, drawn), encoding="utf-8")
+        report = report.said()
         if report.csv:
             with draft_of(table) as draft:
                 draft.write_text(report.csv, encoding="utf-8", newline="")

@@ -45,13 +45,13 @@ def render(report: Report, pictures: Mapping[str, bytes], plots: PagePlots = NO_
     return (
         _environment(pictures, plots)
         .get_template("page.html.j2")
-        .render(report=report, scripts=scripts)
+        .render(report=report.said(), scripts=scripts)
     )
 
 
 def fragment(report: Report) -> str:
     """Return what a notebook shows of a report, as HTML: what a screen shows."""
-    return _environment({}, NO_PLOTS).get_template("notebook.html.j2").render(report=report)
+    return _environment({}, NO_PLOTS).get_template("notebook.html.j2").render(report=report.said())
 
 
 def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment:

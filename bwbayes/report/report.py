@@ -9,7 +9,7 @@ it. A text is escaped where it is shown; a :class:`~markupsafe.Markup` is taken 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -21,6 +21,7 @@ from rich.markup import escape
 from rich.table import Table as Grid
 
 from bwbayes.errors import ExitStatus
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.shown import head
 from bwbayes.watching import Watch, unwatched
 
@@ -207,7 +208,8 @@ class Report:
     name, does; ``about`` says in a line what it is about. ``banners`` say how it came out, the
     first thing to see; ``blocks`` have the answer, then why one may believe it, then what only some
     readers ask for. ``numbers`` are what the JSON file holds, if there is one, and ``csv`` is the
-    text of the CSV file, if there is one.
+    text of the CSV file, if there is one. All of it is written for voltage and displacement, and
+    shown in the words and units of its ``quantities``.
     """
 
     title: str
@@ -217,10 +219,47 @@ class Report:
     blocks: Sequence[Block] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
     csv: str = ""
+    quantities: Quantities = DEFAULT
+
+    def said(self) -> Report:
+        """Return the report in the words of its quantities."""
+        if self.quantities == DEFAULT:
+            return self
+        head, newline, rows = self.csv.partition("\n")
+        heading = ",".join(map(self.quantities.heading, head.split(",")))
+        said = {
+            "title": self.quantities.say(self.title),
+            "heading": self.quantities.say(self.heading),
+            "about": self.quantities.say(self.about),
+            "banners": [_said(banner, self.quantities) for banner in self.banners],
+            "blocks": [_said(block, self.quantities) for block in self.blocks],
+            "numbers": self.quantities.rendered(self.numbers),
+            "csv": f"{heading}{newline}{rows}",
+        }
+        return replace(self, **said, quantities=DEFAULT)
 
     def all_blocks(self) -> Iterator[Block]:
         """Yield all blocks, those within others too, in their order."""
         yield from _flat(self.blocks)
+
+
+def _said(part: Any, quantities: Quantities) -> Any:
+    """Return a part of a report in the words of quantities; names are for links and files."""
+    if isinstance(part, str):
+        return quantities.say(part)
+    if isinstance(part, list | tuple):
+        return [_said(item, quantities) for item in part]
+    if isinstance(part, Mapping):
+        return {quantities.heading(key): item for key, item in part.items()}
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    kept = ("name", "kind", "on")
+    changes = {
+        each.name: _said(getattr(part, each.name), quantities)
+        for each in fields(part)
+        if each.name not in kept
+    }
+    return replace(part, **changes)
 
 
 def _flat(blocks: Sequence[Block]) -> Iterator[Block]:
@@ -255,6 +294,7 @@ def standing_banner(standing: ValidationSummary, on: Target = "both") -> list[Ba
 
 def show(report: Report, console: Console) -> None:
     """Show the banners of a report, and the tables and texts that are meant for a screen."""
+    report = report.said()
     for banner in report.banners:
         if banner.on == "page":
             continue
@@ -325,6 +365,8 @@ def _plain(text: str) -> str:
 class Shown:
     """What shows itself by its report: its head as a repr, all of it in print and a notebook."""
 
+    quantities: Quantities = DEFAULT  # those of the run that it is of
+
     @property
     def heading(self) -> str:
         """What is said above the report, if anything."""
@@ -334,16 +376,25 @@ class Shown:
         """Return all that there is to say of it."""
         raise NotImplementedError
 
+    def said_in(self, quantities: Quantities) -> Self:
+        """Return this, shown in the words of these quantities from now on."""
+        object.__setattr__(self, "quantities", quantities)  # most of these are frozen
+        return self
+
+    def full_report(self) -> Report:
+        """Return its report, which is shown in the words of the run's quantities."""
+        return replace(self.report(), quantities=self.quantities)
+
     def __repr__(self) -> str:
         return head(str(self))
 
     def __str__(self) -> str:
-        return "\n".join(filter(None, [self.heading, as_text(self.report())]))
+        return "\n".join(filter(None, [self.heading, as_text(self.full_report())]))
 
     def _repr_html_(self) -> str:
         from bwbayes.report.page import fragment  # noqa: PLC0415  # slow to load
 
-        report = self.report()
+        report = self.full_report()
         return fragment(replace(report, title=self.heading or report.title))
 
 
@@ -383,10 +434,13 @@ class Product(Shown):
         from bwbayes.report.outputs import refuse_existing, save  # noqa: PLC0415
 
         folder = Path(folder)
-        records = {folder / f"{name}.csv": record for name, record in self.records().items()}
+        records = {
+            folder / f"{name}.csv": replace(record, quantities=self.quantities)
+            for name, record in self.records().items()
+        }
         pages = [folder / f"{self.NAME}.{kind}" for kind in ("json", "csv", "html")]
         refuse_existing([*records, *pages], overwrite=overwrite)
-        files = save(self.report(), folder, self.NAME, watch=watch)
+        files = save(self.full_report(), folder, self.NAME, watch=watch)
         for path, record in records.items():
             write_record(record, path)
         return [*records, *files]

@@ -28,6 +28,7 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.loops import Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import StepResponse
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.sampling.diagnostics import SamplingResult
 from bwbayes.shown import brief
 
@@ -65,6 +66,8 @@ class Result:
         Notes for the user: warnings of the record, combinations that are not identifiable.
     truth
         The true parameters, of a simulated record.
+    quantities
+        What the records are of, in whose words the run is shown.
     """
 
     __repr__ = brief
@@ -89,6 +92,7 @@ class Result:
     facts: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     truth: Mapping[str, float] = field(default_factory=dict)
+    quantities: Quantities = DEFAULT
 
     # Earlier names
     agreement = Renamed("consistency")

@@ -132,8 +132,9 @@ def run(
             if not quiet:
                 # Of a record alone the remarks are shown already.
                 banners = [] if is_proposal else remarks_banner(remarks)
+                said: Any = {"banners": banners, "quantities": problem.quantities}
                 priors = priors_table(problem.posterior.prior)
-                show_report(Report(title="priors", banners=banners, blocks=[priors]))
+                show_report(Report(title="priors", blocks=[priors], **said))
             options = {"workers": workers, "executor": executor, "figure_worker": figure_worker}
             return finish(folder.path, quiet=quiet, problem=problem, **options)
 
@@ -194,7 +195,9 @@ def _config_or_proposal(
     config = proposal.config
     tables = {key: naming[key] for key in ("columns", "units", "covariates")}
     init = f"bwbayes init {shlex.quote(str(path))}"
-    for option, key in ("table", "table"), ("displacement", "displacement_file"):
+    options = ("table", "displacement_file", "input", "output")
+    for key in options:
+        option = key.removesuffix("_file")
         init += "" if naming[key] is None else f" --{option} {shlex.quote(str(naming[key]))}"
     init = with_naming(init, tables, naming["fs"])
     if command != "check" and proposal.blocking_issue is not None:
@@ -219,7 +222,9 @@ def _proposed(path: Path, where: Path, naming: dict[str, Any]) -> ConfigProposal
             from bwbayes.app.config.proposal import draft_config
             from bwbayes.record.io.columns import Naming
 
-            return draft_config(path, where, Naming(**naming))
+            stated = Naming.stated(**naming)
+            with stated.quantities.spoken():
+                return draft_config(path, where, stated)
     except ColumnsError as error:
         raise error.in_command(command_as_typed()) from None
 
@@ -238,4 +243,5 @@ def _show(proposal: ConfigProposal, conclusion: str) -> None:
             "demagnetized and nothing moved, from_rest = true under [record] makes it known"
         )
     banners = [*remarks_banner(proposal.remarks), *findings]
-    show_report(Report(title="", banners=banners, blocks=[Text(conclusion, on="screen")]))
+    blocks, quantities = [Text(conclusion, on="screen")], proposal.record.quantities
+    show_report(Report(title="", banners=banners, blocks=blocks, quantities=quantities))

@@ -58,9 +58,11 @@ def command_of(verb: Verb) -> click.Command:
             refuse_existing([out / f"{kind.NAME}.json"], overwrite=overwrite)
             fit = open_converged(folder)
             try:
-                product = verb.load()(fit, *arguments, watch=watch, **options)
+                with fit.quantities.spoken():
+                    product = verb.load()(fit, *arguments, watch=watch, **options)
             except ColumnsError as error:
                 raise error.in_command(command_as_typed()) from None
+            product.said_in(fit.quantities)
             saved = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
         return present(product, saved, fit.standing, quiet=quiet)
 
@@ -141,11 +143,13 @@ def predict(
         fit = open_converged(folder)
         try:
             options |= {"name": name, "estimate_offset": not same_offset, "watch": watch}
-            reading = {key: options.pop(key) for key in ("columns", "units", "fs", "covariates")}
-            bands = predict_record(fit, record, reading=reading, **options)
+            keys = ("columns", "units", "fs", "covariates", "input", "output")
+            reading = {key: options.pop(key) for key in keys}
+            with fit.quantities.spoken():
+                bands = predict_record(fit, record, reading=reading, **options)
         except ColumnsError as error:
             raise error.in_command(command_as_typed()) from None
-        write_prediction(bands, files, fit.standing, partial(watch, "files"))
+        write_prediction(bands, files, fit.standing, partial(watch, "files"), fit.quantities)
     unmeasured, remarks = bands.measured is None, list[str]()
     if unmeasured and record is not None:
         remarks.append(
@@ -162,7 +166,8 @@ def predict(
         )
     banners = [*standing_banner(fit.standing), *remarks_banner(remarks)]
     report = bands.report()
-    show_report(replace(report, banners=[*banners, *report.banners]))
+    banners = [*banners, *report.banners]
+    show_report(replace(report, banners=banners, quantities=fit.quantities))
     for path in files:
         click.echo(f"wrote {path}")
     return worse(fit.standing.exit_status, bands.standing.exit_status)

@@ -183,7 +183,7 @@ def reading_of(options: dict[str, Any], file: object, flag: str) -> dict[str, An
 
     Raises InputError: they say something, and the command is given no ``file``.
     """
-    keys = ("columns", "units", "fs", "covariates", "table")
+    keys = ("columns", "units", "fs", "covariates", "table", "input", "output")
     reading = {key: options.pop(key) for key in keys}
     if file is None and any(value not in (None, {}) for value in reading.values()):
         context = click.get_current_context()
@@ -256,7 +256,7 @@ def present(
     product: Product, files: Sequence[Path], standing: ValidationSummary, *, quiet: bool = False
 ) -> int:
     """Show a product of a run and its files; return the worse of the run's and its own status."""
-    report = product.report()
+    report = product.full_report()
     if not quiet:
         show_report(report)
         for path in files:
@@ -288,7 +288,7 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
         fit = resume(
             folder,
             Console(stderr=True, quiet=quiet),
-            answer=lambda fit: None if quiet else show_report(fit.report()),
+            answer=lambda fit: None if quiet else show_report(fit.full_report()),
             **options,
         )
     if not quiet:

@@ -153,7 +153,7 @@ def campaign(
     with resumable(batch.resuming):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
     if not quiet:
-        show_report(result.report())
+        show_report(result.full_report())
         click.echo(f"report: {batch.page}")
     for row in result.rows:
         if row.reason:

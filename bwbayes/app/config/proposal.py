@@ -13,10 +13,10 @@ import os
 import re
 import warnings
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 import numpy as np
 import scipy
@@ -28,6 +28,7 @@ from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning, path_text
 from bwbayes.model.registry import DYNAMICS
 from bwbayes.model.reversals import rate
+from bwbayes.quantities import DISPLACEMENT
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.fields import record_fields
@@ -71,11 +72,15 @@ def draft_config(path: Path, where: Path, naming: Naming | None = None) -> Confi
         record = Record(**record_fields(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
     # Of a reversed sign, what turns it without a new file.
+    quantities = record.quantities
     unit = table.columns["displacement"].unit
+    if quantities.output != DISPLACEMENT:
+        unit = table.naming.units.get("displacement", quantities.output.unit)
     turned = unit[1:] if unit.startswith("-") else f"-{unit}"
+    key = "displacement" if quantities.output == DISPLACEMENT else "output"
     here = (
-        f'units = {{ displacement = "{turned}" }} under [record], or '
-        f"`bwbayes init {path} --unit displacement={quote(turned)}`"
+        f'units = {{ {key} = "{turned}" }} under [record], or '
+        f"`bwbayes init {path} --unit {key}={quote(turned)}`"
     )
     findings = tuple(
         replace(finding, fix=f"{finding.fix}, or say {here}")
@@ -90,12 +95,13 @@ def draft_config(path: Path, where: Path, naming: Naming | None = None) -> Confi
 def _text(
     path: Path, where: Path, naming: Naming, record: Record, findings: tuple[Finding, ...]
 ) -> str:
+    say = record.quantities.say
     notes: list[str] = []
     stated: dict[str, dict[str, tuple[str, str]]] = {"record": {}, "model": {}}
     for finding in findings:
-        notes.append(f"# {finding.kind}: {finding.text}")
+        notes.append(say(f"# {finding.kind}: {finding.text}"))
         if not (fix := re.fullmatch(r"(\w+) = (.+) under \[(record|model)\]", finding.fix)):
-            notes.append(f"#   fix: {finding.fix}")
+            notes.append(say(f"#   fix: {finding.fix}"))
             continue
         key, value, table = fix.groups()
         before, kinds = stated[table].get(key, (value, finding.kind))
@@ -120,26 +126,7 @@ def _text(
     first, last = np.flatnonzero(usable.has_reading)[[0, -1]].tolist()
     edges = [first, *(edge for window in held for edge in (window.start, window.stop)), last + 1]
     train = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
-    # A JSON string is a TOML string too, except for DEL, which no column's name has.
-    quoted = partial(json.dumps, ensure_ascii=False)
-
-    def relative(file: Path) -> str:
-        location = Path(os.path.relpath(file.absolute(), where.absolute()))
-        return quoted(path_text(location.as_posix()))
-
-    source = f"file = {relative(path)}"
-    if naming.displacement_file is not None:
-        source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
-    tables = {"columns": naming.columns, "units": naming.units}
-    tables["covariates"] = naming.covariate_columns
-    for key, table in tables.items():
-        if table:
-            pairs = ", ".join(
-                f"{quantity} = {quoted(column)}" for quantity, column in table.items()
-            )
-            source += f"\n{key} = {{ {pairs} }}"
-    source += "" if naming.fs is None else f"\nfs = {naming.fs!r}"
-    source += "" if naming.table is None else f"\ntable = {quoted(naming.table)}"
+    source = _source(path, where, naming, record)
     command = ""
     if naming.units.get("voltage") is None and record.voltage_is == "output":
         command = (
@@ -147,29 +134,23 @@ def _text(
             "for measured\n"
         )
     ending = f"[validation.held_out]\nwindow = {_windows(record, held)}"
-    ending += "  # s: held out, used to validate the bands"
+    ending += f"  # {record.quantities.clock.unit}: held out, used to validate the bands"
     if not held:
         ending = """\
 # Too little of the record, or of its motion, can be left out of the fit to hold bands against it:
 # [validation.another]
 # file = "another.csv\""""
-    assert record.displacement is not None
-    low, high = record.range_voltage
-    missing = record.samples - record.readings
     return f"""\
-# {record.origin}: {record.samples} samples every {record.interval:g} s from \
-{record.start:g} s on{f", {missing} readings missing" if missing else ""}
-# voltage {low:.4g} to {high:.4g} V, displacement {np.nanmin(record.displacement):.4g} \
-to {np.nanmax(record.displacement):.4g} um
+{_heading(record)}
 {chr(10).join(notes or ["# No issues found."])}
 
 [record]
 {source}
-train = {_windows(record, train)}  # s: fitted
+train = {_windows(record, train)}  # {record.quantities.clock.unit}: fitted
 {fixes["record"]}{_start(record)}
 {command}
 [model]
-dynamics = "lag"  # or {", ".join(quoted(name) for name in DYNAMICS if name != "lag")}
+dynamics = {_dynamics(record)}
 {fixes["model"]}
 # Priors come from the record's ranges; `bwbayes check` shows them. To say more:
 # [parameters]
@@ -182,13 +163,69 @@ dynamics = "lag"  # or {", ".join(quoted(name) for name in DYNAMICS if name != "
 """
 
 
+def _quoted(text: Any) -> str:
+    # A JSON string is a TOML string too, except for DEL, which no column's name has.
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _source(path: Path, where: Path, naming: Naming, record: Record) -> str:
+    """Say where the record is, and how its file is read."""
+
+    def relative(file: Path) -> str:
+        location = Path(os.path.relpath(file.absolute(), where.absolute()))
+        return _quoted(path_text(location.as_posix()))
+
+    source = f"file = {relative(path)}"
+    if naming.displacement_file is not None:
+        source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
+    for key, quantity in ("input", naming.input), ("output", naming.output):
+        source += "" if quantity is None else f"\n{key} = {_quoted(quantity)}"
+    roles = {"voltage": "input", "displacement": "output"}
+    names = {} if record.quantities.are_default else roles
+    tables = {"columns": naming.columns, "units": naming.units}
+    tables["covariates"] = naming.covariate_columns
+    for key, table in tables.items():
+        if table:
+            pairs = ", ".join(
+                f"{names.get(name, name)} = {_quoted(column)}" for name, column in table.items()
+            )
+            source += f"\n{key} = {{ {pairs} }}"
+    if naming.fs is not None and record.quantities.has_clock:
+        source += f"\nfs = {naming.fs!r}"
+    return source + ("" if naming.table is None else f"\ntable = {_quoted(naming.table)}")
+
+
+def _heading(record: Record) -> str:
+    """Say what is in the record."""
+    assert record.displacement is not None
+    low, high = record.range_voltage
+    missing = record.samples - record.readings
+    clock = ", without a time"
+    if record.quantities.has_clock:
+        clock = f" every {record.interval:g} s from {record.start:g} s on"
+    extent = (
+        f"# voltage {low:.4g} to {high:.4g} V, displacement {np.nanmin(record.displacement):.4g} "
+        f"to {np.nanmax(record.displacement):.4g} um"
+    )
+    heading = f"# {record.origin}: {record.samples} samples{clock}"
+    heading += f", {missing} readings missing" if missing else ""
+    return f"{heading}\n{record.quantities.say(extent)}"
+
+
+def _dynamics(record: Record) -> str:
+    """Say which dynamics there are."""
+    if not record.quantities.has_clock:
+        return '"none"  # the record has no time'
+    return f'"lag"  # or {", ".join(_quoted(name) for name in DYNAMICS if name != "lag")}'
+
+
 def _start(record: Record) -> str:
     """Say how the drive starts, and what no record tells of it."""
     if not record.starts_at_zero:
         unknown = "the initial state is unknown and will be estimated"
-        return f"# from_rest = false  # {record.beginning}; {unknown}"
+        return record.quantities.say(f"# from_rest = false  # {record.beginning}; {unknown}")
     advice = "say so if the actuator was demagnetized and nothing moved"
-    return f"# from_rest = true  # {record.beginning}; {advice}"
+    return record.quantities.say(f"# from_rest = true  # {record.beginning}; {advice}")
 
 
 def _held_out(record: Record) -> list[slice]:

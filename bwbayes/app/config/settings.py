@@ -8,7 +8,6 @@ A key is a field here and nowhere else: its type is what is checked, its docstri
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
@@ -108,6 +107,10 @@ class _Source(ConfigTable):
     """Further columns of the file that a part of the model sees, as stages = ["temperature"] does;
     where they are called otherwise { temperature_degC = "T2" }.
     """
+    input: str | None = key(None, example='"H (A/m)"')
+    """What drives, where it is no voltage in V: its name, and the unit of all numbers."""
+    output: str | None = key(None, example='"B (T)"')
+    """What is measured, where it is no displacement in um."""
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
     """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
     that is predicted by default those of the training record.
@@ -117,14 +120,8 @@ class _Source(ConfigTable):
     def _naming(self) -> Self:
         from bwbayes.record.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
-        other = None if self.displacement_file is None else Path(self.displacement_file)
-        Naming(
-            self.columns or {},
-            self.units or {},
-            self.fs,
-            displacement_file=other,
-            covariates=self.covariates or (),
-        )
+        keys = ("columns", "units", "fs", "displacement_file", "covariates", "input", "output")
+        Naming.stated(**{key: getattr(self, key) for key in keys})
         return self
 
 

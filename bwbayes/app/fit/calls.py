@@ -83,7 +83,8 @@ def fit(
     path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
     problem = resolve_config(config, where, records)
-    warn(problem.remarks, 3)
+    say = problem.quantities.say
+    warn(map(say, problem.remarks), 3)
     result = run.resume(
         RunFolder.create(path, problem, overwrite),
         console,
@@ -92,7 +93,7 @@ def fit(
         executor=executor,
         problem=problem,
     )
-    warn([note for note in result.notes if note not in problem.remarks], 3)
+    warn([say(note) for note in result.notes if note not in problem.remarks], 3)
     return result.with_cache(_scratch=scratch)
 
 

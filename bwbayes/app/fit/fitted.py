@@ -19,6 +19,7 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.stages import Stages
 from bwbayes.app.verbs import VERBS, Verb
 from bwbayes.errors import InputError, Renamed
+from bwbayes.quantities import DEFAULT
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.storage import ChainFile
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
     from bwbayes.diagnosis.validation import ValidationSummary
+    from bwbayes.quantities import Quantities
     from bwbayes.report.report import Report
 
 
@@ -77,6 +79,11 @@ class Run(Shown, Stages):
         """The name of its config, or else of its operator."""
         return self.problem.config.name or self.problem.config.model.hysteresis
 
+    @property
+    def quantities(self) -> Quantities:  # type: ignore[override]
+        """What its records are of, in whose words it is shown."""
+        return self.problem.quantities
+
     @cached_property
     def standing(self) -> ValidationSummary:
         """Whether the bands hold, all together: as its folder says, if it does."""
@@ -85,7 +92,7 @@ class Run(Shown, Stages):
         numbers = self.folder.numbers()
         return (
             ValidationSummary.read(numbers)
-            if numbers
+            if numbers and self.quantities == DEFAULT  # in the package's own words
             else ValidationSummary.of(self.validation.values())
         )
 
@@ -116,13 +123,15 @@ class Run(Shown, Stages):
         from bwbayes.app.running.fingerprint import versions
         from bwbayes.report.result import summary
 
-        return summary(self.result) | {
+        numbers = summary(self.result) | {
             "seed": self.problem.config.seed,
             "go_on": None if self.converged else self.resuming,
             "wall_s": self.seconds,
             "versions": versions(self.problem.posterior.engine),
             "data_sha256": self.problem.sha256,
         }
+        said: dict[str, object] = self.quantities.rendered(numbers)
+        return said
 
     @cached_property
     def posterior(self) -> Any:
@@ -191,7 +200,8 @@ class Run(Shown, Stages):
             residuals = self.bands[name].residuals
             values[span] = np.where(np.isfinite(residuals), residuals, values[span])
         coords = {"time": ("time", record.time, {"units": "s"})}
-        return xr.DataArray(values, coords, "time", "residual", {"units": "um"})
+        unit = {"units": self.quantities.output.unit}
+        return xr.DataArray(values, coords, "time", "residual", unit)
 
     @property
     def plot(self) -> Plots:

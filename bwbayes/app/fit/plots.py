@@ -8,6 +8,7 @@ figures alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.control.loop import CONTROLLERS
@@ -45,9 +46,12 @@ class Plots:
                 for key, picture in pictures(self._fit.result).items()
                 if key.partition("_")[0] == kind
             }
-            return draw_styled(_named(shown, name or next(iter(shown), kind))[1].draw)
+            return self._styled(_named(shown, name or next(iter(shown), kind))[1].draw)
 
         return draw
+
+    def _styled(self, draw: Callable[..., Figure], *shown: Any) -> Figure:
+        return draw_styled(draw, *shown, quantities=self._fit.quantities)
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *PICTURES]
@@ -58,7 +62,7 @@ class Plots:
         name, record = _named(problem.records, name)
         training = problem.posterior.for_record(name).single_record.training
         shown = record_pictures(record, training, problem.findings[name])
-        return draw_styled(_named(shown, kind)[1].draw)
+        return self._styled(_named(shown, kind)[1].draw)
 
     def loop(self, *names: str) -> Figure:
         """Draw displacement against voltage with its bands, and its tip enlarged.
@@ -66,11 +70,11 @@ class Plots:
         By default for all that was predicted with the fit, or for the bands of these names.
         """
         bands = self._fit.bands
-        return draw_styled(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
+        return self._styled(draw_kind, "loop", [_named(bands, name)[1] for name in names or bands])
 
     def tracking(self, tracked: Tracking) -> Figure:
         """Draw what ``fit.track()`` returns: error against frequency, for each controller."""
-        return draw_styled(draw_tracking, tracked.to_pandas(), CONTROLLERS)
+        return self._styled(draw_tracking, tracked.to_pandas(), CONTROLLERS)
 
 
 def _named[T](items: Mapping[str, T], name: str | None) -> tuple[str, T]:

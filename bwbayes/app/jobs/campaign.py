@@ -88,7 +88,7 @@ def start(
     """
     records_in(records)
     stated = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
-    Naming(**stated)  # what cannot be is refused before any record is
+    Naming.stated(**stated)  # what cannot be is refused before any record is
     origin = Origin(str(records.absolute()), str(where.absolute()), pictures, stated)
     return CampaignFolder.create(out, config, origin, overwrite=overwrite)
 
@@ -131,10 +131,10 @@ def resume(
             if outcome.refused:
                 refused[outcome.file.name] = outcome.short
         with StepProgress(console, "combining the records ...") as watch:
-            campaign = Campaign.of(folder, files, refused, watch)
+            campaign = Campaign.of(folder, files, refused, watch).said_in(folder.quantities())
             # Nothing in its files depends on when or how it was computed.
             figures = partial(watch, "figures")
-            save(campaign.report(), folder.path, "campaign", pictures="figures", watch=figures)
+            save(campaign.full_report(), folder.path, "campaign", pictures="figures", watch=figures)
     return campaign
 
 
@@ -184,7 +184,7 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
     if text := campaign.config.read_text(encoding="utf-8"):
         config = parse(text, "campaign.toml").with_record(file)
     else:
-        proposal = draft_config(file, where, Naming(**origin.reading))
+        proposal = draft_config(file, where, Naming.stated(**origin.reading))
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
         config = proposal.config

@@ -74,6 +74,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     )
     report = Report(
         title=f"{name}, check",
+        quantities=problem.quantities,
         heading=f"Check: {name}",
         about="; ".join(about),
         banners=[

@@ -209,7 +209,7 @@ def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison
     facts += [item for item in problem.facts.items() if item[0].partition(" ")[0] in about]
     facts.append(("readings fitted", str(candidates[0].readings)))
     facts.append(("held out", ", ".join(problem.validations) or "nothing"))
-    return recommend(candidates, facts)
+    return recommend(candidates, facts).said_in(problem.quantities)
 
 
 def _candidate(

@@ -229,7 +229,7 @@ def _reference(
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
         options_of_record = column_options_from(path, read_as, reading)
         options_of_record.pop("voltage_is", None)
-        values, interval = read_reference(path, Naming(**options_of_record))
+        values, interval = read_reference(path, Naming.stated(**options_of_record))
         return Reference(values, interval, path.stem, smoothed)
     try:
         values = np.asarray(requested, dtype=np.float64)

@@ -23,6 +23,7 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.operator import Span
+from bwbayes.report.report import Shown
 
 EARLIER = {"own_offset": "estimate_offset", "lead_in_from": "lead_in_start"}  # earlier names
 
@@ -44,10 +45,14 @@ def fit_method[**P, R](
                 hint = suggestion(name, options, EARLIER)
                 raise InputError(f"{job.__name__}: {name} is unknown; {hint}")
         fit.require_converged()
-        product = job(fit, *args, **kwargs)
+        say = fit.quantities.say
+        with fit.quantities.spoken():
+            product = job(fit, *args, **kwargs)
+        if isinstance(product, Shown):
+            product.said_in(fit.quantities)
         if getattr(product, "standing", fit.standing) is fit.standing:
-            warn(fit.standing.messages, 3)
-        warn(getattr(product, "notes", getattr(product, "remarks", ())), 3)
+            warn(map(say, fit.standing.messages), 3)
+        warn(map(say, getattr(product, "notes", getattr(product, "remarks", ()))), 3)
         return product
 
     return method

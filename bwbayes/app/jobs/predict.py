@@ -15,7 +15,10 @@ from bwbayes.app.running.predictions import Prediction, predict_after, predict_a
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, path_text, refuse_unwritable, suggestion
 from bwbayes.prediction.initial_state import InitialConditions
-from bwbayes.record import Record, read_record
+from bwbayes.quantities import DEFAULT, Quantities
+from bwbayes.record import Record
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.formats import read_named
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.report.figures import picture_of
 from bwbayes.report.outputs import write_bands, write_summary
@@ -126,7 +129,10 @@ def predict(
         name = name or path_text(Path(record).stem)
         reading = {**(reading or {}), "table": table, "displacement_file": displacement_file}
         reading_options = column_options_from(record, problem.config.records[of].read_as, reading)
-        record = read_record(record, need_displacement=False, **reading_options)
+        voltage_is = reading_options.pop("voltage_is", None)
+        naming = Naming.stated(**reading_options)
+        record = read_named(Path(record), naming, voltage_is, need_displacement=False)
+    record = record.like(problem.records[of])
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
     declared_hold = None if hold == "auto" else hold
@@ -143,6 +149,7 @@ def write_prediction(
     files: Sequence[Path],
     standing: ValidationSummary,
     watch: Watch = unwatched,
+    quantities: Quantities = DEFAULT,
 ) -> None:
     """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
 
@@ -153,7 +160,8 @@ def write_prediction(
     table, numbers, picture = files
     with refuse_unwritable(table):
         table.parent.mkdir(parents=True, exist_ok=True)
-        write_bands(table, [prediction], part(watch, 0.0, 0.8))
-        write_summary(numbers, prediction.numbers() | {"run_validation": standing.numbers})
-        picture.write_bytes(picture_of(prediction.plot))
+        write_bands(table, [prediction], part(watch, 0.0, 0.8), quantities)
+        said = prediction.numbers() | {"run_validation": standing.numbers}
+        write_summary(numbers, quantities.rendered(said))
+        picture.write_bytes(picture_of(prediction.plot, quantities))
         watch(1.0)

@@ -13,8 +13,9 @@ from typing import Any
 
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.errors import InputWarning
-from bwbayes.record.io.columns import Naming, series_named
+from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_source
+from bwbayes.record.io.recognition import series_named
 from bwbayes.record.io.series import Source
 
 
@@ -25,7 +26,7 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     """
     stated = {
         key: getattr(source, key)
-        for key in ("columns", "units", "fs", "voltage_is", "covariates")
+        for key in ("columns", "units", "fs", "voltage_is", "covariates", "input", "output")
         if getattr(source, key) is not None
     }
     if not stated or source.file is None:
@@ -52,13 +53,18 @@ def column_options_from(
     Raises InputError: the file cannot be read.
     """
     as_stated = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
-    if noted is None or as_stated.keys() & {"columns", "units", "fs"}:
+    if noted is None:
+        return as_stated
+    # The same quantities in whatever columns.
+    as_stated = {key: noted[key] for key in ("input", "output") if key in noted} | as_stated
+    if as_stated.keys() & {"columns", "units", "fs"}:
         return as_stated
     names = {item.name for item in _content(Path(path), as_stated.get("table")).series}
     if not names <= {*noted.get("all_columns", ())}:
         return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
-    options = {key: noted[key] for key in noted if key in ("units", "fs", "voltage_is")}
+    kept = ("units", "fs", "voltage_is", "input", "output")
+    options = {key: noted[key] for key in noted if key in kept}
     further = Naming(covariates=noted.get("covariates", ())).covariate_columns
     options["covariates"] = {name: column for name, column in further.items() if column in names}
     return options | as_stated | {"columns": columns}

@@ -22,6 +22,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.spec import ModelSpec
+from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
 
@@ -88,14 +89,14 @@ def with_model(
     )
 
 
-def as_config(parameter: Parameter) -> ParameterConfig:
-    """Write a parameter as a config does, in explicit numbers."""
+def as_config(parameter: Parameter, quantities: Quantities) -> ParameterConfig:
+    """Write a parameter as a config does, in explicit numbers and the quantities' units."""
     stated = Stated(
         parameter.prior,
         parameter.fixed,
         parameter.lower if np.isfinite(parameter.lower) else None,
         parameter.upper if np.isfinite(parameter.upper) else None,
-        parameter.unit,
+        quantities.say(parameter.unit),
         parameter.label,
         parameter.description,
     )

@@ -31,6 +31,7 @@ from bwbayes.app.problem.records import (
     unlike,
     validations_of,
     windows_of,
+    without_clock,
 )
 from bwbayes.arrays import IntArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training
@@ -43,6 +44,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study, require_known
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.spec import ModelSpec
+from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.sampling.plan import (
     SamplingPlan,
@@ -121,6 +123,11 @@ class Problem:
         return next(iter(self.records.values()))
 
     @property
+    def quantities(self) -> Quantities:
+        """What its records are of, in whose words all is said."""
+        return self.record.quantities
+
+    @property
     def sha256(self) -> str:
         """A digest of all that was measured."""
         return self.study.data_sha256
@@ -137,8 +144,9 @@ class Problem:
         for name, record in self.records.items():
             which = "" if len(self.records) == 1 else f" {name}"
             low, high = record.range_voltage
+            clock = f" every {record.interval:g} s" if record.quantities.has_clock else ""
             fact = (
-                f"{record.origin}: {record.samples} samples every {record.interval:g} s, "
+                f"{record.origin}: {record.samples} samples{clock}, "
                 f"{low:.4g} to {high:.4g} V ({record.voltage_is}), {record.readings} readings"
             )
             if gap := record.longest_gap:
@@ -243,15 +251,30 @@ def resolve_config(
 
     Raises InputError: anything in the config or the records that cannot be used.
     """
-    in_memory = records or {}
+    with _quantities(config, records or {}).spoken():
+        return _resolved(config, folder, records or {})
+
+
+def _quantities(config: Config, in_memory: Mapping[str, Record]) -> Quantities:
+    """Return what the first record of a config is of."""
+    name, source = next(iter(config.records.items()))
+    if name in in_memory:
+        return in_memory[name].quantities
+    return Quantities.of(source.input, source.output)
+
+
+def _resolved(config: Config, folder: Path, in_memory: Mapping[str, Record]) -> Problem:
+    """Make a problem of a config, as :func:`resolve_config`."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         fitted, stand = training_records(config, folder, in_memory)
+        config, untimed = without_clock(config, fitted)
         config, fitted = join_records(config, fitted)
         training, held_out = windows_of(config, fitted)
         validations = validations_of(config, folder, fitted, held_out, in_memory)
     remarks = [text for source in config.records.values() for text in source.remarks or ()]
     remarks += [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
+    remarks += untimed
     aside = {name: source.outliers for name, source in config.records.items()}
     if config.model.outliers:
         aside |= _outliers(config, fitted, training, [n for n, t in aside.items() if t is None])
@@ -365,6 +388,8 @@ def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
             outliers=source.outliers,
             read_as=source.read_as,
             remarks=source.remarks or None,
+            input=source.input,
+            output=source.output,
         )
         for name, source in config.records.items()
     }
@@ -381,7 +406,7 @@ def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
             "record": records[ALONE] if isinstance(config.record, RecordConfig) else records,
             "model": config.model.with_spec(study.spec.explicit(posterior.datasets[0].actuator)),
             "sampling": config.sampling.model_copy(update=sampling),
-            "parameters": {p.name: as_config(p) for p in parameters},
+            "parameters": {p.name: as_config(p, study.quantities) for p in parameters},
             "truth": {name: value for name, value in true.items() if value is not None},
             "validation": validation,
         }

@@ -24,8 +24,11 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
 from bwbayes.inference.study import place_of
+from bwbayes.model.registry import STAGES
 from bwbayes.prediction.initial_state import InitialConditions
-from bwbayes.record import Record, read_record
+from bwbayes.record import Record
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.formats import read_named
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
@@ -112,6 +115,33 @@ def training_records(
             _require_usable(record, table)
         records[name] = record
     return records, stand
+
+
+def without_clock(config: Config, records: Mapping[str, Record]) -> tuple[Config, list[str]]:
+    """Leave out of a config's model what needs a clock, if its records have none, and say so.
+
+    Raises InputError: records of different quantities.
+    """
+    first = next(iter(records.values()))
+    for name, record in records.items():
+        if record.quantities != first.quantities:
+            own = record.quantities
+            raise InputError(
+                f"{place_of(name)}: is of {own.input} and {own.output} along {own.clock}, the "
+                "first record of others; give records of the same quantities"
+            )
+    if first.quantities.has_clock:
+        return config, []
+    model, stages = config.model, config.model.stages
+    if stages != "auto":
+        stages = [name for name in stages if name in STAGES and STAGES[name]().rate_independent]
+    changes = {"dynamics": "none", "creep": False, "creep_growth": False, "noise": "white"}
+    changed = model.model_copy(update={**changes, "stages": stages})
+    remark = (
+        "the record has no time, so it is taken as rate independent: dynamics, creep, stages that "
+        "need a clock and the model error's correlation time are left out"
+    )
+    return config.model_copy(update={"model": changed}), [remark]
 
 
 def _require_usable(record: Record, where: str) -> None:
@@ -229,16 +259,17 @@ def _read(
         return record.without_values(source.missing or ())
     assert source.file is not None
     try:
-        record = read_record(
-            folder / source.file,
-            voltage_is=source.voltage_is,
+        naming = Naming.stated(
             columns=source.columns,
             units=source.units,
             fs=source.fs,
             table=source.table,
             displacement_file=source.displacement_file and folder / source.displacement_file,
             covariates=source.covariates,
+            input=source.input,
+            output=source.output,
         )
+        record = read_named(folder / source.file, naming, source.voltage_is)
     except ColumnsError as error:
         raise error.within(table) from None
     return record.without_values(source.missing or ())
@@ -264,8 +295,11 @@ def validations_of(
             continue
         if source.signal is None:
             covariates = source.covariates or config.records[of].covariates
-            told = source.model_copy(update={"covariates": covariates})
-            record = _read(told, folder, in_memory.get(name), table)
+            told = {"covariates": covariates}
+            for key in ("input", "output"):
+                told[key] = getattr(source, key) or getattr(config.records[of], key)
+            told_source = source.model_copy(update=told)
+            record = _read(told_source, folder, in_memory.get(name), table).like(training[of])
             if source.missing is None:
                 record = record.without_values(config.records[of].missing or ())
         else:

@@ -116,7 +116,7 @@ def _works(result: Result) -> dict[str, Callable[[], Any]]:
     if result.predictions:
         works[PLOTS] = partial(plots_of, result)
     for name, picture in pictures(result).items():
-        works[name] = partial(picture_of, picture.draw)
+        works[name] = partial(picture_of, picture.draw, result.quantities)
     return works
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 from filelock import FileLock, Timeout
 
 from bwbayes.errors import InputError, refuse_unwritable
+from bwbayes.quantities import Quantities
 
 if TYPE_CHECKING:
     from bwbayes.app.problem.problem import Problem
@@ -293,6 +294,17 @@ class CampaignFolder(Folder):
                 f"{self.mark}: does not say which records it is about; start again with "
                 "`overwrite=True`"
             ) from None
+
+    def quantities(self) -> Quantities:
+        """Return what its records are of, as its config or else the command says."""
+        from bwbayes.app.config.config import parse
+
+        reading = self.origin().reading
+        stated = reading.get("input"), reading.get("output")
+        if text := self.config.read_text(encoding="utf-8"):
+            first = next(iter(parse(text, str(self.config)).records.values()))
+            stated = first.input, first.output
+        return Quantities.of(*stated)
 
     def digests(self, file: Path) -> dict[str, str]:
         """Return the SHA-256 of a record's file, and of all files that the config predicts."""

@@ -143,7 +143,7 @@ def _open_chain(
             problem, point, steps, explanations = choose_model(problem, watch)
             unsure = voltage_noise(problem, point, partial(watch, "noise on the voltage"))
         posterior, config = problem.posterior, problem.config
-        for step in steps:
+        for step in map(problem.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
         if config != given:
             _rewrite(folder, config)
@@ -202,10 +202,11 @@ def write_files(
     files(0.3)
     bands.unlink(missing_ok=True)
     if result.predictions:
-        write_bands(bands, result.predictions, part(files, 0.3, 0.9))
+        written = result.predictions, part(files, 0.3, 0.9), fit.quantities
+        write_bands(bands, *written)
     fit.keep(folder)
     files(1.0)
     pictures, plots = figure_worker.collect(result, figures, partial(watch, "figures"))
-    page = render(fit.report(), pictures, plots)
+    page = render(fit.full_report(), pictures, plots)
     (folder.path / "report.html").write_text(page, encoding="utf-8")
     write_summary(folder.summary, numbers)

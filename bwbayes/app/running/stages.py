@@ -200,6 +200,7 @@ class Stages:
             moves=chain.moves("sampling"),
             facts=problem.facts | facts,
             truth=problem.config.truth,
+            quantities=problem.quantities,
         )
 
     @cached_property

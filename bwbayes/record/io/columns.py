@@ -13,27 +13,27 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.quantities import DEFAULT, DISPLACEMENT, TIME, VOLTAGE, Quantities
 from bwbayes.record.io.own_times import with_own_times
 from bwbayes.record.io.questions import columns_error
 from bwbayes.record.io.recognition import (
-    bare_name,
     beside,
     counts_samples,
     finite,
     is_demand,
     likeness,
-    listed,
-    ranges_of,
+    series_named,
     unit_of,
 )
 from bwbayes.record.io.series import Clock, Series, Source
+from bwbayes.record.io.stated import conversion, in_stated_quantities
 from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, epoch_unit, scale_of
 
 
@@ -58,6 +58,8 @@ class Naming:
         The file with the displacement, if it is another one than that with the voltage.
     covariates
         The columns of covariates by their names; or columns that are called as these are.
+    input, output
+        What the voltage and the displacement are, where they are others, as ``"H (A/m)"``.
 
     Raises
     ------
@@ -72,6 +74,8 @@ class Naming:
     table: int | str | None = None
     displacement_file: Path | None = None
     covariates: Mapping[str, str] | Sequence[str] = ()
+    input: str | None = None
+    output: str | None = None
 
     def __post_init__(self) -> None:
         if wrong := {*QUANTITIES, "truth", ""} & self.covariate_columns.keys():
@@ -79,17 +83,9 @@ class Naming:
         for key, table in (("columns", self.columns), ("units", self.units)):
             for quantity in table:
                 if quantity not in QUANTITIES:
-                    allowed = ", ".join(QUANTITIES)
+                    allowed = self.quantities.say(", ".join(QUANTITIES))
                     raise InputError(f"{key}: no quantity {quantity!r}; write {allowed}")
-        for quantity, unit in self.units.items():
-            if (scale := scale_of(unit, quantity)) is None:
-                allowed = ", ".join(COMMON_UNITS[quantity])
-                raise InputError(
-                    f"units: {quantity} in {unit!r} is unknown; write {allowed}, with another SI "
-                    f"prefix, or a number of them, as '0.35 {COMMON_UNITS[quantity][0]}'"
-                )
-            if quantity == "time" and scale[0] < 0:
-                raise InputError("units: time does not run backwards; remove the minus")
+        self._require_units()
         for quantity, column in self.columns.items():
             if not isinstance(column, str) and (
                 isinstance(column, bool) or not hasattr(column, "__index__")
@@ -108,6 +104,51 @@ class Naming:
             raise InputError(f"fs: {self.fs:g} Hz is no sampling rate; give a number above 0")
         if self.fs is not None and "time" in self.columns:
             raise InputError("fs: takes the place of the time column; give one of the two")
+
+    def _require_units(self) -> None:
+        """Refuse a unit that its quantity cannot have."""
+        for quantity, unit in self.units.items():
+            own = self.quantities.of_key(quantity)
+            if own not in (VOLTAGE, DISPLACEMENT, TIME):
+                if conversion(unit, own.unit) is None:
+                    raise InputError(
+                        f"units: {own.name} in {unit!r} is unknown; write {own.unit}, a unit that "
+                        f"converts to it, or a number of them, as '0.35 {own.unit}'"
+                    )
+                continue
+            if (scale := scale_of(unit, quantity)) is None:
+                allowed = ", ".join(COMMON_UNITS[quantity])
+                raise InputError(
+                    f"units: {quantity} in {unit!r} is unknown; write {allowed}, with another SI "
+                    f"prefix, or a number of them, as '0.35 {COMMON_UNITS[quantity][0]}'"
+                )
+            if quantity == "time" and scale[0] < 0:
+                raise InputError("units: time does not run backwards; remove the minus")
+
+    @classmethod
+    def stated(
+        cls,
+        *,
+        columns: Mapping[str, str | int] | None = None,
+        units: Mapping[str, str] | None = None,
+        displacement_file: str | Path | None = None,
+        covariates: Mapping[str, str] | Sequence[str] | None = None,
+        **others: Any,
+    ) -> Self:
+        """Return the naming of a user, who may call the quantities input and output, or H and B."""
+        names = Quantities.of(others.get("input"), others.get("output")).by_key
+        return cls(
+            {names.get(q.casefold(), q): column for q, column in (columns or {}).items()},
+            {names.get(q.casefold(), q): unit for q, unit in (units or {}).items()},
+            displacement_file=None if displacement_file is None else Path(displacement_file),
+            covariates=covariates or (),
+            **others,
+        )
+
+    @property
+    def quantities(self) -> Quantities:
+        """What the voltage and the displacement are."""
+        return Quantities.of(self.input, self.output)
 
     @property
     def covariate_columns(self) -> dict[str, str]:
@@ -148,6 +189,7 @@ class ColumnTable:
     notes: Mapping[str, str]
     naming: Naming
     rows: IntArray | None = None
+    quantities: Quantities = DEFAULT
 
     def error(self, problem: str, quantity: str = "", sample: int | None = None) -> InputError:
         """Return the error ``file:line: column: problem``; sample and quantity may be left out."""
@@ -157,7 +199,7 @@ class ColumnTable:
             where += f":{lines[sample]}" if lines else f":sample {sample}"
         if quantity:
             name = self.columns[quantity].name if quantity in self.columns else quantity
-            where += f": {name}"
+            where += f": {name}" if self.quantities.are_default else f": {name!r}"
         return InputError(f"{where}: {problem}")
 
     def only(self, rows: IntArray) -> ColumnTable:
@@ -181,6 +223,8 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     InputWarning
         If a column is recognized by nothing but its unit, or columns of a text are ignored.
     """
+    as_asked = naming
+    source, naming, quantities = in_stated_quantities(source, naming, needed)
     chosen = {q: series_named(source, name, q) for q, name in naming.columns.items()}
     by_unit = _recognize(source, chosen, naming)
     if "voltage" in needed:
@@ -197,7 +241,8 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
             raise InputError(f"{source.path}: {series.name}: in {stated}, not in V; {advice}")
     unknown = [q for q in QUANTITIES if q in chosen and units[q] is None]
     if missing or unknown:
-        raise columns_error(source, naming, chosen, missing, unknown)
+        error = columns_error(source, naming, chosen, missing, unknown)
+        raise error if quantities.are_default else quantities.asked(error)
     path = source.path
     if by_unit:
         reasons = ", ".join(f"{quantity} is {chosen[quantity].name!r}" for quantity in by_unit)
@@ -235,42 +280,12 @@ def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES)
     foreign = {
         q: name for q, name in names.items() if q in QUANTITIES and likeness(name, "", q) != 0
     }
-    used = Naming(
-        {**foreign, **naming.columns},
-        naming.units,
-        naming.fs,
-        naming.table,
-        covariates=naming.covariates,
-    )
-    return ColumnTable(source, columns, notes, used)
+    used = replace(as_asked, columns={**foreign, **as_asked.columns}, fs=naming.fs)
+    return ColumnTable(source, columns, notes, used, quantities=quantities)
 
 
 def _warn(remark: str) -> None:
     warnings.warn(one_line(remark), InputWarning, stacklevel=5)
-
-
-def series_named(source: Source, name: str | int, quantity: str) -> Series:
-    """Return the series that a naming means: by its path, the end of its path, or its number.
-
-    Raises
-    ------
-    InputError
-        There is none, or several.
-    """
-    word = str(name).strip()
-    exact = [s for s in source.series if s.name == word and name == str(name)]
-    matches = exact or [s for s in source.series if s.label == word and name == str(name)]
-    if not matches:  # without its unit, which a reader may have appended
-        matches = [s for s in source.series if name == bare_name(s.label, quantity)]
-    if not matches and word.isdecimal():
-        matches = list(source.series[int(word) - 1 : int(word)]) if int(word) else []
-    if len(matches) == 1:
-        return matches[0]
-    problem = "several columns" if matches else "no column"
-    raise InputError(
-        f"{source.path}: {problem} {name!r} for the {quantity}; choose another. "
-        f"{listed(matches or source.series, ranges_of(matches or source.series))}"
-    )
 
 
 def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> list[str]:

@@ -88,6 +88,7 @@ def record_fields(
         "interval": grid.interval,
         "start": grid.start,
         "voltage_is": kind,
+        "quantities": table.quantities,
         "origin": table.notes.get("origin") or path_text(table.source.path.name),
         "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
     }
@@ -177,7 +178,7 @@ def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None
     if extent == 0:
         problem = f"constant at {values[0]:g}; give a record in which it moves"
         raise table.error(problem, quantity)
-    if extent < 1e-9:  # V or um
+    if extent < 1e-9 and table.quantities.are_default:  # V or um
         problem = f"moves by {extent:.3g} at most, which is absurdly little; check the unit"
         raise table.error(problem, quantity)
 
@@ -186,6 +187,8 @@ def _converted(table: ColumnTable, quantity: str) -> FloatArray:
     """Return a column in the package's unit after refusing what is not finite or absurdly large."""
     column = table.columns[quantity]
     largest = 1e12 if quantity == "time" else 1e9  # s; V or um, whatever the actuator
+    if not table.quantities.are_default and quantity != "time":
+        largest = 1e100
     with np.errstate(all="ignore"):
         values = column.scaled(np.asarray(column.values, dtype=np.float64), quantity)
         refused = ~(np.abs(values) <= largest)

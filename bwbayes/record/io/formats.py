@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import h5py
@@ -72,6 +72,8 @@ def read_record(
     table: int | str | None = None,
     displacement_file: str | Path | None = None,
     covariates: Mapping[str, str] | Sequence[str] | None = None,
+    input: str | None = None,
+    output: str | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -103,6 +105,11 @@ def read_record(
     covariates : dict or list
         Further columns that a model may see, by name: temperature_degC. A list names columns that
         are called so.
+    input : str
+        What drives, if not a voltage: 'H (A/m)'. Its column is converted to that unit; columns and
+        units may be given for "input" and "output", or by the quantities' own names.
+    output : str
+        What is measured, if not a displacement: 'B (T)'.
 
     Raises
     ------
@@ -116,22 +123,46 @@ def read_record(
         If columns are ignored, a column is recognized by nothing but its unit, samples are missing,
         or times are not uniform.
     """
-    path = Path(path)
+    named: dict[str, Any] = {
+        "columns": columns,
+        "units": units,
+        "fs": fs,
+        "table": table,
+        "input": input,
+    }
+    named |= {"displacement_file": displacement_file, "covariates": covariates, "output": output}
+    naming = Naming.stated(**named)
+    with naming.quantities.spoken():
+        return read_named(Path(path), naming, voltage_is, need_displacement)
+
+
+def read_named(
+    path: Path,
+    naming: Naming,
+    voltage_is: VoltageIs | None = None,
+    need_displacement: bool = True,
+) -> Record:
+    """Read and check a record by a naming, as :func:`read_record`, with errors of any quantities.
+
+    Raises
+    ------
+    InputError
+        For every problem, in one line.
+    """
     if voltage_is is not None:
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
-    other = None if displacement_file is None else Path(displacement_file)
-    naming = Naming(columns or {}, units or {}, fs, table, other, covariates or ())
     content = read_table(path, naming, needed)
     record = Record(**record_fields(content, voltage_is, need_displacement))
     truth_path = _truth_path(path)
     if path.suffix.lower() not in _TEXT or not truth_path.exists():
         return record
-    truth = Record(**record_fields(read_table(truth_path, Naming())))
-    same = truth.samples == record.samples and np.allclose(
+    same = Naming(input=naming.input, output=naming.output)
+    truth = Record(**record_fields(read_table(truth_path, same)))
+    is_same = truth.samples == record.samples and np.allclose(
         truth.time, record.time, rtol=0.0, atol=0.01 * record.interval
     )
-    if not same:
+    if not is_same:
         problem = "time_s: not the times of the record; remove or replace the file"
         raise InputError(f"{truth_path}: {problem}")
     return replace(record, truth=truth.displacement)

@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 
 from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.quantities import DEFAULT, DISPLACEMENT, VOLTAGE
 from bwbayes.record.io.series import (
     NOTES,
     RATES,
@@ -84,12 +85,16 @@ def write_hdf5(record: Record, path: Path) -> None:
 
 
 def record_arrays(record: Record) -> dict[str, Any]:
-    """Return the arrays of a record by the names that they have in files."""
+    """Return the arrays of a record by the names that they have in files.
+
+    Those of other quantities are input and output, whose unit the notes have.
+    """
+    quantities = record.quantities
     arrays = {
-        "time_s": record.time,
-        "voltage_V": record.voltage,
-        "displacement_um": record.displacement,
-        "truth_um": record.truth,
+        "time_s": record.time if quantities.has_clock else None,
+        "voltage_V" if quantities.input == VOLTAGE else "input": record.voltage,
+        "displacement_um" if quantities.output == DISPLACEMENT else "output": record.displacement,
+        "truth_um" if quantities.output == DISPLACEMENT else "truth": record.truth,
     }
     return {name: v for name, v in arrays.items() if v is not None} | dict(record.covariates)
 
@@ -103,6 +108,11 @@ def record_notes(record: Record) -> dict[str, str | float]:
         "time_offset_s": record.time_offset,
         "covariates": ", ".join(record.covariates),
     }
+    if record.quantities != DEFAULT:
+        own = record.quantities
+        notes |= {"input_is": str(own.input), "output_is": str(own.output)}
+    if not record.quantities.has_clock:
+        del notes["interval_s"]
     return {name: value for name, value in notes.items() if value}
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.errors import InputError, NoNumbersError
+from bwbayes.record.io.series import NOTES
 from bwbayes.record.io.units import (
     QUANTITIES,
     is_other_unit,
@@ -204,8 +205,10 @@ def split_header(line: str, layout: Layout) -> list[str]:
     """Return the cells of a line, by any separator that gives as many as the numbers have.
 
     Where blanks separate them, names may have several words before a unit in parentheses. Settings
-    may stand above fields without numbers.
+    may stand above fields without numbers. A note that the package writes has none.
     """
+    if line.startswith("# ") and line[2:].partition(":")[0] in NOTES:
+        return []
     bare = line.lstrip("#%").strip(" ") if line.startswith(("#", "%")) else line
     ways = [cells_of(bare, separator) for separator in (layout.separator, *SEPARATORS)]
     between_names = (r"\s{2,}|\t", r"(?<=[\])])\s+", r"\s+(?![\[(/])(?<!/ )")

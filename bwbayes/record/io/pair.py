@@ -65,7 +65,9 @@ def _own(source: Source, naming: Naming, quantity: str) -> Naming:
         columns[quantity] = others[0].name
     units = {q: unit for q, unit in naming.units.items() if q in ("time", quantity)}
     covariates = naming.covariates if quantity == "voltage" else ()
-    return Naming(columns, units, naming.fs, covariates=covariates)
+    return replace(
+        naming, columns=columns, units=units, covariates=covariates, displacement_file=None
+    )
 
 
 def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> ColumnTable:
@@ -98,5 +100,6 @@ def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> 
         replace(voltage.source, lines=voltage.source.lines if alike else ()),
         columns,
         {"origin": path_text(f"{path.name}, {other.name}"), **voltage.notes},
-        replace(naming, columns=used),
+        replace(naming, columns=used, fs=voltage.naming.fs),
+        quantities=voltage.quantities,
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
-from bwbayes.record.io.series import Series
+from bwbayes.record.io.series import Series, Source
 from bwbayes.record.io.units import QUANTITIES, factor_in, unit_in, unit_in_brackets, unit_scale
 
 # In the names of displacements that are asked for, not measured.
@@ -130,6 +130,30 @@ def listed(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) 
         texts = [f"{name!r} ({_span(*ranges[name])})" for name in names[:12]]
         listed.append(f"{size} values each: {', '.join(texts)}{', ...' * (len(names) > 12)}")
     return f"There are {'; '.join(listed)}" if listed else "There are no series of numbers"
+
+
+def series_named(source: Source, name: str | int, quantity: str) -> Series:
+    """Return the series that a naming means: by its path, the end of its path, or its number.
+
+    Raises
+    ------
+    InputError
+        There is none, or several.
+    """
+    word = str(name).strip()
+    exact = [s for s in source.series if s.name == word and name == str(name)]
+    matches = exact or [s for s in source.series if s.label == word and name == str(name)]
+    if not matches:  # without its unit, which a reader may have appended
+        matches = [s for s in source.series if name == bare_name(s.label, quantity)]
+    if not matches and word.isdecimal():
+        matches = list(source.series[int(word) - 1 : int(word)]) if int(word) else []
+    if len(matches) == 1:
+        return matches[0]
+    problem = "several columns" if matches else "no column"
+    raise InputError(
+        f"{source.path}: {problem} {name!r} for the {quantity}; choose another. "
+        f"{listed(matches or source.series, ranges_of(matches or source.series))}"
+    )
 
 
 def _span(low: float, high: float) -> str:

@@ -22,7 +22,10 @@ from bwbayes.errors import InputError, InputWarning, one_line
 
 MAXIMUM_SAMPLES = 10**8
 # What a file may say beside its numbers.
-NOTES = ("voltage_is", "origin", "interval_s", "time_offset_s", "covariates")
+NOTES = (
+    *("voltage_is", "origin", "interval_s", "time_offset_s", "covariates"),
+    *("input_is", "output_is"),
+)
 # What a number beside the series is called, in lower case, that is their rate, Hz, or the interval,
 # s: the power of it that is the rate.
 RATES = {
@@ -56,7 +59,8 @@ class Series:
 
     ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values, and
     ``load_readings``, if it is given, the same of which some may be missing: words are nan. A
-    ``clock`` is what the file states in place of a time column.
+    ``clock`` is what the file states in place of a time column. An ``alias`` takes the place of the
+    name where a quantity is recognized by it.
     """
 
     name: str
@@ -66,11 +70,12 @@ class Series:
     group: str = ""
     load_readings: Callable[[], NDArray[Any]] | None = None
     clock: Clock | None = None
+    alias: str = ""
 
     @property
     def label(self) -> str:
         """The name without the path."""
-        return self.name.removeprefix(self.group)
+        return self.alias or self.name.removeprefix(self.group)
 
     def numbers(self, where: object, *, readings: bool = False) -> NDArray[Any]:
         """Load the numbers, (size,), of a series in the file ``where``; of ``readings`` some.

@@ -169,10 +169,16 @@ def _different(path: Path, names: Sequence[str], frame: pd.DataFrame) -> list[st
 
 def write_text(record: Record, path: Path) -> None:
     """Write a record as text, all floats with the shortest digits that give them back exactly."""
-    columns = {name: v for name, v in record_arrays(record).items() if name != "truth_um"}
+    names = {"input": str(record.quantities.input), "output": str(record.quantities.output)}
+    columns = {
+        names.get(name, name): values
+        for name, values in record_arrays(record).items()
+        if values is not record.truth
+    }
     with path.open("w", encoding="utf-8", newline="\n") as file:
         for name, value in record_notes(record).items():
-            file.write(f"# {'voltage' if name == 'voltage_is' else name}: {value}\n")
+            is_voltage = name == "voltage_is" and record.quantities.are_default
+            file.write(f"# {'voltage' if is_voltage else name}: {value}\n")
         pd.DataFrame(columns).to_csv(file, index=False, lineterminator="\n")
 
 

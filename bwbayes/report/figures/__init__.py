@@ -16,6 +16,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.report.figures.style import STYLE
 
 if TYPE_CHECKING:
@@ -27,12 +28,19 @@ if TYPE_CHECKING:
 __all__ = ["draw_styled", "picture_of", "plots_of", "prepare", "save_pictures"]
 
 
-def draw_styled(draw: Callable[..., Figure], *shown: Any) -> Figure:
-    """Draw a figure with the look that all have."""
+def draw_styled(
+    draw: Callable[..., Figure], *shown: Any, quantities: Quantities = DEFAULT
+) -> Figure:
+    """Draw a figure with the look that all have, and in the words of its quantities."""
     import matplotlib as mpl  # noqa: PLC0415
+    from matplotlib.text import Text  # noqa: PLC0415
 
     with mpl.rc_context(STYLE):
-        return draw(*shown)
+        figure = draw(*shown)
+        for text in figure.findobj(Text) if quantities != DEFAULT else ():
+            assert isinstance(text, Text)
+            text.set_text(quantities.say(text.get_text()))
+        return figure
 
 
 def prepare() -> None:
@@ -53,7 +61,7 @@ def plots_of(result: Result) -> PagePlots:
     return PagePlots(plots, interactive.scripts()) if plots else NO_PLOTS
 
 
-def picture_of(draw: Callable[[], Figure]) -> bytes:
+def picture_of(draw: Callable[[], Figure], quantities: Quantities = DEFAULT) -> bytes:
     """Draw a figure and return it as PNG, laid out and drawn once: ``savefig`` does either twice.
 
     Of its thousands of colors, nearly all from smooth edges, it keeps those that come nearest to
@@ -64,7 +72,7 @@ def picture_of(draw: Callable[[], Figure]) -> bytes:
     from PIL import Image  # noqa: PLC0415
 
     with mpl.rc_context(STYLE):
-        figure = draw()
+        figure = draw_styled(draw, quantities=quantities)
         figure.set_dpi(STYLE["savefig.dpi"])
         canvas = FigureCanvasAgg(figure)
         canvas.draw()  # type: ignore[no-untyped-call]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -53,17 +53,35 @@ def draw(result: Result) -> dict[str, Markup]:
     if loops:
         # A row goes on below where it is too narrow.
         plots["loop"] = row(*loops, sizing_mode="stretch_width", styles={"flex-wrap": "wrap"})
-    return {name: _page_json(plot, i) for i, (name, plot) in enumerate(plots.items())}
+    say = result.quantities.say
+    return {name: _page_json(plot, i, say) for i, (name, plot) in enumerate(plots.items())}
 
 
-def _page_json(plot: models.Model, number: int) -> Markup:
+def _said(part: Any, say: Callable[[str], str], key: str = "") -> Any:
+    """Return the JSON of a plot with its labels in the words of the run's quantities."""
+    if isinstance(part, str):
+        return say(part) if key in ("axis_label", "text", "value", "tooltips") else part
+    if isinstance(part, list):
+        # Of a tooltip the label; what it shows is a column of the source.
+        is_pair = key == "tooltips" and len(part) == 2 and isinstance(part[0], str)
+        return [say(part[0]), part[1]] if is_pair else [_said(item, say, key) for item in part]
+    if isinstance(part, dict):
+        return {name: _said(item, say, name) for name, item in part.items()}
+    return part
+
+
+def _page_json(plot: models.Model, number: int, say: Callable[[str], str]) -> Markup:
     """Return a plot as JSON that may stand in HTML, and is the same whenever it is drawn.
 
     Bokeh numbers its models on through a process; here they are numbered through the plot.
     """
     document = Document()
     document.add_root(plot)
-    item = {"root_id": plot.id, "doc": document.to_json(deferred=False), "version": __version__}
+    item = {
+        "root_id": plot.id,
+        "doc": _said(document.to_json(deferred=False), say),
+        "version": __version__,
+    }
     text = json.dumps(item)
     names: dict[str, str] = {}
     text = re.sub(
