@@ -45,6 +45,7 @@ def ranges_of(
         interval=inputs.interval,
         duration=volts.size * inputs.interval,
         rounding=rounding_sd(readings[~np.isnan(readings)]),
+        resolution=resolution_sd(readings[~np.isnan(readings)]),
         covariates={name: inputs.range_of(name, windows) for name in inputs.covariates},
     )
 
@@ -59,10 +60,26 @@ def rounding_sd(readings: FloatArray) -> float:
     # Here, because to open a run is to read files: records bring what reads any of them.
     from bwbayes.record.voltage_path import noise_sd, rounding_step  # noqa: PLC0415
 
-    step = max(rounding_step(readings), 2.0**-24 * float(np.ptp(readings)))
-    rounding = step / math.sqrt(12)
+    rounding = max(rounding_step(readings) / math.sqrt(12), _finest_sd(readings))
     enough = readings.size > 10  # for differences of the highest order
     return rounding if enough and noise_sd(readings)[0] < 1.1 * rounding else 0.0
+
+
+def resolution_sd(readings: FloatArray) -> float:
+    """Return the least sd of a sensor whose readings (readings,) hide their noise, um; else 0.
+
+    Readings along a drive that jumps at every few samples may have none, and a model may follow
+    them exactly.
+    """
+    from bwbayes.record.voltage_path import noise_sd  # noqa: PLC0415  # as above
+
+    enough = readings.size > 10
+    return _finest_sd(readings) if enough and not noise_sd(readings)[1] else 0.0
+
+
+def _finest_sd(readings: FloatArray) -> float:
+    """Return the sd of rounding to 2⁻²⁴ of the range of readings, um."""
+    return 2.0**-24 * float(np.ptp(readings)) / math.sqrt(12)
 
 
 def join_ranges(records: Sequence[Ranges]) -> Ranges:
@@ -86,6 +103,7 @@ def join_ranges(records: Sequence[Ranges]) -> Ranges:
         interval=min(record.interval for record in records),
         duration=max(record.duration for record in records),
         rounding=min(record.rounding for record in records),
+        resolution=min(record.resolution for record in records),
         covariates={
             name: (
                 min(record.covariates[name][0] for record in records),

@@ -20,11 +20,15 @@ from bwbayes.model.registry import build_part
 
 
 def _sensor_sd(context: Context) -> Distribution:
-    """Return the default prior of the sensor's sd; where rounding alone is seen, above its sd."""
-    if not (rounding := round_to_scale(context.ranges.rounding)):
-        return lognormal(0.006 * context.ranges.displacement, 2.0)
-    # What is seen may be all there is; a model that misses some of it needs many times that.
-    return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
+    """Return the default prior of the sensor's sd, above what its readings may be rounded by."""
+    if rounding := round_to_scale(context.ranges.rounding):
+        # What is seen may be all there is; a model that misses some of it needs many times that.
+        return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
+    usual = lognormal(0.006 * context.ranges.displacement, 2.0)
+    if not (least := round_to_scale(context.ranges.resolution)):
+        return usual
+    scale, width = usual.arguments["median"], usual.arguments["sigma"]
+    return Distribution("lognorm", {"s": width, "loc": least, "scale": scale})
 
 
 SENSOR_SD = Declaration(

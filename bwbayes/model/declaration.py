@@ -36,8 +36,9 @@ class Ranges:
     middle of the displacement's range, um; ``time`` is T, the typical time between turning points
     of the drive, s; ``bias`` the middle of the voltage's range, V; ``interval`` between samples and
     ``duration`` of the record, s. ``rounding`` is the sd of the rounding of readings that show no
-    other noise, um; 0 where they show some. ``covariates`` are the least and the largest value of
-    each, by name.
+    other noise, um; 0 where they show some. ``resolution`` is the least sd of a sensor whose
+    readings jump too often to show their noise, um; 0 where they show it. ``covariates`` are the
+    least and the largest value of each, by name.
     """
 
     voltage: float
@@ -48,6 +49,7 @@ class Ranges:
     interval: float = 0.0
     duration: float = 0.0
     rounding: float = 0.0
+    resolution: float = 0.0
     covariates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def middle_of(self, covariate: str) -> float:

@@ -21,7 +21,9 @@ def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
     record = bw.Record.from_arrays(voltage, displacement, interval=0.005)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return bw.fit(record, dynamics="none", noise="white", ess=200, progress=False)
+        return bw.fit(
+            record, dynamics="none", noise="white", search="none", ess=200, progress=False
+        )
 
 
 def test_an_exact_record_gives_its_parameters() -> None:
@@ -29,6 +31,16 @@ def test_an_exact_record_gives_its_parameters() -> None:
     assert fit.converged
     assert fit.passed is not False, fit.standing.lines
     assert any("no noise" in note for note in fit.notes)
+    means = dict(zip(fit.problem.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
+    for name, value in {"d": 0.7, **TRUTH}.items():
+        assert means[name] == pytest.approx(value, rel=1e-5)
+
+
+def test_a_drive_that_jumps_gives_its_parameters() -> None:
+    """Differences of its readings do not show that they have no noise."""
+    voltage = np.repeat(np.random.default_rng(3).uniform(-60, 60, 100), 4)
+    fit = fitted(0.7 * voltage - np.ravel(bw.hysteresis(voltage, **TRUTH)), voltage)
+    assert fit.converged
     means = dict(zip(fit.problem.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
     for name, value in {"d": 0.7, **TRUTH}.items():
         assert means[name] == pytest.approx(value, rel=1e-5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -172,6 +174,22 @@ def test_readings_without_noise_have_that_of_rounding(digits: int, scale: float,
     noise = np.random.default_rng(seed).standard_normal(clean.size)
     assert rounding_sd(clean + 1e-4 * np.ptp(clean) * noise) == 0
     assert rounding_sd(step * np.round((clean + step * noise) / step)) == 0
+
+
+def test_readings_that_jump_have_a_sensor_as_good_as_a_converter_at_best() -> None:
+    """They hide their noise; the prior's median and width are those of readings that show it."""
+    voltage = np.repeat(np.random.default_rng(0).uniform(-60, 60, 100), 4)
+    jumping, smooth = 0.7 * voltage, displacement(drive())
+    ranges = ranges_of(Inputs(voltage, interval=1e-3), jumping)
+    least, usual = prior("sensor_sd", ranges), prior("sensor_sd", replace(ranges, resolution=0.0))
+    finest = 2.0**-24 * np.ptp(jumping) / np.sqrt(12)
+    assert least.support[0] == pytest.approx(finest, rel=0.01)
+    quantiles = np.array([0.01, 0.5, 0.99])
+    shifted = least.support[0] + usual.frozen.ppf(quantiles)
+    np.testing.assert_allclose(least.frozen.ppf(quantiles), shifted, rtol=1e-12)
+    noise = 0.1 * np.random.default_rng(0).standard_normal(smooth.size)
+    for readings in (smooth, smooth + noise):
+        assert ranges_of(Inputs(drive(), interval=1e-3), readings).resolution == 0
 
 
 def test_a_record_without_noise_has_a_sensor_as_good_as_its_rounding_at_best() -> None:
