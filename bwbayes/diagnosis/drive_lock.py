@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import root
@@ -76,10 +76,9 @@ class DriveLock:
         text = (
             "what the model misses follows the drive "
             f"(correlation {self.correlation:.2g}, p = {max(self.p_value, 1e-6):.1g}): the bands "
-            "hold for drives like the training record's; another drive may be missed"
+            "hold for drives like the training record's; those of others are widened"
         )
-        fix = "train on a record with reversals at all voltages, such as a multisine"
-        return (Finding("model error", text, fix),)
+        return (Finding("model error", text, TELLING_DRIVE),)
 
 
 def drive_locks(

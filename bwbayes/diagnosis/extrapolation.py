@@ -9,7 +9,7 @@ and drifts.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.finding import Finding
+from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
@@ -136,8 +136,7 @@ def beyond_training(
             f"voltage and last reversal are {100 * distance:.2g}% of the range away from those of "
             "training on average; the bands' level is untested on these loops"
         )
-        fix = "train on a record with reversals at all voltages, such as a multisine"
-        findings.append(Finding("reversals", text, fix))
+        findings.append(Finding("reversals", text, TELLING_DRIVE))
     findings += _slow(posterior, (low, high), min(turn_times), voltage, interval, window)
     duration = voltage[: window.stop].size * interval
     before = max(
@@ -150,6 +149,16 @@ def beyond_training(
         )
         findings.append(Finding("duration", text, "train on a record that is as long"))
     return findings
+
+
+# What a drive excites in an actuator that its training record did not, by a finding's kind.
+UNEXCITED = {"speed": "fast edges", "slow": "slow holds"}
+
+
+def unexcited(findings: Iterable[Finding]) -> str:
+    """Say what a drive excites that the training record did not; nothing if that is not known."""
+    kinds = [UNEXCITED[finding.kind] for finding in findings if finding.kind in UNEXCITED]
+    return f"this drive excites what the record did not ({', '.join(kinds)})" if kinds else ""
 
 
 def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator[Finding]:

@@ -59,6 +59,13 @@ class Finding:
         return f"Likely cause: {self.note}"
 
 
+# What shows a wrong model, and which drive that would be.
+TELLING_DRIVE = (
+    "train on a record with reversals at all voltages, such as a multisine; `bwbayes design FOLDER "
+    "--validate` finds one"
+)
+
+
 def join_findings(findings: Sequence[Finding]) -> Finding | None:
     """Return findings that cannot be told apart as one; None if there is none."""
     if not findings:

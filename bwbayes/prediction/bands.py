@@ -90,20 +90,45 @@ class Bands:
     model_error_sd: float | None = None
 
     @property
-    def model_error_note(self) -> str:
-        """By how much the bands are wider for the model's error, and why; nothing if they are not.
+    def without_rivals(self) -> Bands:
+        """The bands as they would be without the model's error, without scores of the readings.
 
-        Of normal distributions.
+        About the mean, by the ratio of the sds: of normal distributions.
         """
         if not self.model_error_sd:
+            return self
+        lower, upper = dict(self.lower), dict(self.upper)
+        for kind in KINDS[1:]:
+            sd = self.sd(kind)
+            left = np.sqrt(np.maximum(1 - (self.model_error_sd / sd) ** 2, 0.0))
+            for level in LEVELS:
+                for edges in (lower, upper):
+                    edges[kind, level] = self.mean + left * (edges[kind, level] - self.mean)
+        return replace(
+            self,
+            lower=lower,
+            upper=upper,
+            pit=None,
+            crps=None,
+            log_score=None,
+            model_error_sd=None,
+        )
+
+    def width(self, level: int = 95) -> float:
+        """Return the mean width of the sensor band after the lead-in, um."""
+        width = self.upper["sensor", level] - self.lower["sensor", level]
+        return float(np.mean(width[self.scored_from :]))
+
+    @property
+    def model_error_note(self) -> str:
+        """By how much the bands are wider for the model's error, and why; nothing if not."""
+        if not self.model_error_sd:
             return ""
-        wide = self.sd("sensor")[self.scored_from :]
-        narrow = np.sqrt(np.maximum(wide**2 - self.model_error_sd**2, 0.0))
-        width, before = 2 * scipy.special.ndtri(0.975) * np.array([np.mean(wide), np.mean(narrow)])
+        width, before = self.width(), self.without_rivals.width()
         return (
-            f"what the model misses follows the drive, and other models that fit the training "
-            f"record differ by {self.model_error_sd:.2g} um more on this drive: the 95% sensor "
-            f"band is {width:.2g} um wide instead of {before:.2g} um"
+            f"model error that follows the drive: bands widened {width / before:.2g} times on this "
+            f"one (95% sensor band {width:.2g} um wide instead of {before:.2g} um), because other "
+            f"models of the training record differ by {self.model_error_sd:.2g} um more here"
         )
 
     @property

@@ -192,6 +192,7 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         records = tables.flat_records({name: result.validation_numbers[name] for name in titles})
         validation = [
             tables.scores_table(scores, result.validation, titles, records),
+            *tables.rivals_table(ordered),
             Section(
                 "Other scores",
                 [

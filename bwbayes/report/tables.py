@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from bwbayes.diagnosis.identifiability import InformationGain
 from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.prediction.bands import LEVELS
+from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
@@ -195,6 +195,29 @@ def scores_table(
     return Table.of(
         "validation", "Band validation", rows, columns, records=records, note=note, on="both"
     )
+
+
+def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
+    """Return a table of the bands that rivals widen, with and without them, if there are any."""
+    rows = []
+    for bands in predictions:
+        if not bands.model_error_sd:
+            continue
+        both, shares = (bands, bands.without_rivals), ["–", "–"]
+        if (scored := bands.scored(bands.measured)).any():
+            assert bands.measured is not None
+            inside = [each.covers("sensor", 95, bands.measured)[scored] for each in both]
+            shares = [f"{np.mean(covered):.1%}" for covered in inside]
+        wide, narrow = both[0].width(), both[1].width()
+        widths = [length_text(wide), length_text(narrow), f"{wide / narrow:.2g}"]
+        rows.append((bands.name, *widths, *shares))
+    columns = ("Record", "Width 95%", "Without rivals", "Times", "Coverage", "Without rivals")
+    note = (
+        "The model's error follows the drive, and these drives are unlike the training record's: "
+        "there the sensor band has in it how much other models of the training record differ."
+    )
+    table = Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")
+    return [table] * bool(rows)
 
 
 def other_scores_table(

@@ -119,6 +119,8 @@ def test_posterior_of_a_record_is_looked_at(planted: bool) -> None:
     lock = drive_lock(posterior, free, rng)
     assert lock.locked is planted
     assert ["follows the drive" in str(finding) for finding in lock.findings] == [True] * planted
+    # What to do is to measure a record that `design` finds.
+    assert all("bwbayes design FOLDER --validate" in finding.fix for finding in lock.findings)
     assert lock.numbers["follows_the_drive"] is planted
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.extrapolation import Drive, beyond_training
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
@@ -53,6 +53,18 @@ def kinds(posterior: Posterior, voltage: FloatArray, interval: float) -> list[st
     return [
         finding.kind for finding in beyond_training(posterior, Inputs(voltage, interval=interval))
     ]
+
+
+def test_what_a_drive_excites_that_the_record_did_not_is_said_in_a_word() -> None:
+    """Steps after a sine have fast edges and slow holds; the sine itself has neither."""
+    for voltage, text in (
+        (
+            np.repeat([20.0, 120.0, 20.0], 3_000),
+            "this drive excites what the record did not (fast edges, slow holds)",
+        ),
+        (sine(0.1, 0.05), ""),
+    ):
+        assert unexcited(beyond_training(SLOW, Inputs(voltage, interval=0.05))) == text
 
 
 def test_range_and_speed_are_said_one_by_one() -> None:

@@ -123,6 +123,15 @@ def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None
     wide, narrow = (predicted(problem, draws, "unlike", found) for found in (rivals, agreeing))
     require_wider(wide, narrow)
     assert covered(wide) > covered(narrow)
+    # The report has both.
+    assert wide.without_rivals.width() == pytest.approx(narrow.width(), rel=0.03)
+    times = f"{wide.width() / wide.without_rivals.width():.2g}"
+    assert f"bands widened {times} times on this one" in str(wide)
+    assert "Without rivals" in str(wide)
+    assert "Without rivals" not in str(narrow)
+    for bands in (wide, narrow):
+        drawn = bands.plot().axes[4].get_legend_handles_labels()[1]
+        assert ("sensor band without rivals" in drawn) is (bands is wide)
     plan = problem.validations["unlike"].record
     assert plan is not None
     require_wider(

@@ -34,7 +34,7 @@ from bwbayes.app.problem.records import (
     without_clock,
 )
 from bwbayes.arrays import IntArray
-from bwbayes.diagnosis.extrapolation import Drive, beyond_training
+from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
 from bwbayes.errors import InputError, InputWarning
@@ -114,7 +114,8 @@ class Problem:
             if source.outliers is not None
         ]
         for name, beyond in self.extrapolations.items():
-            remarks += [f"{name}: {finding.note}" for finding in beyond]
+            notes = (unexcited(beyond), *(finding.note for finding in beyond))
+            remarks += [f"{name}: {note}" for note in notes if note]
         return tuple(remarks)
 
     @property

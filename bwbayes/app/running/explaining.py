@@ -23,6 +23,7 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
+from bwbayes.diagnosis.finding import TELLING_DRIVE
 from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.model import without
@@ -228,7 +229,7 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
         remarks.append(
             "the search for stages may not have found the mechanism: the model error is still "
             f"{discrepancy:.2g} times the sensor's noise, with {len(notes)} added; a drive unlike "
-            "the training record's may be missed"
+            f"the training record's may be missed. Fix: {TELLING_DRIVE}."
         )
     spec = problem.study.spec
     problem = problem.with_model(spec, remarks=remarks, stages=spec.keys["stages"])

@@ -19,7 +19,7 @@ import numpy as np
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import Validation, generator
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis.extrapolation import beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.rivals import Rival, disagreement
@@ -47,8 +47,16 @@ from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.record.voltage_path import estimate_path
 from bwbayes.report.figures import draw_styled
-from bwbayes.report.report import Figure, Report, Shown, remarks_banner, standing_banner
-from bwbayes.report.tables import scores_table
+from bwbayes.report.report import (
+    Block,
+    Figure,
+    Report,
+    Shown,
+    Text,
+    remarks_banner,
+    standing_banner,
+)
+from bwbayes.report.tables import rivals_table, scores_table
 from bwbayes.watching import Watch, part, unwatched
 
 type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]
@@ -125,24 +133,30 @@ class Prediction(Shown, Bands):
 
     def report(self) -> Report:
         """Return how the prediction turned out, and what to know of it."""
-        tables, notes, name = [], self.validation.notes if self.validation else (), self.name
+        blocks, notes, name = (
+            list[Block](),
+            self.validation.notes if self.validation else (),
+            self.name,
+        )
         if self.scores is not None and self.validation is not None:
-            tables = [scores_table({name: self.scores}, {name: self.validation}, {name: name})]
+            blocks.append(scores_table({name: self.scores}, {name: self.validation}, {name: name}))
+        blocks += rivals_table([self])
+        if self.passed:
+            blocks.append(Text(f"{name}: validation passed for drives like this one", on="both"))
         remarks = remarks_banner([*self.remarks, *notes])
         return Report(
-            title=name, banners=[*standing_banner(self.standing), *remarks], blocks=tables
+            title=name, banners=[*standing_banner(self.standing), *remarks], blocks=blocks
         )
 
     @property
     def heading(self) -> str:
         """Name, times and width of the sensor band."""
-        width = float(np.mean(self.upper["sensor", 95] - self.lower["sensor", 95]))
         first, last = (
             clock(time, self.interval) for time in (self.time[0], self.time[-1] + self.interval)
         )
         return (
             f"prediction {self.name}: {self.time.size} samples from {first} to {last} s; "
-            f"the 95% sensor band is {width:.3g} um wide"
+            f"the 95% sensor band is {self.width():.3g} um wide"
         )
 
 
@@ -177,14 +191,15 @@ def predict_another(
     watch(1.0)
     noise = path.remark or planned_noise(other.record)
     held = _held_lead_in_remark(problem, other, bands)
-    remarks = (
-        *[noise] * bool(noise),
-        *[from_rest_note] * bool(from_rest_note),
-        *[held] * bool(held),
-        *[bands.model_error_note] * bool(bands.model_error_note),
-        *(finding.note for finding in beyond),
-    )
+    notes = (noise, from_rest_note, held, *_notes(bands, beyond))
+    remarks = tuple(note for note in notes if note)
     return Prediction(**vars(bands), scores=scores, validation=verdict, remarks=remarks)
+
+
+def _notes(bands: Bands, beyond: Iterable[Finding]) -> tuple[str, ...]:
+    """Say where a drive leaves that of training, and by how much its bands are wider for that."""
+    notes = (bands.model_error_note, unexcited(beyond), *(finding.note for finding in beyond))
+    return tuple(note for note in notes if note)
 
 
 def planned_noise(record: Record) -> str:
@@ -294,11 +309,7 @@ def predict_after(
         error = disagreement(alone, own_draws, study, found, follow, rng)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
-    remarks = (
-        *[bands.model_error_note] * bool(bands.model_error_note),
-        *(finding.note for finding in beyond),
-    )
-    return Prediction(**vars(bands), remarks=remarks)
+    return Prediction(**vars(bands), remarks=_notes(bands, beyond))
 
 
 def predictions(

@@ -59,6 +59,12 @@ def _draw_column(column: Sequence[Axes], bands: Bands) -> None:
         style.draw_ribbons(displacement, segment)
         style.draw_ribbons(residual, segment, segment.mean)
         displacement.plot(*style.zigzag(time, segment.mean), color=style.Color.MEAN, lw=0.8)
+        if segment.model_error_sd:
+            narrow = segment.without_rivals
+            for edge in (narrow.lower["sensor", 95], narrow.upper["sensor", 95]):
+                dashed: style.Look = {"color": style.Color.MEAN, "lw": 0.7, "ls": "--"}
+                dashed["label"] = "sensor band without rivals"
+                residual.plot(*style.zigzag(time, edge - segment.mean), **dashed)
         if segment.truth is not None and bands.time.size < DOTS:
             true = style.zigzag(time, segment.truth - segment.mean)
             label = "true displacement, without noise"
