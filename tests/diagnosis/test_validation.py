@@ -360,6 +360,21 @@ def test_no_cause_of_a_training_record_compares_it_with_training(kind: str) -> N
         assert kinds == ["unknown", kind]
 
 
+@pytest.mark.parametrize("levels", [3, 5])
+def test_rounding_to_few_levels_is_no_error_of_the_model(levels: int) -> None:
+    """The twin: the same residuals elsewhere, where they do not round the readings, fail."""
+    time = 0.01 * np.arange(2000.0)
+    mean = 5 * np.exp(-0.05 * time) * np.sin(2 * np.pi * 0.9 * time)
+    step = float(np.ptp(mean)) / (levels - 1)
+    sds = dict.fromkeys(KINDS, np.full(time.size, step / np.sqrt(12)))
+    residual = np.round(mean / step) * step - mean
+    for errors, passed in ((residual, None), (np.roll(residual, 700), False)):
+        bands = normal_bands(time, 10 * mean, mean, sds, mean + errors, training=True)
+        verdict = judged(bands, ValidationContext(0.0, 0.0, FITTED))
+        assert verdict.passed is passed
+        assert ("NRMSE" in verdict.line) is (passed is False)
+
+
 def test_a_fit_that_leaves_much_of_the_range_does_not_hold() -> None:
     """Its noise model has grown to cover what the model misses: the coverage says nothing.
 
