@@ -196,7 +196,7 @@ class Likelihood:
         that it has in effect.
 
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
-        at θ, if it is given; or (1, readings), that of all models.
+        at θ, if it is given. Of fewer of them models take one after the other, in turn.
         """
         products, log_determinant = self.products_of_series(theta, shapes, displacement)
         start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns
@@ -317,7 +317,7 @@ class Likelihood:
         elements = 1 << 16 if shapes.size and self.engine == "numpy" else 1 << 23
         shapes_of_models = np.broadcast_to(shapes, (len(theta), *shapes.shape[-2:]))
         if displacement is not None:
-            displacement = np.broadcast_to(displacement, (len(theta), readings.rows.size))
+            displacement = displacement[np.arange(len(theta)) % len(displacement)]
         for batch in batches(len(theta), readings.samples * n_series, elements):
             model, noise = self.table.actuator(theta[batch]), self.table.noise(theta[batch])
             if displacement is None:

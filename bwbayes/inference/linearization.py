@@ -65,6 +65,8 @@ def gradient_and_hessian(
     """Return a function's gradient (free,) and Hessian (free, free) at w = 0.
 
     ``function`` maps (models, free) to (models,), in one call; ``value`` is f(0), if it is known.
+    Of several functions side by side, (models, functions), these come last: (free, functions) and
+    (free, free, functions).
     With f± a ``step`` h along a coordinate, or along two,
 
         gᵢ = (fᵢ₊ − fᵢ₋) / 2h,   Hᵢⱼ = (fᵢⱼ₊ + fᵢⱼ₋ − fᵢ₊ − fᵢ₋ − fⱼ₊ − fⱼ₋ + 2f) / 2h²,
@@ -79,6 +81,7 @@ def gradient_and_hessian(
     values = function(np.concatenate([steps, -steps, center]))
     forth, back, here = np.split(values, [len(steps), 2 * len(steps)])
     second = forth + back - 2 * (here if value is None else value)
-    hessian = np.diag(second[:free])
+    hessian, diagonal = np.zeros((free, free, *second.shape[1:])), np.arange(free)
+    hessian[diagonal, diagonal] = second[:free]
     hessian[i, j] = hessian[j, i] = (second[free:] - second[i] - second[j]) / 2
     return (forth - back)[:free] / (2 * step), hessian / step**2

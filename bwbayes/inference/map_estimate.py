@@ -177,7 +177,7 @@ def _add_mode(
     if covariance is None:
         target = Target(posterior)
         # First in the noise's coordinates, which are guessed, so that all guesses lead to one mode.
-        state = target.step_noise(target.at(start[np.newaxis])[0])
+        (state,) = target.step_noise(target.at(start[np.newaxis]))
         start, (covariance, _) = state.coordinates, target.covariance(state)
     modes.append(refine(posterior, start, covariance))
     modes.sort(key=lambda mode: -mode.log_density)
@@ -222,7 +222,8 @@ def _with_noise(
     density = np.empty(0)
     for _ in range(4):
         best = np.concatenate([best, _beside(position, noise)])
-        tried = Target(posterior).noise_density(best[-len(noise) :], state.displacement)
+        moved = state.displacement[np.newaxis]
+        tried = Target(posterior).noise_density(best[-len(noise) :], moved)
         density = np.concatenate([density, tried])
         order = np.argsort(-density, kind="stable")[:retained]
         best, density = best[order], density[order]

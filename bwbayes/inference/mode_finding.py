@@ -118,10 +118,12 @@ class Target:
         return self.posterior.displacement(theta, log_prior)
 
     def noise_density(self, coordinates: FloatArray, displacement: FloatArray) -> FloatArray:
-        """Log density (models,) where all models have the displacement (readings,)."""
+        """Log density (models,) where models have these displacements (any, readings) in turn."""
         theta, density = self.prior(coordinates)
-        possible = np.isfinite(density)
-        if possible.any():
+        possible = np.flatnonzero(np.isfinite(density))
+        if possible.size < len(theta):
+            displacement = displacement[possible % len(displacement)]
+        if possible.size:
             density[possible] += self.posterior.log_likelihood(theta[possible], displacement)
         return np.where(np.isfinite(density), density, -np.inf)
 
@@ -140,7 +142,7 @@ class Target:
 
         So many steps at most in the noise's, one of Fisher scoring in the others.
         """
-        states = [self.step_noise(state, noise_steps) for state in states]
+        states = self.step_noise(states, noise_steps)
         coordinates = np.stack([state.coordinates for state in states])
         linear = self.linearize(coordinates, np.stack([state.displacement for state in states]))
         gradients = linear.gradient - coordinates[:, self.physical]
@@ -194,10 +196,10 @@ class Target:
             return covariance, log_determinant
         linear = self.linearize(state.coordinates[np.newaxis], state.displacement[np.newaxis])
         information = linear.fisher_information[0] + np.eye(self.physical.size)
-        _, hessian = self._noise_hessian(state)
+        _, hessians = self._noise_hessians([state])
         for rows, curvature, flattest in (
             (self.physical, information, 1.0),
-            (self.noise, -hessian, 1e-2),
+            (self.noise, -hessians[..., 0], 1e-2),
         ):
             values, vectors = np.linalg.eigh(curvature)
             values = np.maximum(values, flattest)
@@ -205,35 +207,62 @@ class Target:
             log_determinant -= float(np.sum(np.log(values)))
         return covariance, log_determinant
 
-    def step_noise(self, state: Iterate, count: int = NOISE_STEPS) -> Iterate:
-        """Step in the noise's coordinates, by Newton's method where the density bends down."""
+    def step_noise(self, states: Sequence[Iterate], count: int = NOISE_STEPS) -> list[Iterate]:
+        """Step in the noise's coordinates from states side by side.
+
+        By Newton's method where the density bends down.
+        """
+        states, climbing = [*states], [*range(len(states))]
         for _ in range(count if self.noise.size else 0):
-            gradient, hessian = self._noise_hessian(state)
-            step = newton_step(gradient, hessian, 1.0)
+            here = [states[i] for i in climbing]
+            if not here or not (steps := self._noise_steps(here)).any():
+                break
+            tried = FRACTIONS[:, np.newaxis, np.newaxis] * steps
+            gains = self._noise_gains(here, tried)
+            gained = []
+            for number, best in enumerate(np.argmax(gains, axis=0).tolist()):
+                state, gain = here[number], float(gains[best, number])
+                if gain > GAIN / 4:
+                    coordinates = state.coordinates.copy()
+                    coordinates[self.noise] += tried[best, number]
+                    ahead = Iterate(coordinates, state.density + gain, state.displacement)
+                    states[climbing[number]] = ahead
+                    gained.append(climbing[number])
+            climbing = gained
+        return states
+
+    def _noise_steps(self, states: Sequence[Iterate]) -> FloatArray:
+        """Return a step (states, noise) from each state, zero where it gains next to nothing."""
+        gradients, hessians = self._noise_hessians(states)
+        steps = np.zeros((len(states), self.noise.size))
+        for number, gradient in enumerate(gradients.T):
+            step = newton_step(gradient, hessians[..., number], 1.0)
             step /= max(1.0, float(np.max(np.abs(step))) / 0.5)
-            if gradient @ step <= GAIN / 4:
-                break
-            steps = FRACTIONS[:, np.newaxis] * step
-            gains = self._noise_gains(state, steps)
-            best = int(np.argmax(gains))
-            if gains[best] <= GAIN / 4:
-                break
-            coordinates = state.coordinates.copy()
-            coordinates[self.noise] += steps[best]
-            state = Iterate(coordinates, state.density + float(gains[best]), state.displacement)
-        return state
+            if gradient @ step > GAIN / 4:
+                steps[number] = step
+        return steps
 
-    def _noise_gains(self, state: Iterate, steps: FloatArray) -> FloatArray:
-        """By how much steps (steps, noise) in the noise's coordinates raise the log density."""
-        coordinates = np.tile(state.coordinates, (len(steps), 1))
-        coordinates[:, self.noise] += steps
-        density = self.noise_density(coordinates, state.displacement)
-        return np.maximum(density, WALL) - state.density
+    def _noise_gains(self, states: Sequence[Iterate], steps: FloatArray) -> FloatArray:
+        """By how much steps (any, states, noise) in the noise's coordinates raise log densities.
 
-    def _noise_hessian(self, state: Iterate) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian of the log density in the noise's coordinates."""
+        Returns (any, states).
+        """
+        here = np.stack([state.coordinates for state in states])
+        coordinates = np.tile(here, (len(steps), 1, 1))
+        coordinates[..., self.noise] += steps
+        moved = np.stack([state.displacement for state in states])
+        density = self.noise_density(coordinates.reshape(-1, self.size), moved)
+        before = np.array([state.density for state in states])
+        gains: FloatArray = np.maximum(density, WALL).reshape(-1, len(states)) - before
+        return gains
+
+    def _noise_hessians(self, states: Sequence[Iterate]) -> tuple[FloatArray, FloatArray]:
+        """Gradients (noise, states) and Hessians (noise, noise, states) in noise coordinates."""
         return gradient_and_hessian(
-            lambda steps: self._noise_gains(state, steps), self.noise.size, NOISE_STEP, 0.0
+            lambda steps: self._noise_gains(states, steps[:, np.newaxis]),
+            self.noise.size,
+            NOISE_STEP,
+            0.0,
         )
 
 

@@ -206,13 +206,14 @@ class Posterior:
     ) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters): the sum over the records.
 
-        ``displacement`` (readings,), um, takes the place of what all models do from rest, if it is
-        known; its readings are those of all records, one after the other.
+        ``displacement`` (models, readings), um, takes the place of what models do from rest, if it
+        is known; readings are those of all records, one after the other. Of fewer models take one
+        after the other, in turn.
         """
         total = np.zeros(len(theta))
         of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)
         for dataset, likelihood, columns in of_records:
-            moved = None if displacement is None else displacement[np.newaxis, columns]
+            moved = None if displacement is None else displacement[:, columns]
             total += likelihood.log_density(self.table.of(theta, dataset.name), moved)
         return total
 

@@ -69,6 +69,9 @@ def test_the_hessian_of_a_quadratic_is_exact(numbers: list[float]) -> None:
         gradient, hessian = gradient_and_hessian(function, 3, 0.1, value)
         np.testing.assert_allclose(gradient, slope, atol=1e-12)
         np.testing.assert_allclose(hessian, matrix, atol=1e-11)
+    both = gradient_and_hessian(lambda w: np.outer(function(w), [1.0, 2.0]), 3, 0.1)
+    np.testing.assert_allclose(both[0], np.outer(slope, [1.0, 2.0]), atol=1e-11)
+    np.testing.assert_allclose(both[1], np.multiply.outer(matrix, [1.0, 2.0]), atol=1e-10)
 
 
 @every_case

@@ -90,5 +90,20 @@ def test_a_displacement_that_is_held_gives_the_density_of_the_noise(
     places = np.tile(np.random.default_rng(1).normal(0, 0.5, len(posterior.names)), (5, 1))
     places[:, target.noise] += np.random.default_rng(2).normal(0, 0.5, (5, target.noise.size))
     places[4, target.noise] = 1e4  # beyond anything that is possible
-    held = target.noise_density(places, target.at(places[:1])[0].displacement)
+    moved = target.at(places[:1])[0].displacement
+    held = target.noise_density(places, moved[np.newaxis])
     np.testing.assert_allclose(held, posterior.log_density(places), rtol=1e-9)
+
+
+def test_steps_in_the_noise_side_by_side_are_those_of_each_state_alone() -> None:
+    """But for what differences make of the densities' rounding, ε |f| / h² of 1e5 nats: 1e-7."""
+    posterior = replace(short_posterior(samples=200), engine="numpy")
+    target = Target(posterior)
+    places = np.random.default_rng(3).normal(0, 0.5, (3, len(posterior.names)))
+    states = target.at(places)
+    for state, before in zip(target.step_noise(states), states, strict=True):
+        (alone,) = target.step_noise([before])
+        np.testing.assert_allclose(state.coordinates, alone.coordinates, atol=1e-6)
+        density = posterior.log_density(state.coordinates[np.newaxis])
+        np.testing.assert_allclose(density, state.density, rtol=1e-9)
+        assert state.density > before.density

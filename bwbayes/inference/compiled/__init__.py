@@ -181,7 +181,7 @@ def _staged(
 ) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
     """Yield which models go together, and the stage that makes their drive.
 
-    That is the ``displacement`` (models, readings), or (1, readings), where it is known.
+    That is the ``displacement`` where it is known.
     """
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
     if displacement is not None:

@@ -69,10 +69,8 @@ def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
 
 
 def given(drive: FloatArray, models: int | None = None) -> CompiledDrive:
-    """Take a known drive (models, samples), um; of so many ``models`` it may be one for all."""
-    number = np.arange(len(drive))
-    if models is not None:
-        number = np.broadcast_to(number, models)
+    """Take a known drive (models, samples), um; so many ``models`` may take fewer in turn."""
+    number = np.arange(models or len(drive)) % len(drive)
     equilibrium = drive[number, 0]
     group = np.stack([number, equilibrium], axis=1)
     # All that follows would be compiled once more for another layout.
