@@ -106,7 +106,7 @@ class Verb:
         return {
             arg.arg: ast.unparse(arg.annotation).removesuffix(" | None")
             for arg, valued in zip(args.args[1:], has_value[1:], strict=True)
-            if arg.annotation and not valued
+            if arg.annotation and not valued and arg.arg != "folder"  # --out, as of any command
         }
 
     def options(self) -> Iterator[tuple[str, str, Any, str]]:
