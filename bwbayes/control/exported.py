@@ -37,6 +37,7 @@ from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.quantities import DEFAULT
 from bwbayes.report.outputs import refuse_existing, write_summary
 from bwbayes.report.report import Facts, Product, Report
 from bwbayes.shown import brief
@@ -220,9 +221,15 @@ class Exported(Product):
             inputs=[*map(self._stage_in_c, model.inputs[0])],
             outputs=[*map(self._stage_in_c, model.outputs[0])],
         )
-        # What is not code.
-        comments = re.compile(r"/\*.*?\*/", re.DOTALL)
-        return comments.sub(lambda comment: to_ascii(self.quantities.say(comment[0])), code)
+        if self.quantities == DEFAULT:
+            return code
+        # Comments speak of the quantities; in the code the names are those of any.
+        parts = re.split(r"(/\*.*?\*/)", code, flags=re.DOTALL)
+        parts[1::2] = [to_ascii(self.quantities.say(comment)) for comment in parts[1::2]]
+        names = re.compile(r"\b(voltage|displacement)\b")
+        roles = {"voltage": "input", "displacement": "output"}
+        parts[::2] = [names.sub(lambda name: roles[name[0]], plain) for plain in parts[::2]]
+        return "".join(parts)
 
     def _stage_in_c(self, sampled: SampledStage) -> dict[str, Any]:
         """Return what the template says of a stage before or behind the model's core."""
