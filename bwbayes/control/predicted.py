@@ -227,14 +227,19 @@ class Compensation(Product):
         """Return the columns of ``compensation.csv`` as a pandas.DataFrame."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        return pd.DataFrame(dict(self.columns()))
+        return pd.DataFrame({self.quantities.heading(n): v for n, v in self.columns()})
 
     def plot(self) -> Figure:
         """Draw reference, prediction and error along time."""
         from bwbayes.report.figures import control, draw_styled  # noqa: PLC0415  # slow to load
 
         return draw_styled(
-            control.draw_command, self.reference.name, self.asked, self._commands, self.limit
+            control.draw_command,
+            self.reference.name,
+            self.asked,
+            self._commands,
+            self.limit,
+            quantities=self.quantities,
         )
 
     def report(self) -> Report:

@@ -178,7 +178,7 @@ class Run(Shown, Stages):
                 **vars(bands),
                 scores=self.scores.get(bands.name),
                 validation=self.validation.get(bands.name),
-            )
+            ).said_in(self.quantities)
             for bands in self.predictions
         }
 

@@ -163,5 +163,5 @@ def write_prediction(
         write_bands(table, [prediction], part(watch, 0.0, 0.8), quantities)
         said = prediction.numbers() | {"run_validation": standing.numbers}
         write_summary(numbers, quantities.rendered(said))
-        picture.write_bytes(picture_of(prediction.plot, quantities))
+        picture.write_bytes(picture_of(prediction.said_in(quantities).plot))
         watch(1.0)

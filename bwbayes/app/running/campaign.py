@@ -265,7 +265,7 @@ class Campaign(Product):
         """
         if not self._units:
             raise InputError("campaign: no record has converged, so there is nothing to draw")
-        return draw_styled(self._draw)
+        return draw_styled(self._draw, quantities=self.quantities)
 
     def report(self) -> Report:
         """Return how the records of a campaign ended, and what they say together."""

@@ -106,13 +106,13 @@ class Prediction(Shown, Bands):
         """Return the bands as a pandas.DataFrame with the columns of ``bands.csv``."""
         import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
 
-        return pd.DataFrame(dict(self.columns()))
+        return pd.DataFrame({self.quantities.heading(n): v for n, v in self.columns()})
 
     def plot(self) -> Figure:
         """Draw the bands along time: voltage, displacement, and the residuals off the mean."""
         from bwbayes.report.figures.series import draw_bands  # noqa: PLC0415  # slow to load
 
-        return draw_styled(draw_bands, self)
+        return draw_styled(draw_bands, self, quantities=self.quantities)
 
     def numbers(self) -> dict[str, object]:
         """Return what ``bwbayes predict`` writes beside the bands: scores, verdict, remarks."""
