@@ -24,6 +24,7 @@ from bwbayes.calibration.replicates import RANKED, Entry
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import LEVELS
+from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.shown import brief
 
 # Probability of a false alarm from all tests of all statistics, half of it for either test.
@@ -80,6 +81,8 @@ class Calibration:
         Probability that the smooth test finds a posterior sd that is wrong by so much.
     name, parameters, facts, provenance
         The calibrated problem, facts about it, and seed, digest of the data and versions.
+    quantities
+        What its records are of, in whose words it is shown.
     """
 
     __repr__ = brief
@@ -96,6 +99,7 @@ class Calibration:
     parameters: Sequence[Parameter] = ()
     facts: Sequence[tuple[str, str]] = ()
     provenance: Mapping[str, object] = field(default_factory=dict)
+    quantities: Quantities = DEFAULT
 
     @property
     def failures(self) -> tuple[str, ...]:

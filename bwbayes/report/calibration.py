@@ -43,6 +43,7 @@ def calibration_report(calibration: Calibration) -> Report:
     columns = {"Parameter": "{name}", "Symbol": Markup("{symbol}"), "Prior": "{prior}"}
     columns["Unit"] = "{unit}"
     return Report(
+        quantities=calibration.quantities,
         title=f"{calibration.name}, simulation-based calibration",
         heading=f"Simulation-based calibration: {calibration.name}",
         banners=[

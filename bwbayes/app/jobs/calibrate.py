@@ -141,6 +141,7 @@ def resume(
                 evaluate_calibration(ordered, generator(seed, "ranks")),
                 name=problem.config.name or "calibration",
                 parameters=problem.parameters,
+                quantities=problem.quantities,
                 facts=[
                     *problem.facts.items(),
                     ("held out", ", ".join(problem.validations) or "nothing"),
