@@ -35,7 +35,9 @@ class Quantity:
             The text is not a name with a unit in brackets.
         """
         match = re.fullmatch(r"\s*([^\[\]()]+?)\s*[(\[]\s*([^\[\]()]+?)\s*[)\]]\s*", text)
-        if match is None or not match[1].isprintable() or "," in text:
+        # Nothing that would be code in a page, a config or the exported C.
+        is_plain = text.isprintable() and not re.search(r"[<>&\"`{}\\,]|\*/|/\*", text)
+        if match is None or not is_plain:
             raise InputError(f"{key}: {text!r} is no name with a unit; write it as 'H (A/m)'")
         return cls(match[1], match[2])
 

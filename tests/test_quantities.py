@@ -155,6 +155,8 @@ def test_columns_are_found_by_name_or_unit_and_converted(
     [
         (("H", "B (T)"), {}, ["input: 'H' is no name with a unit", "'H (A/m)'"]),
         (("B (T)", "b (mT)"), {}, ["output: 'b' is the input"]),
+        (("H <b> (A/m)", "B (T)"), {}, ["input: 'H <b> (A/m)' is no name with a unit"]),
+        (("H */ (A/m)", "B (T)"), {}, ["input: 'H */ (A/m)' is no name with a unit"]),
         (("H (A/m)", "B (T)"), {"units": {"H": "kg"}}, ["units: H in 'kg' is unknown", "A/m"]),
         (("M (J)", "F (N)"), {}, ["which column is the M, which the F", "'input': "]),
         (("H (A)", "B (T)"), {}, ["'H (A/m)'", "cannot be converted to 'A'"]),
@@ -172,12 +174,20 @@ def test_what_is_no_quantity_or_unit_is_refused_in_the_own_words(
     assert not re.search(r"\b(voltage|displacement|um)\b", str(error.value))
 
 
+def test_a_files_note_that_would_be_code_is_none(tmp_path: Path) -> None:
+    """A stranger's file puts no tag into a page."""
+    rows = "".join(f"{i / 10},{i % 7},{i % 5}\n" for i in range(40))
+    head = "# input_is: <script> (V)\n# output_is: x (um)\ntime_s,voltage_V,displacement_um\n"
+    (tmp_path / "loop.csv").write_text(head + rows, encoding="utf-8")
+    assert read_record(tmp_path / "loop.csv").quantities == DEFAULT
+
+
 def test_no_default_prior_knows_an_absolute_voltage_or_displacement() -> None:
     """In other units of input and output every default prior is the same one."""
     warm = {"temperature_degC": (20.0, 30.0)}
-    ranges = Ranges(40.0, 30.0, 4.0, 0.5, 10.0, 0.001, 16.0, 0.01, warm)
+    ranges = Ranges(40.0, 30.0, 4.0, 0.5, 10.0, 0.001, 16.0, 0.01, 0.005, warm)
     per_input, per_output = 1e-3, 1e6
-    scaled = Ranges(4e-2, 3e7, 4e6, 0.5, 1e-2, 0.001, 16.0, 1e4, warm)
+    scaled = Ranges(4e-2, 3e7, 4e6, 0.5, 1e-2, 0.001, 16.0, 1e4, 5e3, warm)
     compared = 0
     for declared in every_declaration():
         stated: dict[str, float | Distribution] = {"exponent": 1.0, "stiffness": 1.0}

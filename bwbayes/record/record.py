@@ -163,17 +163,20 @@ class Record(Inputs):
             raise InputError(f"{origin}: units: interval is in s; leave out that of the time")
         if interval is not None and not 0 < interval < np.inf:
             raise InputError(f"{origin}: interval: {interval} s is not a positive time")
-        arrays = {"time": time, "voltage": voltage, "displacement": displacement}
-        source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
         named: dict[str, Any] = {"units": units, "input": input, "output": output}
         own = Naming.stated(**named, covariates=tuple(covariates or ()))
+        names = own.quantities.input.name, own.quantities.output.name
+        arrays = {"time": time, names[0]: voltage, names[1]: displacement}
+        source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
         common = {"time": "s", "voltage": "V", "displacement": "um"}
         if own.quantities.input != VOLTAGE:
             del common["voltage"]
         if own.quantities.output != DISPLACEMENT:
             del common["displacement"]
-        columns = {q: q for q in ("voltage", "displacement") if arrays[q] is not None}
-        columns = {} if own.quantities.are_default else columns
+        columns: dict[str, str | int] = {}
+        if not own.quantities.are_default:
+            columns = {"voltage": names[0]}
+            columns |= {} if displacement is None else {"displacement": names[1]}
         naming = replace(own, units=common | dict(own.units), columns=columns)
         return cls._of(source, naming, voltage_is, displacement is not None)
 
