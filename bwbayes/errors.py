@@ -16,12 +16,12 @@ from pathlib import PurePath
 from shlex import quote
 from typing import Any, NoReturn
 
-# Of a longer text, as a stranger's file may cause, the beginning and the end are shown.
+# A longer text, as a stranger's file may cause, shows its beginning and its end.
 LONGEST = 600
 
 
 class ExitStatus(IntEnum):
-    """What a command ends with; those that build on a run end with that run's."""
+    """The exit status of a command; commands that build on a run end with that run's."""
 
     SUCCESS = 0
     INVALID_INPUT = 2

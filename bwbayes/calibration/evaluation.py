@@ -7,8 +7,8 @@ these shapes and is by far the more powerful; that of Kolmogorov and Smirnov see
 together raise a false alarm in one sound calibration of a hundred. Bands on held-out samples must
 cover what they promise within three standard errors. Single coverages are far from normal, so this
 is asked of 500 replicates or more, of which one sound calibration in forty fails it by chance (one
-in 17 with 100). These rates are those of one look. What did not converge is counted, and ranked
-with the rest if it has draws at all.
+in 17 with 100). These rates are those of one look. Replicates that did not converge are counted,
+and ranked with the rest if they have draws at all.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What many replicates say.
+    """The results of many replicates.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class Calibration:
 
     @property
     def predicted(self) -> tuple[str, ...]:
-        """What the bands are of: "" for the held-out windows together, and other records' names."""
+        """Records of the bands: "" for the held-out windows together, other records' names."""
         return tuple(dict.fromkeys(" ".join(name.split(" ")[:-2]) for name in self.bands))
 
     @property

@@ -57,7 +57,7 @@ class Entry(TypedDict):
 
 @dataclass(frozen=True)
 class CalibrationSetup:
-    """What all replicates have in common.
+    """The setup that all replicates share.
 
     Parameters
     ----------

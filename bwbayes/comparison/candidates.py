@@ -91,7 +91,7 @@ class Candidate:
 
     @property
     def mean(self) -> dict[str, float] | None:
-        """What all held-out readings say together, each counting the same; None without any.
+        """Means over all held-out readings, each counting the same; None without any.
 
         ``log_score`` in nats per reading, ``crps_um`` and ``width_um`` of the 95% sensor band in
         um, ``nrmse`` over the range of the readings; ``coverage`` of the 95% sensor band with its

@@ -1,6 +1,6 @@
 """Models compared: their numbers, what is recommended, and how they are shown.
 
-What :func:`~bwbayes.comparison.recommendation.recommend` returns.
+:func:`~bwbayes.comparison.recommendation.recommend` returns a :class:`Comparison`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import mark, with_error
 
-# The columns of the models' table. What decides stands in that of the differences.
+# The columns of the models' table. The deciding numbers stand in the table of differences.
 COLUMNS = (
     TableColumn("Model", text="{name}"),
     TableColumn("Validation", text=Markup("{status}")),
@@ -103,7 +103,7 @@ class Comparison(Product):
 
     @property
     def measure(self) -> str:
-        """What decides first, in words."""
+        """The number that decides first, in words."""
         return "log score" if self.voting else "log evidence"
 
     @property
@@ -121,7 +121,7 @@ class Comparison(Product):
 
     @property
     def exit_status(self) -> ExitStatus:
-        """Not a success if no model has converged."""
+        """The status is no success if no model has converged."""
         return ExitStatus.NOT_CONVERGED if self.shortfall else ExitStatus.SUCCESS
 
     def __getitem__(self, name: str) -> Candidate:
@@ -154,7 +154,7 @@ class Comparison(Product):
         for row in rows:
             del row["windows"]
         frame = pd.json_normalize(rows, sep="_").set_index("name")
-        # What is nested has columns of its own, but where it is missing.
+        # Nested values have columns of their own, except where they are missing.
         return frame.drop(columns=["held_out", "difference"], errors="ignore")
 
     def report(self) -> Report:

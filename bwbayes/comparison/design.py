@@ -2,14 +2,13 @@
 
 Each candidate is a voltage that the amplifier can make. At some posterior draws the model is made
 linear in its parameters: the Fisher information of the readings that the candidate would bring,
-with the noise of that draw, adds to what is known already. What a fit of the new record would not
-know of its start and its offset is not known here either. What would be left of a standard
-deviation, averaged over the draws, is the promise; how far the draws scatter is its Monte Carlo
-error.
+with the noise of that draw, adds to what is known already. As in a fit of the new record, its
+initial state and its offset are unknown. The score is the expected remaining share of a standard
+deviation, averaged over the draws; their scatter gives its Monte Carlo error.
 
-Every reading counts as often as a fit counts it, which trusts the noise model: what the model is
-wrong about returns with every period of a steady drive, and is not taken for new each time only as
-far as the discrepancy's correlation time says so.
+Every reading counts as often as a fit counts it, which trusts the noise model. The model's error
+returns with every period of a steady drive; only the discrepancy's correlation time keeps it from
+counting as new each time.
 
 :func:`rank_by_rivals` ranks by what would tell a model from its rivals, other models that fit the
 same record (:mod:`bwbayes.diagnosis.rivals`): by how much they differ along a candidate, and what

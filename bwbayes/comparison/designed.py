@@ -79,7 +79,7 @@ class RivalScore(DesignScore):
 
 @dataclass(frozen=True)
 class Design(Product, Sequence[DesignScore]):
-    """What to measure next, from a run: a sequence of its promises.
+    """Candidates for the next measurement, from a run: a sequence of their scores.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Design(Product, Sequence[DesignScore]):
 
     @property
     def quantity(self) -> str:
-        """What the promises are parts of, in words."""
+        """The quantity whose remaining SD the scores are, in words."""
         if self.parameter is not None:
             return f"sd left of {self.parameter}"
         return f"width left of the band along {self.drive}"

@@ -1,11 +1,11 @@
 """Leave-future-out scores: how probable a model held later readings, given the earlier ones.
 
-Readings that follow one another are no independent votes. What a model is worth on a part of a
-record is the joint density of the part's readings, given all readings before: the noise model
-knows how each reading follows from the last, so that correlation is counted once. That density is
-a ratio of evidences, log p(later | earlier) = log Z(all) − log Z(earlier), and posteriors that
-differ by some readings share enough of their draws for all the ratios on the way from one to the
-other: block by block, which tells how sure the difference of two models is.
+Readings that follow one another are no independent votes. A model's score on a part of a record is
+the joint density of the part's readings, given all readings before. The noise model knows how each
+reading follows from the last, so that correlation is counted once. That density is a ratio of
+evidences, log p(later | earlier) = log Z(all) − log Z(earlier), and posteriors that differ by some
+readings share enough of their draws for all the ratios on the way from one to the other: block by
+block, which tells how sure the difference of two models is.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.watching import Watch, WatchSteps, part, unwatched, watched
 
-# What the later half of the training readings is called.
+# The name of the later half of the training readings.
 FUTURE = "later training"
 
 # Blocks of a part.
@@ -119,7 +119,7 @@ def leave_future_out(
             path = _path(posterior, training, {record: windows}, later)
             training = {dataset.name: dataset.training for dataset in path[-1].datasets}
             score = _scored(path, {0: flat}, later, rng, partial(watch, name))
-            # What is left of the draws at the far end is worth too few: that end is sampled too.
+            # Too few draws are effective at the far end: that end is sampled too.
             if score.effective < 100:
                 again = partial(watch, f"training and {name}")
                 longer = _fitted(path[-1], plan, flat, rng, executor, part(again, 0.0, 0.8))
@@ -156,9 +156,8 @@ def _path(
 def bands_part(bands: Bands) -> Part | None:
     """Return the part that another record is, from its bands; None without a reading to judge.
 
-    What its start leaves open, each draw has an answer to of its own, so that its readings' joint
-    density would be that of the luckiest draw: their own densities stand, and count as independent
-    ones do.
+    Each draw has its own initial state, so the joint density of all readings would be that of the
+    luckiest draw. The readings' own densities are taken instead, as if they were independent.
     """
     rows = bands.scored(bands.log_score)
     if bands.measured is None or bands.log_score is None or not rows.any():

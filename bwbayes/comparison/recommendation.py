@@ -1,13 +1,13 @@
-"""Which model: differences to the best, a recommendation, and what speaks against it.
+"""Which model: differences to the best, a recommendation, and its caveats.
 
-One rule. What a model is worth is the joint log density of the later readings, given the earlier
+There is one rule. A model's score is the joint log density of the later readings, given the earlier
 ones (:mod:`~bwbayes.comparison.leave_future_out`), summed over the later half of the training
 readings and all that was held out. A part worth fewer than five independent readings has no vote.
 Models tie if their sums differ by less than four nats, or than the 95% limit of blocks longer than
-the correlation time. Of those that tie, the one of most log evidence is recommended, which weighs
-what a model says against how much it leaves open; others stay tied unless they are less probable by
-odds of twenty to one, and the tie is said. Where no part has a vote, the log evidence decides
-alone, and where its Monte Carlo error leaves it open, the plainest is recommended.
+the correlation time. The tied model with the largest log evidence is recommended; evidence weighs a
+model's fit against its freedom. The others stay tied unless they are less probable by odds of
+twenty to one, and the tie is said. Where no part has a vote, the log evidence decides alone, and
+where its Monte Carlo error leaves it open, the plainest is recommended.
 """
 
 from __future__ import annotations

@@ -247,7 +247,7 @@ class _Printer(ast.NodeTransformer):
         arguments = ", ".join([*texts, *pointers])
         match node.func:
             case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
-                # What math.h calls otherwise.
+                # Functions with another name in math.h.
                 others = {
                     "abs": "fabs",
                     "minimum": "fmin",

@@ -1,10 +1,10 @@
-"""Compensation: the voltage for a displacement that is asked for, and how well it will do.
+"""Compensation: the voltage for a reference displacement, and its predicted error.
 
 The voltage is the inverse of the posterior's mean model, or the one whose squared error, expected
-over the posterior, is least. What it does is then predicted with every draw, as any planned voltage
-is: bands of the displacement, and so of the tracking error, its rms with an interval, and the
-probability that it stays below a limit. Beside it stands what a linear command would do, by the
-slope of a line through the record that was fitted.
+over the posterior, is least. Every draw then predicts its displacement, as that of any planned
+voltage. So there are bands of the displacement and of the tracking error, its rms with an interval,
+and the probability that it stays below a limit. A linear command stands beside it, by the slope of
+a line through the training record.
 
 A command is played by a DAC, which holds each voltage until the next sample. So it has a hold of
 its own, whatever the voltage did in the record that was fitted: a command for straight lines that a
@@ -48,7 +48,7 @@ from bwbayes.watching import Watch, part, unwatched
 
 @dataclass(frozen=True)
 class _Plan:
-    """What all commands share: the draws of one record, the reference, and the start."""
+    """The parts that all commands share: the draws of one record, the reference, and the start."""
 
     posterior: Posterior
     draws: FloatArray

@@ -189,7 +189,7 @@ class Exported(Product):
             keep_trailing_newline=True,
             finalize=lambda value: to_c_number(value) if isinstance(value, float) else value,
         )
-        # What ends no comment of C.
+        # Characters that end no comment in C.
         environment.filters["plain"] = partial(re.sub, r"[^\w .,:;=+()%-]", "_", flags=re.ASCII)
         model, actuator, step = self.model, self.model.actuator, self.model.step
         remembered = step.demagnetized()[0].tolist()
@@ -252,7 +252,7 @@ class Exported(Product):
 
     @property
     def _called(self) -> str:
-        """What a config calls the hysteresis."""
+        """The operator's name in a config."""
         kind = type(self.model.actuator.hysteresis)
         path = f"{kind.__module__}:{kind.__qualname__}"
         return next((name for name, operator in HYSTERESIS.items() if operator is kind), path)

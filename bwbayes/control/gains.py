@@ -33,7 +33,7 @@ ANGLES: FloatArray = np.geomspace(1e-5, np.pi, 1500)
 
 @dataclass(frozen=True)
 class Robustness:
-    """What every draw must keep: a gain margin, and a phase margin in degrees.
+    """Margins that every draw must keep: a gain margin, and a phase margin in degrees.
 
     Raises
     ------

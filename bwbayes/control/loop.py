@@ -34,7 +34,7 @@ CONTROLLERS = {
 
 @dataclass(frozen=True)
 class Stand:
-    """What is between a controller and its actuator.
+    """The hardware between a controller and its actuator.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Stand:
 
 
 class LoopNoise(NamedTuple):
-    """What each draw has beside its actuator: a noise model, and its parameters (draws, any)."""
+    """The noise of each draw: a noise model, and its parameters (draws, any)."""
 
     model: Noise
     parameters: FloatArray
@@ -78,7 +78,7 @@ class LoopNoise(NamedTuple):
 
 
 class LoopPlan(NamedTuple):
-    """What controllers do on some signals.
+    """The controllers' gains, feedforward and targets for some signals.
 
     ``ahead`` (controllers, signals, samples), V, is fed forward; ``targets`` (controllers, signals,
     samples), um, is what the readings are compared with, and ``looks`` (controllers,) whether they

@@ -1,7 +1,7 @@
 """A command that compensates: its voltage, the displacement that it gives, its errors, its report.
 
-What :func:`~bwbayes.control.compensation.compensate` returns. Errors are those at the samples, to
-the reference as requested and as it was smoothed.
+:func:`~bwbayes.control.compensation.compensate` returns a :class:`Compensation`. Errors are those
+at the samples, to the reference as requested and as it was smoothed.
 """
 
 from __future__ import annotations
@@ -150,12 +150,12 @@ class Compensation(Product):
 
     @property
     def exit_status(self) -> ExitStatus:
-        """Not a success unless the limit is kept."""
+        """The status is a success only if the limit is kept."""
         return ENDINGS[self.limit_kept]
 
     @property
     def shortfall(self) -> str:
-        """What to say of a limit that is not kept: how probably, where, and what to do."""
+        """The message on a limit that is not kept: how probably, where, and the fix."""
         if self.limit_kept:
             return ""
         after = self.compensated.numbers(self.limit)
@@ -181,7 +181,7 @@ class Compensation(Product):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What is promised, in numbers."""
+        """The predicted errors as numbers."""
         target = self.asked
         return {
             "validation": self.standing.numbers,

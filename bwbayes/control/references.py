@@ -51,7 +51,7 @@ TRACKED: Mapping[str, bool] = {
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What a displacement is to be, (samples,), um, at a sampling interval, s.
+    """The displacement that is asked for, (samples,), um, at a sampling interval, s.
 
     0 um is where the actuator stands at zero volts as the command begins. The smoothing keeps the
     first value and the last.

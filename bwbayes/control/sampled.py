@@ -2,8 +2,8 @@
 
 :class:`SampledModel` is what ``bwbayes track`` closes the loop around, and what ``bwbayes export``
 writes as C: :func:`settle`, :func:`advance` and :func:`search` are the actuator's own recursion,
-with a voltage for each model, and are printed as they are. What follows the hysteresis is linear,
-and is given as a system of ``scipy.signal`` too.
+with a voltage for each model, and are printed as they are. The linear part behind the hysteresis is
+given as a system of ``scipy.signal`` too.
 
 These functions take the model in arrays: ``move`` and ``parameters`` of the hysteresis' step;
 ``curve``, the coefficients of 1, u, u² and u³ that the nonlinearity adds, and κ/U, by which the
@@ -244,7 +244,7 @@ class SampledModel:
 
     @property
     def hysteresis(self) -> tuple[Any, FloatArray, FloatArray]:
-        """What all functions of a sample begin with: ``move``, ``parameters`` and ``curve``."""
+        """First arguments of a sample's functions: ``move``, ``parameters`` and ``curve``."""
         return type(self.step).move, self.step.parameters.T, self.curve
 
     @cached_property
@@ -317,9 +317,9 @@ class SampledModel:
     ) -> tuple[FloatArray, SteppedState]:
         """Return the voltage (models,), V, that gives a displacement (models,), um, and the state.
 
-        If the voltage is held, it is the displacement of the next sample. What would need a voltage
-        outside of the limits gets the limit. The search starts at a ``guess``, by default the last
-        voltage, and ends at a ``tolerance``, V, by default the last bits.
+        If the voltage is held, it is the displacement of the next sample. A displacement that needs
+        a voltage outside of the limits gets the limit. The search starts at a ``guess``, by default
+        the last voltage, and ends at a ``tolerance``, V, by default the last bits.
         """
         memory, last, initial, filters, *_ = state
         begin = last if guess is None else guess
@@ -372,7 +372,7 @@ class SampledModel:
 
     @property
     def linear(self) -> Any:
-        """What follows the hysteresis of the first model, a discrete ``scipy.signal.StateSpace``.
+        """The linear part of the first model, a discrete ``scipy.signal.StateSpace``.
 
         With the drive w in um, from hysteresis and nonlinearity, and x the displacement in um, both
         as differences from rest,

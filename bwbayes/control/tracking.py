@@ -39,7 +39,7 @@ from bwbayes.report.report import (
 from bwbayes.shown import brief
 from bwbayes.watching import WatchSteps, part, unwatched
 
-# What dynamics that matter leave of a sine: half of its power.
+# The amplitude of a sine behind dynamics that matter: half of its power.
 LEFT = math.sqrt(0.5)
 
 
@@ -332,7 +332,7 @@ def track(
     signals = tuple(TRACKED)
     models = SampledModel.of(actuator, np.tile(mean_theta, (len(frequencies) * len(signals), 1)))
     rows = SampledModel.of(actuator, np.tile(theta, (len(CONTROLLERS) * len(signals), 1)))
-    # What is still to be followed is known by the samples.
+    # The number of samples tells how much is still to be followed.
     shares = np.cumsum([0, *(desired.shape[1] for desired, _ in references)])
     shares = shares / shares[-1]
     plans = plan_loops(models, references, ends, stand, partial(watch, "feed-forward"))

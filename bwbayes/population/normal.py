@@ -35,7 +35,7 @@ def population_density(z: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Hyperprior:
-    """What is known of a population beforehand: μ ~ N(mean, sd²), τ ~ half-normal(scale)."""
+    """The prior of a population: μ ~ N(mean, sd²), τ ~ half-normal(scale)."""
 
     mean: float
     sd: float
@@ -179,7 +179,7 @@ def left_out(
 ) -> FloatArray:
     """Two-sided p (specimens,) of each record, given the population that the others show.
 
-    Of these, only those ``inside`` (specimens,), by default all. Under the model each is uniform
+    Only specimens ``inside`` (specimens,) count, by default all. Under the model each is uniform
     from 0 to 1, whatever the population. One for a record that tells nothing.
     """
     count = likelihoods.mean.size

@@ -131,7 +131,7 @@ class PopulationParameter:
 
 @dataclass(frozen=True)
 class Population:
-    """What specimens say together: a :class:`PopulationParameter` for each, by its name."""
+    """The population of specimens: a :class:`PopulationParameter` for each, by its name."""
 
     __repr__ = brief
 

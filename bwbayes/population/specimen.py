@@ -27,7 +27,7 @@ DRAWS = 1000
 
 @dataclass(frozen=True)
 class Specimen:
-    """What is kept of one specimen's posterior.
+    """The stored part of one specimen's posterior.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def specimen_of(
 ) -> Specimen:
     """Keep of a specimen's posterior what a population needs.
 
-    Of the draws (draws, free), in their own units, the generator chooses ``DRAWS``.
+    The generator chooses ``DRAWS`` of the draws (draws, free), which have their own units.
     """
     prior = posterior.prior
     table = posterior.table

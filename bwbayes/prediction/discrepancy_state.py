@@ -25,7 +25,7 @@ from bwbayes.watching import Watch, unwatched, watched
 
 @dataclass(frozen=True)
 class DiscrepancyState:
-    """What readings leave of the discrepancy, for each draw.
+    """The discrepancy's state after the last reading, for each draw.
 
     ``last`` is the sample of the last reading; ``mean`` (draws, states) that of the states there,
     and ``gained`` (draws, states, states) by how much their covariance is less than the stationary

@@ -1,10 +1,10 @@
 """Histories: which drive before a record left the state that it starts from.
 
 Most operators' states are one number, ``initial``. Those that remember extrema have more: how far
-earlier drives went leaves states of its own, and each such range is a history. What a lead-in
-says of a history, and of the states in it, is computed on a grid that closes in on where it
-allows them. There may be dozens of histories, and draws think much alike of them: then a few draws
-are asked on grids, and the others choose among what these have drawn, by importance.
+earlier drives went leaves states of its own, and each such range is a history. The lead-in's
+likelihood of a history, and of the states in it, is computed on a grid that closes in on the states
+that it allows. There may be dozens of histories, which most draws rate alike: then a few draws have
+grids, and the others choose among their states, by importance.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class States:
     """Hysteretic states at a record's first sample, and how probable they are beforehand.
 
     ``ordered`` (nodes, draws) are states at ``quantiles`` (nodes,) of that distribution, which is
-    even on straight lines between them. Of one of many histories they lie between the lowest and
+    even on straight lines between them. In one of many histories they lie between the lowest and
     the highest state that drives of its range leave. The last sweep of an earlier drive ends, as
     often as not, at the record's first voltage: a quarter of the states are the lowest, a quarter
     the highest. Where one number holds all states, and a history is ``single``, they are what
@@ -222,7 +222,8 @@ def _by_importance(
     index = np.sum(total < uniform(generator, draws) * total[-1], axis=0)
     pick = proposed[index, np.arange(draws)]
     which, quantile = pool_which[pick], pool_quantile[pick]
-    # Of effectively fewer than four proposals one in ten is beyond what a draw allows.
+    # With effectively fewer than four proposals, one in ten is beyond the states that a draw
+    # allows.
     uncovered = np.flatnonzero(~(total[-1] ** 2 > 4 * np.sum(weight**2, axis=0)))
     if uncovered.size:
         which[uncovered], quantile[uncovered], evidence[uncovered] = _by_grids(

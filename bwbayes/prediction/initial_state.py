@@ -1,4 +1,4 @@
-"""The start of another record: what is unknown of it, and what its first readings tell.
+"""The initial state of another record: its unknowns, and their estimate from the first readings.
 
 A record that was not fitted brings unknowns of its own: the hysteretic state it starts from, how
 the dynamics are moving then, and its sensor's offset. Each posterior draw gets its own values. The
@@ -37,7 +37,7 @@ SWEEPS = 4
 
 @dataclass(frozen=True)
 class InitialConditions:
-    """What is known of the start of another record.
+    """Initial conditions of another record.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ class InitialConditions:
         Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
         the discrepancy at most: after these the offset hardly widens the bands.
     lead_in_start
-        Time at which it begins, s; by default that of the record's first sample. What comes before
-        is simulated.
+        Time at which it begins, s; by default that of the record's first sample. Samples before it
+        are simulated.
     hold
-        What the voltage does between samples; by default what the record says of its voltage.
+        How the voltage goes between samples; by default as the record says.
     after
-        What comes after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
+        Everything after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
         readings leave it.
     settled
         Without a lead-in: the actuator has waited at the first voltage until it stood still, with
@@ -115,7 +115,7 @@ class InitialConditions:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """What every draw takes for a record's start.
+    """Each draw's initial state of a record.
 
     ``histories`` with the record's interval and hold, and which of them each draw has; ``model``
     (draws, parameters of the actuator) with initial state and offset; ``initial_transient`` (draws,
@@ -215,7 +215,7 @@ def estimate_initial_states(
     histories, start_theta, evidence = choose_histories(
         likelihoods, theta, generator, part(watch, 0.0, 0.5)
     )
-    # What stages do not know and what the hysteresis has been through is chosen in turns.
+    # The stages' unknown parameters and the histories are chosen in turns.
     for _ in range(SWEEPS if redrawn else 0):
         theta = _choose_by_lead_in(posterior, histories, start_theta, redrawn, generator)
         histories, start_theta, evidence = choose_histories(likelihoods, theta, generator)
@@ -237,7 +237,8 @@ def _of_new_record(
 ) -> tuple[FloatArray, list[str]]:
     """Give draws θ what stages do not know of a record that was not fitted, from its prior.
 
-    What happened once does not happen again. Beside θ come the names of what was drawn.
+    An event of the training record does not happen again. Beside θ come the names of the parameters
+    that were drawn.
     """
     table, redrawn = posterior.single_record.table, list[str]()
     for parameter in posterior.prior.parameters:
@@ -284,8 +285,9 @@ def _choose_by_lead_in(
 def _between(likelihoods: tuple[Likelihood, ...], model: FloatArray) -> float:
     """Return how far, um, a state may lie between those of two histories that come next.
 
-    What a drive does not reach stays as it was left, and is a part of the offset: half of what one
-    history leaves there more than the one before, root-mean-square, of a ``model`` (1, parameters).
+    States that a drive does not reach stay as they were left, as a part of the offset. It is half
+    of the root-mean-square difference between histories that come next, of a ``model`` (1,
+    parameters).
     """
     first = likelihoods[0]
     paths = [
@@ -304,7 +306,7 @@ def continue_discrepancy(
 ) -> InitialStates:
     """Let the discrepancy go on from where the readings of a likelihood leave it.
 
-    What is unsure of the offset still is drawn, for the discrepancy that is left depends on it.
+    The offset is drawn from what the readings leave open, because the discrepancy depends on it.
     ``watch`` is called with the share that is done.
     """
     column = likelihood.actuator.parameters.index("offset")

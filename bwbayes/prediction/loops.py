@@ -24,7 +24,7 @@ from bwbayes.watching import Watch, part, unwatched, watched
 # Voltages along a branch: an odd number, so that a symmetric drive passes zero at one of them.
 POINTS = 201
 
-# What is measured of a loop: its name in a summary, title and unit for people.
+# Measures of a loop: their names in a summary, titles and units for people.
 MEASURES: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range", "um"),
     "opening_um": ("Opening at zero voltage", "um"),
@@ -186,9 +186,9 @@ def steady_loop(
 ) -> TracedLoop:
     """Drive models from the demagnetized state up and down until the loop closes.
 
-    Of the ``actuator`` all counts that has no pace, but no offset; ``column`` has columns (models,)
-    of its parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points`` is the odd
-    number of voltages along a branch.
+    All rate-independent parts of the ``actuator`` count, but no offset; ``column`` has columns
+    (models,) of its parameters, by name. The voltage turns at ``low`` and ``high``, V; ``points``
+    is the odd number of voltages along a branch.
 
     Raises
     ------

@@ -39,8 +39,8 @@ from bwbayes.watching import Watch, counted, part, unwatched
 # Posterior draws in the mixture.
 DRAWS = 1000
 
-# Samples that are simulated and summarized at once: few enough for a core's own cache. Not a power
-# of two: rows of draws that far apart would take each other's place in it.
+# Samples that are simulated and summarized at once: few enough for a core's own cache. The number
+# is no power of two: rows of draws that far apart would take each other's place in it.
 PIECE = 400
 
 # Share of a prediction's time that goes into the states that it starts from, about.
@@ -155,7 +155,7 @@ def forecast(
 def continued(record: Record, voltage: FloatArray) -> Record:
     """Return a record as it goes on into a planned voltage (samples,), V, without readings.
 
-    What was recorded beside its voltage is not known of what follows.
+    Its covariates are unknown from there on.
     """
     whole = np.concatenate([record.path.voltage, voltage])
     return replace(record, voltage=whole, covariates={}, displacement=None, truth=None)

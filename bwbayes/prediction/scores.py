@@ -63,7 +63,7 @@ class Scores:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``validation.NAME`` in summary.json has of them; null for what is no number."""
+        """The numbers of ``validation.NAME`` in summary.json; null where there is none."""
 
         def by_level(values: dict[int, float] | None) -> dict[str, float] | None:
             return None if values is None else {str(level): x for level, x in values.items()}

@@ -24,7 +24,7 @@ from bwbayes.shown import brief
 # Time after a step from which creep is counted, s, as data sheets do.
 CREEP_FROM = 0.1
 
-# What is measured of a step response: its name in a summary, title and unit for people.
+# Measures of a step response: their names in a summary, titles and units for people.
 STEP_MEASURES: Mapping[str, tuple[str, str]] = {
     "level_um": ("Displacement, without creep", "um"),
     "rise_s": ("Rise time, 10 to 90%", "s"),
@@ -45,7 +45,7 @@ class Step:
 
 @dataclass(frozen=True)
 class StepResponse:
-    """What a posterior says of a step.
+    """The posterior of a step response.
 
     ``time`` (times,), s since the step; ``response`` the displacement since then, um; ``crept`` its
     growth from 0.1 s on, um, nan before, and None without creep. The names in ``estimates`` are
@@ -62,7 +62,7 @@ class StepResponse:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it."""
+        """Its numbers in ``summary.json``."""
         levels: dict[str, object] = {"height_V": self.step.height, "held_s": self.step.held}
         return levels | {n: None if e is None else e.numbers for n, e in self.estimates.items()}
 
@@ -156,7 +156,7 @@ def _responses(
     for i, t in enumerate(time.tolist()):
         sections = replace(actuator, interval=t).sections(column)
         taps = [(r.numerator, r.denominator[:, 1]) for r in sections.recursions]
-        # What a recursion makes of a unit that has been held for one sample.
+        # A recursion's output for a unit that has been held for one sample.
         units = [top[:, 1] + (1 - back) * top[:, 0] for top, back in taps]
         moved = [gain * u * by for gain, u, by in zip(sections.gains, units, steps, strict=True)]
         parts[:, :, i] = moved[0], sum(moved[1:], start=np.zeros_like(settled))

@@ -13,7 +13,7 @@ from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
 from bwbayes.report.words import circumstances, symbol, unit_text
 
-# What is ranked besides parameters: its name, and its unit.
+# Ranked quantities besides parameters: their names and units.
 EXTRA_WORDS = {
     "log_likelihood": ("log likelihood", "-"),
     "loop_area": ("loop area", "um V"),

@@ -35,9 +35,9 @@ def posterior_tree(
 
     Groups: posterior, sample_stats, log_likelihood (of all readings together, (steps, ensembles,
     walkers), nats), observed_data and constant_data. A chain is a walker; the coordinates
-    ``ensemble`` and ``walker`` along it say which. Of several training records variables and times
-    have their record's name behind their own: ``displacement_loops``. The attribute ``converged``
-    is 1 or 0: without convergence the draws are none of the posterior.
+    ``ensemble`` and ``walker`` along it say which. With several training records, variables and
+    times have their record's name behind their own: ``displacement_loops``. The attribute
+    ``converged`` is 1 or 0: without convergence the draws are none of the posterior.
     """
     import xarray as xr  # noqa: PLC0415  # slow to load
 

@@ -56,7 +56,7 @@ def fragment(report: Report) -> str:
 
 def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment:
     """Return the room of the templates, which know pictures and plots by name."""
-    # What a cell with a number begins with, or what stands for a number that is not known.
+    # The beginning of a cell with a number, or the sign for an unknown number.
     number = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
     environment = Environment(
         loader=PackageLoader("bwbayes.report"),
@@ -68,7 +68,7 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
     environment.globals |= {"pictures": pictures, "plots": plots.drawn}
     filters: dict[str, Callable[..., Any]] = {
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
-        # What a Content-Security-Policy calls a script that it allows.
+        # The digest by which a Content-Security-Policy allows a script.
         "digest": lambda script: "sha256-" + b64encode(sha256(script.encode()).digest()).decode(),
         # A picture's width and height, if it is a whole one.
         "pixels": lambda png: struct.unpack(">2I", png[16:24]) if len(png) > 24 else None,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # A figure of matplotlib, which is loaded when something is drawn.
 type Figure = "figure.Figure"  # quoted, for those who evaluate it
 
-# What stands for a number that is not known.
+# The sign for an unknown number.
 UNKNOWN = "–"
 
 Target = Literal["both", "page", "screen", "nowhere"]
@@ -363,13 +363,13 @@ def _plain(text: str) -> str:
 
 
 class Shown:
-    """What shows itself by its report: its head as a repr, all of it in print and a notebook."""
+    """An object shown by its report: its head as a repr, all of it in print and a notebook."""
 
     quantities: Quantities = DEFAULT  # those of the run that it is of
 
     @property
     def heading(self) -> str:
-        """What is said above the report, if anything."""
+        """The heading above the report, if any."""
         return ""
 
     def report(self) -> Report:
@@ -411,7 +411,7 @@ class Product(Shown):
 
     @property
     def exit_status(self) -> ExitStatus:
-        """What a command ends with for it, unless the run's validation is worse."""
+        """The exit status of its command, unless the run's validation is worse."""
         return ExitStatus.SUCCESS
 
     def records(self) -> dict[str, Record]:

@@ -37,8 +37,8 @@ from bwbayes.report.words import circumstances, coverage_text, error_text, lengt
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     """Return what a run says.
 
-    Of its ``numbers`` the ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` are shown if they
-    are there, and without convergence ``go_on``, the command that goes on.
+    The report shows ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` of its ``numbers`` if
+    they are there, and without convergence ``go_on``, the command that goes on.
     """
     if result.validation and all(verdict.training for verdict in result.validation.values()):
         nothing = (
@@ -182,7 +182,7 @@ def _results(result: Result) -> list[Text]:
 def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     ordered = sorted(result.predictions, key=lambda bands: bands.training)  # held out first
     shown = [pictures[f"bands_{bands.name}"] for bands in ordered]
-    # Of several records "innovations_NAME" is one of the innovations.
+    # "innovations_NAME" is the figure of one of several records.
     for kind in ("agreement", "coverage", "innovations", "spectrum"):
         shown += [p for name, p in pictures.items() if name.partition("_")[0] == kind]
     validation: list[Block] = []

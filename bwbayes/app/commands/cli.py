@@ -128,7 +128,7 @@ def _ask_again() -> None:
 
 def main() -> None:
     """Run the command line; every error that a user can fix becomes one line and exit status 2."""
-    # To load libraries and to compile makes hundreds of thousands of objects that stay: to look for
+    # Loading libraries and compiling make hundreds of thousands of objects that stay. Looking for
     # garbage among them again and again would take a twentieth of a run.
     gc.set_threshold(50_000, 1_000)
     # A code page may lack a character of a text, and no text is worth a traceback.

@@ -130,7 +130,7 @@ def run(
             with working():
                 remarks = problem.remarks
             if not quiet:
-                # Of a record alone the remarks are shown already.
+                # A proposed config has shown its remarks already.
                 banners = [] if is_proposal else remarks_banner(remarks)
                 said: Any = {"banners": banners, "quantities": problem.quantities}
                 priors = priors_table(problem.posterior.prior)
@@ -176,8 +176,8 @@ def _config_or_proposal(
 ) -> tuple[Config, bool]:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
 
-    Return the config, of another record if there is one, and whether it is a proposal. What only
-    ``check`` can use is refused.
+    Return the config, of another record if there is one, and whether it is a proposal. Records that
+    only ``check`` can use are refused.
     """
     from bwbayes.app.config.config import is_config, load
 

@@ -61,7 +61,7 @@ def options_of(verb: Verb, *omitted: str) -> Callable[[AnyCommand], AnyCommand]:
     def decorate(command: AnyCommand) -> AnyCommand:
         @wraps(command)
         def usable(*args: Any, **options: Any) -> Any:
-            # What computes is refused before the command does anything.
+            # A command that computes is refused before it does anything.
             if options.get("executor") is not None:
                 # Here, because it is slow to load.
                 from bwbayes.app.running.workers import require_executor
@@ -127,7 +127,7 @@ def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) ->
     return {quantity.strip(): value.strip() for quantity, _, value in pairs}
 
 
-# What of a record's files is meant, and of a single file.
+# Options that say how a record's files are read, and a single file.
 _reading = Verb(
     "bwbayes.record.io.formats:read_record",
     flags={

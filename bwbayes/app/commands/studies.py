@@ -173,7 +173,7 @@ def compare(
     """Compare the runs in folders PATHS, or models that one config is run with.
 
     Reports joint log scores of later readings given earlier ones, with errors; log evidence; a
-    recommendation and its caveats. Of --models the first word is an operator; nonlinearity, creep,
+    recommendation and its caveats. In --models the first word is an operator; nonlinearity, creep,
     dynamics and noise follow after plus signs. Models out of reach at their MAP estimates are only
     screened.
 

@@ -3,7 +3,7 @@
 Here are constants that configs and the command line share, without waiting for what checks configs.
 """
 
-# What files hold as a whole number.
+# Numbers that files hold as integers.
 MAX_SEED = 2**63 - 1
 
 # Models that are compared if no others are named: from no hysteresis at all to the two ways of

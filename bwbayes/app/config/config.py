@@ -31,7 +31,7 @@ from bwbayes.errors import InputError, suggestion
 
 MAX_FILE_SIZE = 1_000_000  # bytes
 
-# What a record is called that is the only one.
+# The name of a record that is the only one.
 ALONE = "record"
 
 # The branches of the key, as pydantic calls them; no record can have such a name.
@@ -67,7 +67,7 @@ class Config(ConfigTable):
     model: ModelConfig = key(ModelConfig())
     """The model of the actuator and of the residual."""
     parameters: dict[str, ParameterConfig] = key({}, called="priors")
-    """What is known of a parameter; NAME is its name, see `bwbayes models`."""
+    """Prior, value and labels of a parameter; NAME is its name, see `bwbayes models`."""
     sampling: SamplingConfig = key(SamplingConfig())
     """How to sample, and when to stop."""
     validation: dict[Name, ValidationConfig] = key({}, called="holdout test")

@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from bwbayes.errors import suggestion
 from bwbayes.shown import brief
 
-# What stands for the name that a user gives to one of several tables of a kind.
+# The placeholder of the name that a user gives to one of several tables of a kind.
 ANY = "NAME"
 
 Positive = Annotated[float, Field(gt=0)]
@@ -44,8 +44,8 @@ def key(
 ) -> Any:
     """Return a field for a key: its default, unit, example in TOML, and limits as pydantic's.
 
-    ``called`` is what people call it elsewhere, words with blanks between. What it is stands below
-    the field, as its docstring.
+    ``called`` is what people call it elsewhere, words with blanks between. The field's docstring
+    below it describes it.
     """
     extra: Any = {"unit": unit, "example": example, "called": called.split()}
     return Field(default, json_schema_extra=extra, **limits)

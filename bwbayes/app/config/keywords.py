@@ -7,8 +7,7 @@ same words. ``parameters`` and ``validation`` are tables, as in a config.
 ``bouc-wen; bouc-wen + quadratic; maxwell-slip(thresholds=4) + creep`` are three models: of each the
 first word is the hysteresis operator, with its options in brackets; what follows after plus signs
 are terms of the nonlinearity, ``creep``, linear dynamics and noise, by the names that a config
-gives them. What is not said stays as the config has it, but for nonlinearity and creep, which are
-left out.
+gives them. All else stays as the config has it, but for nonlinearity and creep, which are left out.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def config_of(
     tables: dict[str, Any] = {"record": {}, "model": {}, "sampling": {}}
     homes = dict.fromkeys(SamplingConfig.model_fields, "sampling")
     homes |= dict.fromkeys(RecordConfig.model_fields.keys() - {"file", "signal"}, "record")
-    # Of two tables with a key of the same name the model's counts.
+    # Where two tables have a key of the same name, the model's counts.
     homes |= dict.fromkeys(ModelConfig.model_fields, "model")
     homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth"), "")
     for key, value in keys.items():

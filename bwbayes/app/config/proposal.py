@@ -2,8 +2,8 @@
 
 :func:`propose` recognizes the file's columns, looks at the record, and holds out a quarter of it
 that is like the rest: of every amplitude and rate that the drive has, in several windows if need
-be. What is wrong with the record and has a line of config as its fix gets that line; what cannot be
-told from a record is asked in a comment.
+be. Issues of the record that a line of config fixes get that line. A comment asks for all that a
+record cannot tell.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def draft_config(path: Path, where: Path, naming: Naming | None = None) -> Confi
         table = read_table(path, naming)
         record = Record(**record_fields(table))
     remarks = tuple(str(w.message) for w in caught if issubclass(w.category, InputWarning))
-    # Of a reversed sign, what turns it without a new file.
+    # A reversed sign is turned without a new file.
     quantities = record.quantities
     unit = table.columns["displacement"].unit
     if quantities.output != DISPLACEMENT:

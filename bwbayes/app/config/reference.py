@@ -34,7 +34,7 @@ PARTS: Mapping[str, Mapping[str, Maker]] = {
     "noise": {name: partial(maker, interval=1e-3) for name, maker in NOISES.items()},
 }
 
-# What a text in a config may be, by its key's name, besides a choice of its own.
+# Choices of a text in a config by its key's name, besides its own.
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "nonlinearity": tuple(PARTS["nonlinearity"]),
     **{key: (*PARTS[key], "or module:Class") for key in ("hysteresis", "dynamics", "stages")},
@@ -58,7 +58,7 @@ def config_reference(requested: str | None) -> str:
             "Every key of a config, by table. `bwbayes config KEY` shows one; notebooks and runs "
             "have whole configs."
         )
-        # Of a table that stands in two places the keys are shown once.
+        # The keys of a table that stands in two places are shown once.
         first = {key.table: key.path for key in reversed(documented)}
         repeated = tuple(f"{k.path}." for k in documented if k.table and first[k.table] != k.path)
         shown = [key for key in documented if not key.path.startswith(repeated)]
@@ -169,7 +169,7 @@ def _part(kind: str, name: str, component: Any) -> str:
 def _without_marks(text: str) -> str:
     """Return a text without the marks of reStructuredText; prose is wrapped again."""
     text = re.sub(r"(?:^|\n)::\n", "", text).replace("::\n", ":\n").replace("``", "")
-    # Of a name in a role, the text to show, or the last part of its path.
+    # The text that is shown for a name in a role, or the last part of its path.
     role = re.compile(r":\w+:`(?:([^<`]+?)\s*<[^`]*>|~?(?:[\w.]*\.)?(\w+))`")
     text = role.sub(lambda name: name[1] or name[2], text)
     paragraphs = (p if "\n " in f"\n{p}" else _wrapped(p) for p in text.split("\n\n"))

@@ -98,7 +98,7 @@ class _Source(ConfigTable):
     fs: Positive | None = key(None, unit="Hz", example="1e3")
     """The file's sampling rate, in place of a time column."""
     table: int | str | None = key(None, example="2", called="sheet")
-    """Of a workbook or text with several tables the one that counts: its number, from 1 on, or the
+    """The table that counts, of a workbook or text with several: its number, from 1 on, or the
     sheet's name.
     """
     displacement_file: str | None = key(None, example='"my_displacement.csv"')
@@ -135,8 +135,8 @@ class RecordConfig(_Source):
     from_rest: bool = key(False, example="true")
     """Whether the record starts at rest, demagnetized."""
     continues: Name | None = key(None, example='"first"', called="follows")
-    """Of several records, the one that this one goes on from at once: state, offset and discrepancy
-    carry over, and the two are fitted as one record of that name.
+    """The record that this one continues at once: state, offset and discrepancy carry over, and the
+    two are fitted as one record of that name.
     """
     start: float | None = key(None, unit="s", example="2.0")
     """Readings before are left out; the voltage is not, because the hysteresis remembers it."""
@@ -147,7 +147,7 @@ class RecordConfig(_Source):
     outliers: list[float] | None = key(None, unit="s", example="[3.105, 7.42]")
     """Times of single readings that are left out; a run with model.outliers writes them."""
     remarks: Texts | None = key(None, example='["my_record.csv:1: ignored columns: temperature_C"]')
-    """What was noted when the record's files were read; a run writes it and shows it again."""
+    """Notes from reading the record's files; a run writes them and shows them again."""
     read_as: dict[str, dict[str, str] | list[str] | float | str] | None = key(
         None, example='{ columns = { displacement = "U2" }, all_columns = ["t", "U1", "U2"] }'
     )
@@ -155,7 +155,7 @@ class RecordConfig(_Source):
     alike.
     """
     decimate: int = key(1, ge=1, example="5", called="thin downsample")
-    """Of so many readings one is used."""
+    """One of so many readings is used."""
     train: Windows | None = key(
         None, unit="s", example="[[0.0, 12.0]]", called="fit training windows"
     )
@@ -185,10 +185,10 @@ class ActuatorConfig(ConfigTable):
     dynamics: str = key("lag", example='"second-order"')
     """The linear dynamics behind the hysteresis."""
     stages: Literal["auto"] | Texts = key("auto", example='["backlash"]')
-    """What else is between command and reading, see `bwbayes models`; auto: what the record has
-    evidence for, in a search that may also add a nonlinearity or creep, or take another operator
-    or other dynamics. A drift, transient or step is fitted in its record and not expected of
-    the next.
+    """Further stages between command and reading, see `bwbayes models`; auto: those that the record
+    has evidence for, in a search that may also add a nonlinearity or creep, or take another
+    operator or other dynamics. A drift, transient or step is fitted in its record and not expected
+    of the next.
     """
     passive: bool | None = key(None, example="false")
     """For bouc-wen: whether |gamma| <= beta, not only beta + gamma >= 0 (default: true)."""
@@ -212,8 +212,8 @@ class ModelConfig(ActuatorConfig):
     """The model: an actuator, and what is read of it."""
 
     hold: Literal["auto", "first", "zero"] = key("auto", example='"zero"')
-    """What the voltage does between samples: straight lines (first), held (zero), or held if it is
-    a command (auto).
+    """How the voltage goes between samples: in straight lines (first), held (zero), or held if it
+    is a command (auto).
     """
     search: Duration = key("60s", example='"none"', called="improve")
     """Longest time of the search for stages, as in 60s or 2min; none: no search."""
@@ -222,7 +222,7 @@ class ModelConfig(ActuatorConfig):
     per_record: Texts = key([], example='["sensor_sd"]')
     """Parameters that each of several records has of its own, besides initial and offset."""
     shared: Texts = key([], example='["offset"]')
-    """Of initial and offset, what all of several records share."""
+    """Which of initial and offset all of several records share."""
     outliers: bool = key(False, example="true")
     """Whether readings far from what their neighbors predict are set aside."""
 
@@ -286,7 +286,7 @@ class ParameterConfig(ConfigTable):
     label: str | None = key(None, example='"d_{33}"', called="symbol")
     """Its symbol in figures, in LaTeX."""
     description: str | None = key(None, example='"gain of the bender"')
-    """What it is, for the report."""
+    """Its description in the report."""
 
     @model_validator(mode="after")
     def _prior_or_value(self) -> ParameterConfig:
@@ -301,7 +301,7 @@ class SamplingConfig(ConfigTable):
     """When to stop and how to sample; see :class:`bwbayes.sampling.plan.SamplingPlan`."""
 
     engine: EngineChoice = key("auto", example='"numpy"')
-    """What evaluates the likelihood; auto: numba if installed."""
+    """The engine that evaluates the likelihood; auto: numba if installed."""
     ess: Positive = key(2000.0, example="4000", called="draws samples")
     """Effective draws of every parameter at which to stop."""
     ensembles: int = key(4, ge=4, example="8", called="chains")
@@ -325,8 +325,8 @@ class ValidationConfig(_Source):
     of another record to judge.
     """
     of: str | None = key(None, example='"record"')
-    """Of several training records, the one that the window is of, or whose own parameters another
-    record takes where nothing tells its own; by default the first.
+    """The training record that the window is of, or whose own parameters another record takes where
+    nothing tells its own; by default the first.
     """
     from_rest: bool = key(False, example="true")
     """Whether another record starts at rest, demagnetized."""

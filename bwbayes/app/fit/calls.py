@@ -1,9 +1,8 @@
 """From a record to a fit in Python: ``fit = bwbayes.fit(record, dynamics="lag", train=(0, 12))``.
 
-What :func:`fit` makes, ``bwbayes run`` makes too, by the same functions; :func:`open_run` reads
-what either has written, and :func:`resume` continues it. :func:`compare` tells which of
-several models to take, and :func:`campaign` fits many records. They load what they need when they
-are called.
+:func:`fit` and ``bwbayes run`` make the same run, by the same functions; :func:`open_run` reads it,
+and :func:`resume` continues it. :func:`compare` tells which of several models to take, and
+:func:`campaign` fits many records. Each loads its libraries when it is called.
 """
 
 from __future__ import annotations
@@ -111,7 +110,7 @@ def compare(
 ) -> Comparison:
     """Compare models of the same readings, to tell which one to take.
 
-    To a record each model is fitted first, side by side; fits and runs that exist are compared as
+    Each model is fitted to a record first, side by side; existing fits and runs are compared as
     they are.
 
     Parameters
@@ -363,7 +362,7 @@ def campaign(
             if not re.fullmatch(r"[\w][\w .+-]*", name):
                 raise InputError(f"campaign: {name!r} is not a valid file name; choose another")
             file = source / f"{name}.h5"
-            # Not again what an earlier call has written.
+            # Files that an earlier call has written are not written again.
             if not file.exists() or read_record(file).sha256 != record.sha256:
                 write_record(record, file)
     else:

@@ -56,7 +56,7 @@ class _Method:
 
 
 class Run(Shown, Stages):
-    """What was fitted, with all that is computed of it: posterior, bands, what to know of them.
+    """A fit with all that is computed of it: posterior, bands, notes on both.
 
     Attributes
     ----------
@@ -70,8 +70,8 @@ class Run(Shown, Stages):
     Notes
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
-    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them. What
-    follows from them is worked out, and what it needs is loaded, when it is first asked for.
+    :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them.
+    Everything else is computed, and its libraries are loaded, when it is first asked for.
     """
 
     @property
@@ -186,7 +186,7 @@ class Run(Shown, Stages):
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
-        nan where nothing was predicted or read. Of several records this raises an InputError: take
+        nan where nothing was predicted or read. A fit of several records raises an InputError: take
         ``fit.bands[NAME].residuals``.
         """
         import xarray as xr

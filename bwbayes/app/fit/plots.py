@@ -26,9 +26,9 @@ class Plots:
 
     Besides those below the report's, by their kinds: ``loops()``, ``steps()``, ``bands()``,
     ``coverage()``, ``agreement()``, ``innovations()``, ``spectrum()``, ``corner()``, ``trace()``
-    and ``ranks()``. Of several bands or records each shows the one of the ``name``, by default the
-    first. Those that speak of an interval raise a :class:`~bwbayes.errors.NotConvergedError`
-    without convergence.
+    and ``ranks()``. Each shows the bands or the record of the ``name``, by default the first. Those
+    that speak of an interval raise a :class:`~bwbayes.errors.NotConvergedError` without
+    convergence.
     """
 
     def __init__(self, fit: Run) -> None:

@@ -139,7 +139,7 @@ def resume(
 
 
 class Ended(NamedTuple):
-    """What came of a record: ``short`` says why it was refused, or that it did not converge."""
+    """The outcome of a record: ``short`` says why it was refused, or that it did not converge."""
 
     file: Path
     short: str = ""
@@ -170,7 +170,7 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
             (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
             return Ended(file, "" if fit.converged else "not converged")
         except InputError as error:
-            # Of a file in the folder of the records its name says enough.
+            # The name of a file in the folder of the records is enough.
             return Ended(file, str(error).replace(f"{file.parent}{os.sep}", ""), True)
         # One record must not end the others, whatever is wrong with it.
         except Exception as error:

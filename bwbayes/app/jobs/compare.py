@@ -300,7 +300,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
 def _standing(folder: RunFolder, files: bool) -> ValidationSummary:
     """Finish a run, and say whether its bands hold."""
     with warnings.catch_warnings():
-        # What is wrong with a model is among what speaks against it.
+        # A model's faults are among its caveats.
         warnings.simplefilter("ignore", InputWarning)
         return resume(folder, Console(quiet=True), workers=1, files=files).standing
 

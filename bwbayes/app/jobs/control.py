@@ -4,7 +4,7 @@ The files of a compensation are the command as a record, ``command.csv``, which 
 can play; the numbers, ``compensation.json``; everything along time, ``compensation.csv``; and a
 page with pictures, ``compensation.html``. An export writes two: ``model.json`` has the parts, all
 coefficients with units, and the linear part as matrices; ``actuator.c`` is the model and its
-inverse, one sample a call. Of a closed loop the posterior's draws are the actuators, on the virtual
+inverse, one sample a call. In a closed loop the posterior's draws are the actuators, on the virtual
 test stand, and its mean is the model that a controller has.
 """
 
@@ -69,9 +69,10 @@ def compensate(
     """Compute the voltage command for a reference displacement, and its predicted error.
 
     The displacement is in a file, or one of the usual shapes. 0 um is where the actuator stands at
-    zero volts as the command begins, so the default voltages are those fitted and 0 V. What the
-    voltage will do is predicted with its error; beside it stands what a linear command would do.
-    Exit status 3: the limit is exceeded more probably than not; 5: it is kept at less than 95%.
+    zero volts as the command begins, so the default voltages are those fitted and 0 V. The
+    displacement that the voltage will cause is predicted with its error, beside that of a linear
+    command. Exit status 3: the limit is exceeded more probably than not; 5: it is kept at less than
+    95%.
 
     Parameters
     ----------
@@ -168,7 +169,7 @@ def compensate(
     extrapolations = beyond_training(alone.posterior, compensation.record.inputs)
     remarks = [*compensation.remarks, *(finding.note for finding in extrapolations)]
     if not from_rest:
-        # What is reached from some states need not be from rest.
+        # A voltage that exists from some states need not exist from rest.
         with suppress(InputError):
             rested = command_from(
                 draws=draws[::4], generator=generator(seed, source), from_rest=True

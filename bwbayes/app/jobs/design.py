@@ -60,10 +60,11 @@ def design(
 ) -> Design | RivalDesign:
     """Rank input signals by the expected reduction in posterior SD.
 
-    What would be left of a parameter's standard deviation, or of a band's width along a drive,
-    after one more record; the best signal within the amplifier's limits goes into best.csv. Or,
-    with ``validate``, what would tell the model from its rivals: validate.csv is a short next
-    record along which these differ most, train.csv one that would tell them apart if it was fitted.
+    Each signal's score is the share of a parameter's standard deviation, or of a band's width along
+    a drive, that one more record would leave. The best signal within the amplifier's limits goes
+    into best.csv. With ``validate`` the signals tell the model from its rivals: validate.csv is a
+    short next record along which these differ most, train.csv one that would tell them apart if it
+    was fitted.
 
     Parameters
     ----------
@@ -110,8 +111,8 @@ def design(
     if (target is None) is not validate:
         raise InputError("design: give either a parameter, a drive or `validate=True`")
     problem = fit.problem
-    # Of several records, what all of them taught of the actuator, seen from the one whose voltage
-    # turns most: the new one is to be alike.
+    # Several records all tell of the actuator; the new one is to be like the one whose voltage
+    # turns most.
     records = problem.records
     record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
     low, high = voltage or limits_of(problem, None)

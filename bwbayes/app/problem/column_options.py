@@ -1,7 +1,7 @@
 """A file beside a run, read as the run's record was: the same columns, in the same units.
 
-A run stores its record under the package's own names. What was said of the columns of the file that
-it came from is noted, with the names of all of them: a file that has no others is of the same kind.
+A run stores its record under the package's own names. It notes how the columns of the original file
+were read, and the names of all of them: a file that has no others is of the same kind.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def column_options_from(
     """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.
 
     None of one that has other columns than the record had. It may lack some, as a planned voltage
-    lacks the displacement. What the user says of the ``reading``, such arguments too, comes first:
-    with columns, units or a rate nothing that was noted counts.
+    lacks the displacement. The user's own ``reading``, of such arguments too, comes first: with
+    columns, units or a rate no note counts.
 
     Raises InputError: the file cannot be read.
     """

@@ -1,9 +1,9 @@
 """From a config to a problem: records read, windows cut, every prior a number.
 
 :func:`resolve` does once what must not happen twice: it runs the virtual stand, sets default
-priors, and takes ``hold = "auto"`` from the record. What comes out is a config that says all this
-in explicit numbers and refers to the records as files beside it, so that a run's folder can be
-moved, continued and run again by itself.
+priors, and takes ``hold = "auto"`` from the record. Its result is a config that says all this in
+explicit numbers and refers to the records as files beside it, so that a run's folder can be moved,
+continued and run again by itself.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Problem:
 
     @cached_property
     def findings(self) -> dict[str, tuple[Finding, ...]]:
-        """What is wrong with each record that is fitted, and matters to the model.
+        """Issues of each fitted record that matter to the model.
 
         Several records make up for what one of them does not show, and a model without hysteresis
         needs no loops.
@@ -99,7 +99,7 @@ class Problem:
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """What to know of the records, one line each."""
+        """Notes on the records, one line each."""
         sources = self.config.records
         remarks = [text for source in sources.values() for text in source.remarks or ()]
         measured = {**self.records, **self.others}
@@ -140,7 +140,7 @@ class Problem:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What is fitted, for people: one line each, by subject."""
+        """The fitted model and records, for people: one line each, by subject."""
         facts = {}
         for name, record in self.records.items():
             which = "" if len(self.records) == 1 else f" {name}"

@@ -64,8 +64,8 @@ def plots_of(result: Result) -> PagePlots:
 def picture_of(draw: Callable[[], Figure], quantities: Quantities = DEFAULT) -> bytes:
     """Draw a figure and return it as PNG, laid out and drawn once: ``savefig`` does either twice.
 
-    Of its thousands of colors, nearly all from smooth edges, it keeps those that come nearest to
-    all: nobody sees the difference, and the file has a third of the size.
+    It has thousands of colors, nearly all from smooth edges. Those that come nearest to all are
+    kept: nobody sees the difference, and the file has a third of the size.
     """
     import matplotlib as mpl  # noqa: PLC0415
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415

@@ -61,8 +61,8 @@ def draw_ecdf(calibration: Calibration) -> Figure:
 def draw_coverage(calibration: Calibration) -> Figure:
     """Draw the coverage of the posteriors' intervals, and of the bands on held-out samples.
 
-    Each statistic's intervals are a row, with binomial limits around each level. Of each kind of
-    band there is how far its mean coverage is off, with three standard errors.
+    Each statistic's intervals are a row, with binomial limits around each level. For each kind of
+    band, the deviation of its mean coverage stands with three standard errors.
     """
     others, labels = calibration.predicted, _labels(calibration)
     size = 7.5 + 3.5 * len(others), 0.28 * len(labels) + 1.8

@@ -50,7 +50,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 
 
 class Color:
-    """What a color stands for."""
+    """Colors by their meaning."""
 
     MEAN = "#D55E00"
     MEASURED = "#222222"
