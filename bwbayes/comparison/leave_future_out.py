@@ -3,9 +3,9 @@
 Readings that follow one another are no independent votes. A model's score on a part of a record is
 the joint density of the part's readings, given all readings before. The noise model knows how each
 reading follows from the last, so that correlation is counted once. That density is a ratio of
-evidences, log p(later | earlier) = log Z(all) − log Z(earlier), and posteriors that differ by some
-readings share enough of their draws for all the ratios on the way from one to the other: block by
-block, which tells how sure the difference of two models is.
+evidences, log p(later | earlier) = log Z(all) − log Z(earlier). Posteriors that differ by some
+readings share enough of their draws for all the ratios on the way from one to the other. They are
+computed block by block, which tells how sure the difference of two models is.
 """
 
 from __future__ import annotations

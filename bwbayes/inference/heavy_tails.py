@@ -8,7 +8,7 @@ and whose expectation has the variance p, has the density
 
     p(e) = Σ a_k N(e; 0, V_k),   V_k = p + s² u_k.
 
-What it says of the states is exact up to their second moments: with weights π_k ∝ a_k N(e; 0, V_k),
+The states' first two moments after the reading are exact: with weights π_k ∝ a_k N(e; 0, V_k),
 
     gain G = P c E[1/V],   x ← x + G e,   P ← P − P c cᵀ P (E[1/V] − e² Var[1/V]),
 
@@ -45,7 +45,7 @@ ONE_SD = 0.8413447460685429
 
 
 class Followed(NamedTuple):
-    """What a filter found along readings.
+    """The result of a filter along readings.
 
     ``log_density`` (models,), nats; the ``error`` of what was expected of each reading and its
     variance ``spread`` (models, readings), um and um²; ``sensor`` (models, readings), the variance
@@ -83,7 +83,7 @@ def scale_of(inverse_df: FloatArray) -> FloatArray:
 
 
 class Steps(NamedTuple):
-    """What a filter takes along readings, states of the discrepancy first, then sizes of responses.
+    """The filter's input along readings: states of the discrepancy, then sizes of responses.
 
     ``transitions`` and ``gained`` are F and Q (gaps, models, states, states) over each gap, and
     ``gaps`` (readings,) which of them is just before a reading; ``variances``, um², and ``logs``

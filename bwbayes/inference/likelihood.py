@@ -31,7 +31,7 @@ from bwbayes.shown import brief
 def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:
     """Cut a number of models into batches of so many elements, by default what memory holds.
 
-    Of 64 at most: enough to share the loop over turns.
+    A batch has 64 at most: enough to share the loop over turns.
     """
     size = min(max(elements // samples, 1), 64)
     return (slice(i, min(i + size, models)) for i in range(0, models, size))
@@ -53,7 +53,7 @@ class LinearStart(NamedTuple):
 
 
 class Score(NamedTuple):
-    """What shapes in the readings would explain, beside an unknown start.
+    """The gradient and curvature of shapes in the readings, beside an unknown start.
 
     ``gradient`` u (models, shapes) is the log density's in their sizes, where these are zero, and
     ``fisher_information`` I (models, shapes, shapes) minus its Hessian; ``log_density`` (models,)

@@ -98,8 +98,8 @@ def local_minima(
 ) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
 
-    From so many starts: a few find the best of them, if not all. Of a long record the beginning is
-    looked at.
+    From so many starts: a few find the best of them, if not all. A long record is represented by
+    its beginning.
 
     Raises
     ------

@@ -187,9 +187,9 @@ class Target:
     def covariance(self, state: Iterate) -> tuple[FloatArray, float]:
         """Covariance (size, size) at a mode, and its log determinant.
 
-        Noise and physical parameters are uncorrelated. What the record does not tell keeps its
-        prior; the noise's Hessian is of differences. A state that is not possible has that of the
-        prior.
+        Noise and physical parameters are uncorrelated. Directions that the record leaves open keep
+        their prior; the noise's Hessian is of differences. A state that is not possible has that of
+        the prior.
         """
         covariance, log_determinant = np.eye(self.size), 0.0
         if not np.isfinite(state.density):

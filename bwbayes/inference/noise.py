@@ -22,7 +22,8 @@ from bwbayes.model.registry import build_part
 def _sensor_sd(context: Context) -> Distribution:
     """Return the default prior of the sensor's sd, above what its readings may be rounded by."""
     if rounding := round_to_scale(context.ranges.rounding):
-        # What is seen may be all there is; a model that misses some of it needs many times that.
+        # Rounding may be all the noise there is; a model that misses some of it needs many times
+        # that.
         return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
     usual = lognormal(0.006 * context.ranges.displacement, 2.0)
     if not (least := round_to_scale(context.ranges.resolution)):
@@ -46,8 +47,8 @@ DISCREPANCY_SD = Declaration(
     "um",
     r"\sigma",
     "sd of the model discrepancy",
-    # Not even its order of magnitude is known. A prior that is level down to zero would claim
-    # some discrepancy where there is none, and make a right model's bands too wide.
+    # Its order of magnitude is unknown. A prior that is level down to zero would claim some
+    # discrepancy where there is none, and make a right model's bands too wide.
     lambda context: lognormal(1e-5 * context.ranges.displacement, 4.0),
     floor=0.0,
     aliases=("sigma",),
@@ -60,9 +61,10 @@ DISCREPANCY_TIME = Declaration(
     lambda context: lognormal(0.5 * context.ranges.time, 0.8),
     floor=0.0,
 )
-# Up to 1/√2 the spectrum, ∝ 1/((ω² − ω₀²)² + ω² ω₀²/Q²), has no peak. What resonates has hardly
-# anything at low frequencies, so that a slow misfit is taken for the parameters'. Were 1/2 the
-# most, low ones would be extrapolated from high ones, the more the finer a record is sampled.
+# Up to 1/√2 the spectrum, ∝ 1/((ω² − ω₀²)² + ω² ω₀²/Q²), has no peak. A process that resonates has
+# hardly any power at low frequencies, so that a slow misfit would be taken for the parameters'.
+# Were 1/2 the most, low ones would be extrapolated from high ones, the more the finer a record is
+# sampled.
 DISCREPANCY_QUALITY = Declaration(
     "discrepancy_quality",
     "",
@@ -240,8 +242,8 @@ class SmoothNoise(Noise):
         """Take the discrepancy's size from the residuals, not from the kernel.
 
         Readings fix how the process moves at high frequencies, σ²/τ³; what σ adds at low ones is an
-        extrapolation. What the models' mean misses has the mean square σ² + s², less the part that
-        the fit took into the parameters, whose own uncertainty a band has besides.
+        extrapolation. The residual's mean square is σ² + s², less the part that the fit took into
+        the parameters, whose own uncertainty a band has besides.
         """
         sized = theta.copy()
         sized[:, 1] = np.sqrt(np.maximum(missed() - theta[:, 0] ** 2, 0.0))

@@ -6,10 +6,10 @@ model here is: each reading is spoiled with a small probability, independently o
 spoiled one may be anything. Its likelihood is a sum over all sets of spoiled readings. Where spikes
 are far outside the noise one set has nearly all of the weight, so it is chosen once, at the point
 fit, and kept: the likelihood of the others costs no more than before. A reading belongs to the set
-if the retained readings before and after it, without itself, predict it worse than by
-:data:`LIMIT` standard deviations: a good reading does so once in five hundred million. What is
-retained decides the priors and the fit, and these decide what is retained, so the selection is
-repeated until it does not change.
+if the retained readings before and after it, without itself, predict it worse than by :data:`LIMIT`
+standard deviations: a good reading does so once in five hundred million. The retained readings
+decide the priors and the fit, and these decide which are retained, so the selection is repeated
+until it does not change.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _predicted(
     """
     means = np.empty((residual.size, observe.size))
     covariances = np.empty((residual.size, *stationary.shape))
-    # What is known already is taken from the covariance, which stays stationary otherwise.
+    # The known part is taken from the covariance, which stays stationary otherwise.
     mean, covariance_now = np.zeros(observe.size), np.zeros_like(stationary)
     series = zip(residual.tolist(), skipped.tolist(), fitted.tolist(), strict=True)
     for t, (reading, missing, is_fitted) in enumerate(series):

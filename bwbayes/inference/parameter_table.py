@@ -1,9 +1,8 @@
 """The table of a model's parameters: one order of θ's columns, and everybody asks by name.
 
 The actuator's parameters come first, then the noise's, each in the order in which their parts
-declare them. Of several records that were measured on one actuator, what belongs to the actuator is
-there once; what belongs to a record (its initial state, its offset) is there once for each, side by
-side, and named after it: ``offset[step_10]``.
+declare them. Several records of one actuator share the actuator's parameters. Each record has its
+own initial state and offset, side by side, named after it: ``offset[step_10]``.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class Parameter:
 
     @property
     def floor(self) -> float:
-        """What the parameter cannot be lower than."""
+        """The lowest value of the parameter."""
         return self.declared.floor
 
     @property
@@ -160,7 +160,7 @@ class JointPrior:
             record: [(p.plain, p.name) for p in self.parameters if p.record == record]
             for record in self.records
         }
-        # What the bounds of each parameter may know.
+        # Parameters that the bounds of each parameter may know.
         self._known = {
             p.name: (*self._fixed, *self.free_names[: self.free.index(p)]) for p in self.free
         }
@@ -175,7 +175,7 @@ class JointPrior:
         rows, logarithmic, center, scale = table.T[:, :, np.newaxis]
         self._formulas = rows[:, 0].astype(np.int64), logarithmic > 0, center, scale
         self._cut = [(row, self.free[row]) for row, f in forms.items() if f is None]
-        # What free parameters must be above, or reach at least: two columns.
+        # Values that free parameters must exceed, or reach: two columns.
         floors = np.array([p.floor for p in self.free])[:, np.newaxis]
         reaches = [p.declared.reaches_floor for p in self.free]
         reached = np.array(reaches, dtype=np.bool_)[:, np.newaxis]

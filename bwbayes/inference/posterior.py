@@ -233,7 +233,7 @@ class Posterior:
     ) -> FloatArray:
         """Displacement (models, rows), um, at samples up to the last training sample of a record.
 
-        Of the record of that name; it may be left out if there is one alone. Where the start of the
+        The name of the record may be left out if there is one alone. Where the start of the
         dynamics is unknown, it is the most probable one.
         """
         return np.concatenate(list(self.simulations(theta, rows, record)))
@@ -315,7 +315,7 @@ class Posterior:
     def altered(self, *, voltage: FloatArray | None = None, **fields: Any) -> Posterior:
         """Return a posterior of one record with another voltage, or other fields of its dataset.
 
-        What was recorded beside a voltage is not known of another one.
+        Covariates are unknown of another voltage.
         """
         if voltage is not None:
             fields["inputs"] = replace(self.single_record.inputs, voltage=voltage, covariates={})

@@ -1,8 +1,8 @@
 """A study: a model, the records to fit, and statements about its parameters.
 
-A :class:`Study` makes the posterior. It puts what is stated of parameters (priors, values, bounds,
-names) before what the parts of the model declare, and gives the same study with another model, of
-which it keeps all that is stated of parameters that both have.
+A :class:`Study` makes the posterior. Statements about parameters (priors, values, bounds, names)
+come before the declarations of the model's parts. The same study with another model keeps the
+statements about parameters that both have.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from bwbayes.shown import brief
 
 @dataclass(frozen=True)
 class Stated:
-    """What is stated of a parameter: its prior or value, bounds, and names for people.
+    """The user's statements about a parameter: its prior or value, bounds, and names for people.
 
     All that is None is as the part declares it.
     """
@@ -54,7 +54,7 @@ class Stated:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What a config's [parameters.NAME] says of it, by key."""
+        """The keys of a config's [parameters.NAME]."""
         keys = {name: value for name, value in vars(self).items() if value is not None}
         if self.prior is not None:
             keys["prior"] = {"distribution": self.prior.name, **self.prior.arguments}
@@ -143,7 +143,7 @@ class Study:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What makes its posterior another one, besides the readings: values by a config's keys.
+        """All that its posterior depends on besides the readings: values by a config's keys.
 
         The names that people read of parameters do not, nor does the engine.
         """
@@ -172,7 +172,7 @@ class Study:
 
     @cached_property
     def extent(self) -> Extent:
-        """What the model takes from all records."""
+        """The quantities that the model takes from all records."""
         return extent_of([training.record for training in self.records.values()])
 
     @cached_property
@@ -213,7 +213,7 @@ class Study:
 
     @cached_property
     def contexts(self) -> dict[str, Context]:
-        """What default priors may know of each record, by name, and ("") of all together.
+        """The ranges that default priors use, of each record by name, and ("") of all together.
 
         From the windows that are fitted.
 
@@ -248,7 +248,7 @@ class Study:
 
     @cached_property
     def defaults(self) -> dict[str, Distribution]:
-        """What the default priors of these records are, by the parameters' names."""
+        """The default priors of these records, by the parameters' names."""
         defaults = {
             column.name: column.declaration.default(self.contexts[column.record])
             for column in self.posterior.table.layout

@@ -1,8 +1,8 @@
 """An operator's step, compiled: the same function as NumPy's, for one model after the other.
 
-What is compiled takes a step as an argument, whose type it is compiled for: so an operator of any
-module is as fast as one of this package, and a run compiles what it needs. What is kept on disk is
-that of the sources as they are.
+A compiled function takes a step as an argument and is compiled for its type. So an operator of any
+module is as fast as one of this package, and a run compiles only its own. The cache on disk follows
+the sources.
 
 It needs numba, which is loaded when something is compiled, not before.
 """
@@ -34,8 +34,8 @@ from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.stage import Stage
 from bwbayes.model.step import HysteresisStep
 
-# What is called at each sample allocates nothing: to count who holds an array would take longer
-# than all of the arithmetic. It becomes a part of its caller's loop, or there would be no vectors.
+# A function of each sample allocates nothing: counting references would take longer than all of the
+# arithmetic. It becomes a part of its caller's loop, or there would be no vectors.
 INNER: Mapping[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
@@ -55,9 +55,9 @@ WHOLE = 1.5 * 2.0**52
 class FormulaType(types.Type):
     """The type of what brings a formula, by its class and a digest of the formula's sources.
 
-    A step and a stage bring their ``move``, an operator that remembers extrema its ``everett``.
-    What is kept on disk knows the ``kind``, the class, by its name alone: one of a module of the
-    user's own need not be there when others are looked up beside it.
+    A step and a stage bring their ``move``, an operator that remembers extrema its ``everett``. The
+    cache on disk knows the ``kind``, the class, by its name alone: a class of the user's own module
+    need not be there when others are looked up beside it.
     """
 
     kind: Any
@@ -72,7 +72,7 @@ class FormulaType(types.Type):
 @typeof_impl.register(RemembersExtrema)
 def _type_of(formula: HysteresisStep | RemembersExtrema | Stage, _: Any) -> FormulaType:
     kind: Any = type(formula)
-    # To read the sources takes longer than a short record: a class does so once.
+    # Reading the sources takes longer than a short record: a class does so once.
     if "_numba_type_" not in vars(kind):
         files = sorted({inspect.getfile(inner) for inner in _functions(_formula_of(kind))})
         # Which knows the cells of a notebook too.

@@ -31,7 +31,7 @@ MOST_TIMES = 8
 class Creep:
     """Creep: slow lags beside the dynamics, one for each of the given times.
 
-    To what the dynamics make of the drive w in um, creep adds
+    Creep adds to the output of the dynamics, driven by w in um,
 
         x_creep = Σ cᵢ Lᵢ,   Tᵢ Lᵢ′ + Lᵢ = w (1 + κ |u| / U),
 

@@ -79,13 +79,13 @@ class Ranges:
 
     @property
     def reach(self) -> float:
-        """What the voltage's distance from zero may add to offset and hysteresis, um."""
+        """The most that the voltage's distance from zero adds to offset and hysteresis, um."""
         return self.displacement + self.slope * abs(self.bias)
 
 
 @dataclass(frozen=True)
 class Context:
-    """What default priors may know: ranges, and what is ``stated`` of parameters by name."""
+    """The input of default priors: ranges, and ``stated`` priors and values by parameter."""
 
     ranges: Ranges
     stated: Mapping[str, float | Distribution] = field(default_factory=dict)

@@ -16,7 +16,8 @@ from bwbayes.model.declaration import Context, Declaration, Values, lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.linear import Hold, Recursion, first_order_lag, no_dynamics, second_order
 
-# Of T: drives are mostly slow for the actuator. Wide, because its lag does not follow the drive.
+# A part of T: drives are mostly slow for the actuator. The prior is wide, because the lag does not
+# follow the drive.
 LAG, LAG_SIGMA = 0.005, 2.3
 
 

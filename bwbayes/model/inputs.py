@@ -79,7 +79,7 @@ class Inputs:
 
     @property
     def hold(self) -> Hold:
-        """What the voltage does between samples."""
+        """The hold of the voltage between samples."""
         return "zero" if self.voltage_is == "command" else "first"
 
     def range_of(self, name: str, windows: Sequence[slice]) -> tuple[float, float]:

@@ -6,11 +6,11 @@ undone last. The drive turns where the voltage does, and along a branch
 between two turns both go one way: each sample asks for one root of one rising curve, and one walk
 along the curve serves all samples. It asks of an operator only to simulate, one model at a time.
 
-Of the dynamics the recursion on the samples is inverted, not the differential equation: what it
-returns makes the displacement again to rounding, at every sample. A displacement that jumps, or
-whose speed does, needs a drive that swings from sample to sample around the one of the differential
-equation, for about a lag: smooth it first. A drive that is held acts one sample later, so the
-second sample cannot be chosen, and the last drive, which acts after the record, stays.
+The dynamics' recursion on the samples is inverted, not the differential equation: the voltage makes
+the displacement again to rounding, at every sample. A displacement that jumps, or whose speed does,
+needs a drive that swings from sample to sample around the one of the differential equation, for
+about a lag: smooth it first. A drive that is held acts one sample later, so the second sample
+cannot be chosen, and the last drive, which acts after the record, stays.
 
 A mass on a spring that is sampled much faster than it swings, driven in straight lines, has
 recursions whose inverse runs away (a zero outside of the unit circle, −2 − √3 in the limit). It has

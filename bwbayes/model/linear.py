@@ -25,7 +25,7 @@ from bwbayes.errors import InputError
 
 Hold = Literal["first", "zero"]
 
-# What a command's hold is called outside of the package.
+# Names of a command's hold outside of the package.
 HOLD_NAMES: Mapping[Hold, str] = {"zero": "zoh", "first": "foh"}
 
 ComplexArray = NDArray[np.complex128]
@@ -67,8 +67,8 @@ class Recursion:
     free: FloatArray
 
     def __post_init__(self) -> None:
-        # What decays within a sample to nearly less than any normal number is nothing: a processor
-        # takes ten times as long with such numbers.
+        # Numbers that decay within a sample to nearly subnormal ones are set to zero: a processor
+        # takes ten times as long with them.
         for taps in (self.numerator, self.denominator, self.free):
             taps[np.abs(taps) < 1e-200] = 0.0
 
@@ -98,7 +98,7 @@ class Recursion:
         responses = np.zeros((models, unknowns, samples))
         for unknown in range(unknowns):
             state, first, size = self.free[:, unknown].copy(), 0, 512
-            # What is below 10⁻¹⁸ of a unit adds nothing to a reading.
+            # States below 10⁻¹⁸ of a unit add nothing to a reading.
             while first < samples and np.any(np.abs(state) > 1e-18):
                 self.run(responses[:, unknown, first : first + size], state)
                 first, size = first + size, 2 * size

@@ -2,8 +2,8 @@
 
 An operator is rate-independent: only the path of the voltage counts, not its pace. It works for a
 batch of models at once, whose parameters come as columns by name, and for a record in pieces, with
-its memory carried from one piece to the next. What was before a record is one number in each of
-them, ``initial``: a state that an earlier drive within a ``span`` of voltages could have left.
+its memory carried from one piece to the next. The history before a record is one number for each
+model, ``initial``: a state that an earlier drive within a ``span`` of voltages could have left.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ REACH = 36.0
 class PowerStep(OneStateStep):
     """w = d u − h with Bouc-Wen hysteresis h of any exponent n ≥ 1.
 
-    What it remembers besides voltage and h is the direction, and the time on the curve, V, below
-    zero where g is; it is looked up where the voltage turns.
+    Besides voltage and h it remembers the direction and the time on the curve, V, negative where g
+    is; the time is looked up where the voltage turns.
     """
 
     ROW: ClassVar = "d, α, c/α, scales and rates below zero and above, n, and the curves' tables"
@@ -51,7 +51,7 @@ class PowerStep(OneStateStep):
     ) -> Self:
         """Return the step of d, α, β, γ and n, (models,), as of Bouc-Wen hysteresis."""
         rates = (gamma - beta) / alpha, (beta + gamma) / alpha
-        # What z is in units of below zero and above, |c/α|^(−1/n), um; not out of all reach.
+        # Units of z below zero and above, |c/α|^(−1/n), um; kept finite.
         with np.errstate(divide="ignore"):
             logs = [-np.log(np.abs(rate)) / exponent for rate in rates]
         below, above = (np.exp(np.minimum(values, np.log(1e100))) for values in logs)
@@ -194,7 +194,7 @@ def tabulate(exponent: FloatArray, *, saturating: bool, top: float = 0.0) -> Flo
     ]
     a = [scale * values[:, :-1] for scale, values in zip(ends, derivatives, strict=True)]
     b = [scale * values[:, 1:] for scale, values in zip(ends, derivatives, strict=True)]
-    # What the cubic from the left end misses at the right end fixes the four upper coefficients.
+    # The error of the left end's cubic at the right end fixes the four upper coefficients.
     missed = (
         b[0] - a[0] - a[1] - a[2] - a[3],
         b[1] - a[1] - 2 * a[2] - 3 * a[3],

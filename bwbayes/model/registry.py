@@ -52,7 +52,7 @@ HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
     "linear": NoHysteresis,
 }
 
-# What may be said of a hysteresis operator beside its name: what any of them takes.
+# Options of a hysteresis operator beside its name: all that any of them takes.
 OPTIONS = tuple(
     dict.fromkeys(
         name for maker in HYSTERESIS.values() for name in inspect.signature(maker).parameters

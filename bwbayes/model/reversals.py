@@ -1,8 +1,8 @@
 """A drive's own turns, times and speeds, whatever the sampling rate.
 
-The voltage alone decides: a record and its every k-th sample have the same turning points, and
-noise on a measured voltage makes none, because a turn counts only where the voltage comes back by a
-part of its range.
+The voltage alone decides: a record and its every k-th sample have the same turning points. Noise on
+a measured voltage makes none, because a turn counts only where the voltage comes back by a part of
+its range.
 """
 
 from __future__ import annotations

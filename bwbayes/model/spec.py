@@ -2,8 +2,8 @@
 
 A :class:`ModelSpec` describes a model without any record. It makes the actuator for a record, says
 what it is in words and as a config has it, and gives another one with a stage added, replaced or
-left out. To get another model, a diagnosis, a comparison or a choice of noise changes the
-spec; a config reads and writes it.
+left out. A diagnosis, a comparison or a choice of noise changes the spec to get another model; a
+config reads and writes it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Slot = Literal["input", "hysteresis", "nonlinearity", "dynamics", "creep", "outp
 
 
 class Extent(NamedTuple):
-    """What a model takes from all records of an actuator.
+    """The quantities that a model takes from all records of an actuator.
 
     ``span`` of their voltages, V, from which nonlinearity and creep count; the ``shortest``
     interval between samples and the ``longest`` duration, s, between which creep has its times.
@@ -56,7 +56,7 @@ class StageSpec(NamedTuple):
 
     @property
     def place(self) -> str:
-        """What no two stages of a chain have in common: hysteresis or dynamics, or their name."""
+        """The place that one stage of a chain takes: hysteresis or dynamics, or its name."""
         return self.slot if self.slot in ("hysteresis", "dynamics") else self.name
 
 
@@ -126,7 +126,7 @@ class ModelSpec:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What a config's [model] says of it, by key; lists for tuples."""
+        """The keys of a config's [model]; lists for tuples."""
         keys = {
             "hysteresis": self.operator.name,
             "nonlinearity": self._in("nonlinearity"),

@@ -51,7 +51,7 @@ class Stage(ABC):
     """Whether only the path of its values counts, not their pace: then it shapes loops."""
     sees: ClassVar[str] = ""
     """A column of the inputs that it sees: ``"time"``, s since the record began, ``"voltage"``, the
-    command, or a covariate. What that is at a sample is then the last of its ``parameters``.
+    command, or a covariate. Its value at a sample is then the last of the ``parameters``.
     """
     remembers: ClassVar[int] = 0
     """How many numbers it remembers from sample to sample."""
@@ -60,7 +60,7 @@ class Stage(ABC):
     have taken its place.
     """
     advice: ClassVar[str] = ""
-    """What can be done on the test stand, instead of making it a part of the model."""
+    """A remedy on the test stand, instead of a stage of the model."""
 
     @property
     @abstractmethod
@@ -90,8 +90,8 @@ class Stage(ABC):
     def settle(parameters: Any, value: Any, after: Any) -> Any:
         """Return what comes out once the stage is at rest at a value, and write its memory.
 
-        Step of one model, whose parameters and memory are rows, or of all, (any, models).
-        What has no memory needs none: ``move`` says all.
+        Step of one model, whose parameters and memory are rows, or of all, (any, models). A stage
+        without memory needs none: ``move`` is enough.
         """
         raise NotImplementedError
 
@@ -135,7 +135,7 @@ class Stage(ABC):
     ) -> tuple[FloatArray, FloatArray]:
         """Return what comes out (models, samples) of values, and the memory after them.
 
-        All models take one sample together. What is given stays as it is. ``seen`` (samples,) is
+        All models take one sample together. The arguments are not changed. ``seen`` (samples,) is
         what the stage sees.
         """
         result, rows = np.empty(values.shape), numbers.T.copy()
@@ -211,7 +211,7 @@ def begin_stages(
             memory = stage.begin(column, numbers, first, timing)
         else:
             rested, at_rest = stage.settled(numbers, rest_value)
-            # What has no pace has come along the whole path from there.
+            # A rate-independent stage has come along the whole path from there.
             memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
             rest_value = rested
         memories.append(memory)
@@ -245,7 +245,7 @@ def undo_stages(
     for stage, rested in zip(reversed(stages), reversed(at_rest), strict=True):
         numbers, first = stage.numbers_at(column, timing, inputs), values[:, 0].copy()
         memories = begin_stages((stage,), column, first, inputs, timing, rested)
-        # What comes out first hangs on what goes in first.
+        # The first output depends on the first input.
         for _ in range(40):
             out, _ = stage.advance(numbers, memories[0], first[:, np.newaxis])
             first = first + (values[:, 0] - out[:, 0])

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class StepResult(NamedTuple):
-    """What is once a voltage has gone there: w (models,), um, dw/du (models,), and the memory."""
+    """The state at a voltage: w (models,), um, dw/du (models,), and the memory."""
 
     w: FloatArray
     slope: FloatArray
@@ -38,8 +38,8 @@ class StepResult(NamedTuple):
 class HysteresisStep(ABC):
     """A hysteresis operator w = Γ[u] that goes from one voltage (models,) straight to the next.
 
-    Voltages are in V, displacements in um, slopes in um/V, all (models,). What it remembers is an
-    array (models, any).
+    Voltages are in V, displacements in um, slopes in um/V, all (models,). The memory is an array
+    (models, any).
 
     Parameters
     ----------

@@ -3,8 +3,8 @@
 :func:`start` makes the folder; :func:`resume` fits the records whose runs have not ended, side by
 side and each as ``bwbayes run`` fits it, and writes table and page over all of them. One that
 cannot be used comes back as a refusal of one line. A record's run depends on the config, the seed
-and the record alone, and the tables on the runs alone, so it does not matter in how many pieces or
-with how many workers a campaign is done, and records that come later are fitted by themselves.
+and the record alone, and the tables on the runs alone. So pieces and workers do not matter, and
+records that come later are fitted by themselves.
 """
 
 from __future__ import annotations

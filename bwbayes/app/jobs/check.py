@@ -1,8 +1,8 @@
 """Check of a record and its config before a run, on the screen and as a page with figures.
 
-:func:`check` resolves the config, looks at the record, fits a point with the noise that a run would
-take, and says what the record shows to be wrong with it, each with the line of config that deals
-with it.
+:func:`check` resolves the config, looks at the record, and finds the MAP estimate with the noise
+that a run would take. It names the record's issues, each with the line of config that deals with
+it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """From a config to a problem: records read, windows cut, every prior a number.
 
 :func:`resolve` does once what must not happen twice: it runs the virtual stand, sets default
-priors, and takes ``hold = "auto"`` from the record. Its result is a config that says all this in
-explicit numbers and refers to the records as files beside it, so that a run's folder can be moved,
-continued and run again by itself.
+priors, and takes ``hold = "auto"`` from the record. The resulting config says all this in explicit
+numbers and refers to the records as files beside it. So a run's folder can be moved, continued and
+run again by itself.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Time does not appear in them: h depends on the path of the voltage alone. So a r
 the voltage turns, and every stretch between two turns is one array expression for all samples and
 all models at once (:mod:`bwbayes.model.relaxing` for n = 1, :mod:`bwbayes.model.power` for any n).
 
-Of the parameters this is known beforehand, with U half the range of the voltage and Y that of the
-displacement: d is Y/U or twice that, α a part of it, β near 1/U.
+Default priors follow from U, half the range of the voltage, and Y, that of the displacement: d is
+Y/U or twice that, α a part of it, β near 1/U.
 
 With half a range below about a third of 1/β a small drive shows no loop that closes; then the
 priors, not the record, say how large β is, and leave room for the value that a large drive shows.
@@ -214,7 +214,7 @@ def hysteresis(
     column["d"] = np.zeros(size)
     operator = BoucWen(passive=False)
     operator.check(column)
-    # Not its negative, which has −0 for 0.
+    # The difference, because the negative has −0 for 0.
     h: FloatArray = 0.0 - operator.trace(column, path, column["initial"])[0]
     return h
 
@@ -226,7 +226,7 @@ def _anywhere(column: Values) -> BoolArray:
 
 def _top(column: Values) -> FloatArray:
     """Highest |h| (models,), um, not beyond a number that can be worked with."""
-    # Not a number where β + γ < 0 or α = 0, which is outside already; fmin prefers the number.
+    # It is nan where β + γ < 0 or α = 0, which is outside already; fmin prefers the number.
     with np.errstate(invalid="ignore"):
         top = ceiling(*(column[name] for name in SHAPE))
     return np.fmin(top, HIGHEST_CEILING)

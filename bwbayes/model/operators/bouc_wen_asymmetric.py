@@ -22,7 +22,7 @@ from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, ceiling
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.step import HysteresisStep
 
-# What each term depends on, in the order in which their bounds follow from each other.
+# Variables of each term, in the order in which their bounds follow from each other.
 TERMS = {
     "b4": "the voltage's direction",
     "b5": "the sign of h",

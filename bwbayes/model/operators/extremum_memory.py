@@ -1,7 +1,7 @@
 """Memory of Preisach's model and its kin: the extrema of the voltage that still count.
 
 A voltage that comes back to an earlier turning point closes a loop, and all that happened inside
-the loop is forgotten. What is left is a stack of extrema, each nearer to the next than the one
+the loop is forgotten. The memory is a stack of extrema, each nearer to the next than the one
 before. It depends on the voltage alone, so all models of a batch share it, and along a branch, from
 the last of these extrema to where the voltage turns or closes a loop, the displacement is one array
 expression. An operator is told from another by that expression alone, its Everett function.
@@ -82,7 +82,7 @@ class RemembersExtrema(Operator):
     other.
 
     A drive that was smaller leaves other states, which show once the voltage goes beyond what it
-    reached: :meth:`earlier`. What a prediction does not know of the start goes through these too.
+    reached: :meth:`earlier`. A prediction's unknown initial states include these.
 
     Sources: F. Preisach, Z. Phys. 94 (1935) 277-302; I. D. Mayergoyz, Mathematical Models of
     Hysteresis (Springer, 1991), for the stack and the Everett function.

@@ -66,7 +66,7 @@ class KrasnoselskiiPokrovskii(RemembersExtrema):
             stated_bounds=f"width <= {WIDEST:g} saturation",
         )
         rayleigh, saturation = DENSITY
-        # Of a width that is fixed.
+        # The bound of a width that is fixed.
         saturation = replace(saturation, bounds=lambda earlier: (earlier["width"] / WIDEST, np.inf))
         return (SLOPE, rayleigh, saturation, width, INITIAL)
 

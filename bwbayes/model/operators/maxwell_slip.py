@@ -1,9 +1,9 @@
 """Maxwell-slip: springs that slip, in parallel; Prandtl-Ishlinskii read from the other side.
 
 A spring that slips beyond a strain r (a stop) follows the voltage up to there, then stays: its
-strain is s = u − z, with z the play of threshold r. What the springs hold back of the actuator's
-displacement is its hysteresis. A sum of stops is therefore a sum of plays with another linear part,
-and the work is done by :mod:`bwbayes.model.operators.prandtl_ishlinskii`.
+strain is s = u − z, with z the play of threshold r. The displacement that the springs hold back is
+the hysteresis. A sum of stops is therefore a sum of plays with another linear part, and the work is
+done by :mod:`bwbayes.model.operators.prandtl_ishlinskii`.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ class Plays(RemembersExtrema):
 
     thresholds: int | tuple[float, ...] = 10
 
-    # What a weight is called: its name, its symbol, and of which element it is.
+    # A weight's name, its symbol, and its element.
     weight: ClassVar[tuple[str, str, str]] = ("weight", "w", "play")
 
     def __post_init__(self) -> None:

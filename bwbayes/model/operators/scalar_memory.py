@@ -123,7 +123,7 @@ def ceiling(alpha: FloatArray, rate: FloatArray) -> FloatArray:
         return np.minimum(alpha / rate, HIGHEST_CEILING)
 
 
-# What is the same thing as in the Bouc-Wen model, with the same priors.
+# Parameters with the meaning and the priors that they have in the Bouc-Wen model.
 
 
 def d() -> Declaration:

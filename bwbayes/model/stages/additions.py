@@ -1,4 +1,4 @@
-"""What a reading has in it besides the displacement, at some times more than at others.
+"""Additions to a reading besides the displacement, at some times more than at others.
 
 None of it is the actuator's: it is fitted in the record where it was, and not expected of the next.
 """

@@ -22,7 +22,7 @@ from bwbayes.model.stage import Side, Stage, Timing
 class _Lag(Stage):
     """A first-order lag. The memory is y and x.
 
-    Of an x that is held, what comes out is the mean of y until the next sample.
+    Where x is held, the output is the mean of y until the next sample.
     """
 
     remembers: ClassVar = 2
@@ -93,7 +93,7 @@ def _declared(name: str, label: str, whose: str, unit: str, range_: str) -> tupl
     """Declare time constant and speed before the record."""
 
     def speed(context: Context) -> Distribution:
-        # Of a triangle's slope, twice.
+        # Twice the slope of a triangle.
         return normal(0.0, 4 * getattr(context.ranges, range_) / context.ranges.time)
 
     return (
