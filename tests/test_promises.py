@@ -7,38 +7,18 @@ checked too; the rest of them are numbers that the tests themselves hold.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
-from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
-from tests.measured import measured
+from tests.measured import assert_quotes, figures, measured, numbers, quotes
 from tests.test_calibration_moving import PARTS
 
 PROMISES = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
-NUMBER = re.compile(r"(?<![\w.-])-?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
 
 STUDIES = measured()
 
-
-def leaves(figure: Any, path: str) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of a figure by their paths; "5 of 9" is two, "#path" a list's length."""
-    if isinstance(figure, str):
-        counts = re.fullmatch(r"(\d+) of (\d+)", figure)
-        figure = [int(count) for count in counts.groups()] if counts else []
-    if isinstance(figure, int | float):
-        yield path, figure
-        return
-    yield f"#{path}", len(figure)
-    items = figure.items() if isinstance(figure, dict) else enumerate(figure)
-    for key, value in items:
-        yield from leaves(value, f"{path}/{key}")
-
-
-LEAVES = {path: value for study, figure in STUDIES.items() for path, value in leaves(figure, study)}
 
 ROWS = {
     cells[0]: cells
@@ -48,10 +28,7 @@ ROWS = {
 
 
 class Quoted(NamedTuple):
-    """How the figures of a row come from the studies, and numbers of its limit and its records.
-
-    Each expression says how numbers are reduced, what they are multiplied by, and their paths.
-    """
+    """Expressions of a row's figures, and of numbers among its limits and its records."""
 
     figures: list[str]
     beside: list[str] = []  # noqa: RUF012  # read alone
@@ -297,56 +274,14 @@ CLAIMS: dict[str, Quoted] = {
     **{name: Quoted([f"benchmarks/{name}"]) for name in STUDIES["benchmarks"]},
 }
 
-REDUCE: dict[str, Callable[[list[float]], list[float]]] = {
-    "": list,
-    "min": lambda values: [min(values)],
-    "max": lambda values: [max(values)],
-    "sum": lambda values: [sum(values)],
-    "count": lambda values: [len(values)],
-    "extent": lambda values: [min(values), max(values)],
-    "worst": lambda values: [max(map(abs, values))],
-}
-
-
-def figures(expression: str) -> list[float]:
-    """Return the numbers of an expression."""
-    found = re.fullmatch(rf"(?:({'|'.join(filter(None, REDUCE))}) )?(?:(\d+) )?(.*)", expression)
-    assert found is not None
-    how, factor, patterns = found.groups()
-    values = [
-        value * int(factor or 1)
-        for pattern in patterns.split("|")
-        for path, value in LEAVES.items()
-        if fnmatchcase(path, pattern)
-    ]
-    assert values or how == "sum", expression
-    return REDUCE[how or ""](values)
-
-
-def quotes(text: str, value: float) -> bool:
-    """Tell whether a number is a value, as precisely as it is printed."""
-    if "e" in text:
-        return f"{value:.0e}" == text
-    return f"{value:,.{len(text.partition('.')[2])}f}" == text
-
-
-def numbers(cell: str) -> list[str]:
-    """Return the numbers of a cell, as they are printed."""
-    return [number.rstrip(",") for number in NUMBER.findall(cell)]
-
 
 @pytest.mark.parametrize("claim", CLAIMS)
 def test_the_quoted_figures_are_those_of_the_last_full_run(claim: str) -> None:
     _, cell, limit, records, _ = ROWS[claim]
-    measured_figures = [value for text in CLAIMS[claim].figures for value in figures(text)]
-    quoted = numbers(cell)
-    assert len(measured_figures) == len(quoted), (cell, measured_figures)
-    for number, figure in zip(quoted, measured_figures, strict=True):
-        assert quotes(number, figure), (cell, measured_figures)
+    assert_quotes(cell, *CLAIMS[claim].figures)
     beside = iter(numbers(f"{limit} {records}"))
-    for text in CLAIMS[claim].beside:
-        for figure in figures(text):
-            assert any(quotes(number, figure) for number in beside), (text, limit, records)
+    for figure in figures(*CLAIMS[claim].beside):
+        assert any(quotes(number, figure) for number in beside), (figure, limit, records)
 
 
 def test_every_figure_is_that_of_a_study_and_every_claim_has_a_command() -> None:
@@ -365,7 +300,7 @@ def test_twin_another_figure_is_found() -> None:
 
 
 def test_no_calibration_has_a_shortcoming_and_every_part_has_one() -> None:
-    failures = [value for path, value in LEAVES.items() if path.endswith("/shortcomings")]
+    failures = figures("*/shortcomings|#*/shortcomings")
     assert len(failures) > len(PARTS)
     assert not any(failures)
     assert all(f"calibrated part, {name}" in STUDIES for name in PARTS)

@@ -14,11 +14,19 @@ import numpy as np
 import pytest
 
 from bwbayes.app.commands import cli
+from bwbayes.app.config.settings import SamplingConfig
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.model.declaration import Context, Ranges
+from bwbayes.model.distributions import Distribution
+from bwbayes.model.operators.bouc_wen import BoucWen
+from bwbayes.prediction import prediction
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Waveform
+from bwbayes.sampling import diagnostics
 from tests.app import small
 from tests.examples import README, ROOT, blocks
-from tests.measured import measured
+from tests.measured import assert_quotes, measured, quotes
+from tests.test_what_drives_tell import DRIVES, LENGTHS
 
 
 def block(name: str) -> str:
@@ -75,8 +83,12 @@ def test_ci_runs_the_test_command_of_the_readme() -> None:
 
 
 def test_the_files_and_figures_that_the_readme_names_exist() -> None:
-    for path in re.findall(r"\]\((\S+?)\)", README):
+    for link in re.findall(r"\]\((\S+?)\)", README):
+        path, _, heading = link.partition("#")
         assert (ROOT / path).is_file(), path
+        if heading:
+            lines = (ROOT / path).read_text(encoding="utf-8").splitlines()
+            assert f"## {heading.capitalize()}" in lines, link
 
 
 def test_the_first_command_converges_with_the_effective_draws_it_was_asked_for(
@@ -93,7 +105,7 @@ def test_the_quoted_parameters_are_those_of_the_run(summary: Any) -> None:
     rows = [
         line.split("|")[1:-1] for line in block("numbers: ring_bender").strip().splitlines()[2:]
     ]
-    quoted = {row[0].strip(): [float(cell) for cell in row[2:]] for row in rows}
+    quoted = {row[0].strip(): [float(cell) for cell in row[3:]] for row in rows}
     assert set(summary["parameters"]) == set(quoted)
     for name, (truth, mean, sd) in quoted.items():
         run = summary["parameters"][name]
@@ -126,3 +138,76 @@ def test_the_quoted_campaign_is_that_of_the_last_benchmark() -> None:
         "minute to put together"
     )
     assert text in " ".join(README.split())
+
+
+def test_the_quoted_evaluations_of_an_effective_draw_are_those_of_the_run(summary: Any) -> None:
+    """Of the draws that count, within a fifth: effective draws are estimates."""
+    quoted = re.search(r"one costs \*\*([\d.]+)\*\* simulations", " ".join(README.split()))
+    assert quoted
+    least = min(min(row["ess_bulk"], row["ess_tail"]) for row in summary["parameters"].values())
+    evaluations = sum(summary["sampling"]["proposals"].values())
+    assert float(quoted.group(1)) == pytest.approx(evaluations / least, rel=0.2)
+
+
+def test_the_quoted_limits_are_those_of_the_last_full_run() -> None:
+    text = " ".join(re.findall(r"\*\*([\d.,]+)\*\*", block("numbers: limits")))
+    assert_quotes(
+        text,
+        "extent 100 moving, */coverage and t/*/95/0",
+        "extent 100 untried/coverage/*",
+        "extent 100 a * discrepancy of 1.3 s/coverage/95",
+        "ordinary answers/other/False",
+        "ordinary answers/seeds",
+        "ordinary answers/other/True",
+        *(
+            f"cost of a fit/{model}/{length}/core s"
+            for model, lengths in LENGTHS.items()
+            for length in lengths
+        ),
+    )
+
+
+def test_what_drives_tell_is_what_the_last_full_run_found() -> None:
+    rows = [line.split("|")[2:-1] for line in block("numbers: drives").strip().splitlines()[2:]]
+    for row, drive in zip(rows, DRIVES, strict=True):
+        for cell, name in zip(row, ("d", "alpha", "beta", "gamma", "lag"), strict=True):
+            found = measured()["what drives tell"][drive]
+            for text, readings in zip(cell.split("/"), ("100", "10000"), strict=True):
+                assert quotes(text.strip(), found[readings][name]), (drive, name)
+
+
+METHODS = (ROOT / "runs" / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_methods_state_the_priors_of_the_code() -> None:
+    """For a record whose half ranges and time between reversals are one."""
+    one = Context(Ranges(1.0, 1.0, 0.0, 1.0), {})
+    declared = [*BoucWen().parameters, *DiscrepancyNoise(1.0).declarations]
+    default = {each.name: each.default(one) for each in declared}
+    symbols = {"d": "d", "alpha": "α", "beta": "β", "sensor_sd": "sensor noise s"}
+    symbols |= {
+        "discrepancy_sd": "model discrepancy σ",
+        "discrepancy_time": "its correlation time τ",
+    }
+    for name, symbol in symbols.items():
+        prior = default[name]
+        assert isinstance(prior, Distribution)
+        (row,) = (line for line in METHODS.splitlines() if line.startswith(f"| {symbol} | "))
+        median, sigma = (float(prior.arguments[key]) for key in ("median", "sigma"))
+        assert re.search(rf"median {median:g}[ /]", row.replace("1e-5", "1e-05")), row
+        assert f"sigma {sigma:g}" in row
+    gamma = default["gamma"]
+    assert isinstance(gamma, Distribution)
+    assert gamma.arguments == {"mean": 0.0, "sd": 4.0}
+
+
+def test_the_methods_state_when_a_sampling_has_converged() -> None:
+    for requirement in (
+        f"| < {diagnostics.MAX_RHAT:g} |",
+        f"| < {diagnostics.MAX_WALKER_RHAT:g} |",
+        f"| {diagnostics.LENGTH} autocorrelation times |",
+        f"| < {diagnostics.MAX_PARETO_K:g} |",
+        f"| {SamplingConfig().ess:,.0f} by default |",
+        f"Each of {prediction.DRAWS:,} draws",
+    ):
+        assert requirement in METHODS, requirement
