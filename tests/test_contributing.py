@@ -9,7 +9,6 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,9 @@ import pytest
 
 import bwbayes
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis import effects, explanations
-from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
+from bwbayes.diagnosis import explanations
+from bwbayes.diagnosis.defects import DEFECTS, Defect
+from bwbayes.diagnosis.residual_analysis import ResidualAnalysis, Sighting
 from bwbayes.inference import map_estimate
 from bwbayes.inference.compiled.walk import walk
 from bwbayes.inference.noise import (
@@ -31,6 +31,7 @@ from bwbayes.inference.noise import (
     DiscrepancyNoise,
 )
 from bwbayes.inference.state_space import Noise
+from bwbayes.inference.study import Stated
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
 from bwbayes.model.operator import Span
@@ -169,12 +170,11 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: float
 ) -> None:
     """Before a vibration of any frequency, which has more to pay for; not in a good record."""
-    names = {"ResidualAnalysis": ResidualAnalysis, "add_shapes": effects.add_shapes, "np": np}
-    known: dict[str, Any] = {**names, "Iterator": Iterator, "Explanation": Explanation}
+    known: dict[str, Any] = {"Defect": Defect, "Sighting": Sighting, "Stated": Stated, "np": np}
     exec(example("my_defect.py"), known)
-    monkeypatch.setattr(
-        explanations, "ADDITIONS", (effects.oscillation, effects.drift, known["swaying_table"])
-    )
+    added = known["Swaying"]("swaying table", "oscillation", noise=True)
+    tried = (DEFECTS["oscillation"], DEFECTS["drift"], added)
+    monkeypatch.setattr(explanations, "ADDITIONS", [defect.explanations for defect in tried])
     monkeypatch.setattr(explanations, "CHANGES", ())
     record = plant("good", (5, 1), 4.0)
     assert record.displacement is not None
@@ -183,7 +183,9 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(1)
     optima = map_estimate.fit(problem.posterior, rng).optima
-    ranked = explanations.explain(ResidualAnalysis.of(problem.posterior, optima, rng))
+    ranked = explanations.explain(
+        ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
+    )
     causes = explanations.likely_causes(ranked)
     if size:
         assert (causes[0].kind, ranked[0].kind) == ("swaying table", "swaying table")

@@ -9,12 +9,13 @@ filter. Where residuals are too large, a cause has to bring most of that back. W
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
+from bwbayes.diagnosis.defects import DEFECTS
 from bwbayes.diagnosis.departures import ODDS
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.finding import Finding, join_findings
@@ -31,58 +32,12 @@ LEAD_IN_ALARM = 0.002
 # Time constants of a bad start, as fractions of the record, evenly probable.
 DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
 
-REVERSED_SIGN = Finding(
-    "sign", "reversed sign of the displacement", "change the sign of the displacement in the file"
-)
-REFIT = "fit this record itself, with the same config"
 # Of a training record, whose explanations are fitted: all other causes compare with training.
 UNEXPLAINED = Finding(
     "unknown",
     "unknown (no explanation takes most of the error away)",
     "look at the residuals in the figure, and compare other models of this record",
 )
-
-# What a cause is called, and what to do about it.
-WORDS: Mapping[str, tuple[str, str]] = {
-    "sign": (REVERSED_SIGN.text, REVERSED_SIGN.fix),
-    "outliers": (
-        "outliers",
-        "empty their cells in the file, at {spikes} s: they are missing readings then",
-    ),
-    "start": (
-        "the start of the record (large residuals until {settled} s)",
-        "set lead_in_start = {settled} in [validation.{name}], or predict with "
-        "--lead-in-start {settled}",
-    ),
-    "drift": (
-        "a drift of the readings",
-        "validate a shorter part: set window in [validation.{name}], or predict with --window",
-    ),
-    "step": (
-        "a jump of the offset by {jump} um at {jumped} s",
-        "validate one side: set window in [validation.{name}] to end or begin at {jumped}, or "
-        "predict with --window",
-    ),
-    "oscillation": (
-        "an oscillation of {swing} um at {line}",
-        "look for the source: mains, ground loops, vibration",
-    ),
-    "offset": (
-        "an offset of {size} um",
-        "set estimate_offset = true and a longer lead_in in [validation.{name}], or predict with "
-        "--lead-in and without --same-offset",
-    ),
-    "gain": ("another gain (another actuator, load or sensor range)", REFIT),
-    "delay": (
-        "a delay (another hold of the voltage, or dynamics that the model lacks)",
-        'set voltage_is to "command" or "output", whichever it is, in [validation.{name}]',
-    ),
-    "loop": ("loop-shaped residuals (model too simple, or a different actuator)", REFIT),
-    "noise": (
-        "noise of another size than in training",
-        "train on a record of this sensor with this sampling",
-    ),
-}
 
 
 def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Finding:
@@ -221,7 +176,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     }
     return [
         Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
-        for kind, (text, fix) in WORDS.items()
+        for kind, (text, fix) in ((kind, DEFECTS[kind].in_bands) for kind in nats)
         # What is named takes away most of what the bands do not allow, if that is much. Of a model
         # that is too simple these loops are a sign, and no full account.
         if kind == "loop"

@@ -15,28 +15,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from bwbayes.diagnosis import effects, model
+from bwbayes.diagnosis import model
+from bwbayes.diagnosis.defects import LONG_DELAY, QUICK, SLOW
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.watching import Watch, unwatched
 
-# A line an explanation: each yields what it finds of a fit. The first are small additions, which a
-# good fit refuses at once; the others explain what the discrepancy takes up.
+# Each yields what it finds of a fit. The first are small additions, which a good fit refuses at
+# once; the others explain what the discrepancy takes up.
 ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
-    effects.transient,
-    effects.drift,
-    effects.step,
-    effects.oscillation,
-    effects.moving_gain,
-    effects.reversed_sign,
-    effects.delay,
+    *(defect.explanations for defect in QUICK),
     model.prior,
     model.heavy_tails,
     model.growing_noise,
 )
 CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
-    effects.long_delay,
-    model.stages,
+    LONG_DELAY.explanations,
+    *(defect.explanations for defect in SLOW),
     model.nonlinearity,
     model.creep,
     model.dynamics,
@@ -45,19 +40,12 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.smooth,
 )
 
-# Those that a record without a clock may have.
-TIMELESS = (
-    effects.reversed_sign,
-    model.prior,
-    model.heavy_tails,
-    model.stages,
-    model.nonlinearity,
-    model.operator,
-)
+# Those that a record without a clock does not have, besides stages that count time.
+TIMED = (model.growing_noise, model.creep, model.dynamics, model.hold, model.smooth)
 
 # Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
-LIMIT = float(np.log(100 * len((*ADDITIONS, *CHANGES, *model.SEARCHED))))
+LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
 
 # Odds of twenty to one, nats: explanations nearer than this, or a fit without any, are tied.
 TIED = float(np.log(20))
@@ -79,8 +67,10 @@ def explain(
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
     looked_at, rough = scene, scene.with_rough_noise()
-    has_clock = scene.posterior.single_record.inputs.quantities.has_clock
-    kinds = [kind for kind in ADDITIONS + CHANGES if has_clock or kind in TIMELESS]
+    # What the actuator is, several records say together.
+    kinds = (*ADDITIONS, *(CHANGES if scene.alone else CHANGES[:1]))
+    if not scene.posterior.single_record.inputs.quantities.has_clock:
+        kinds = tuple(kind for kind in kinds if kind not in TIMED)
     for number, kind in enumerate(kinds):
         if time.process_time() > until:
             break

@@ -5,31 +5,27 @@ Another model has its own evidence; noise may have heavy tails, or be more where
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import conflict_fix
-from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
+from bwbayes.diagnosis.residual_analysis import (
+    Explanation,
+    ResidualAnalysis,
+    Sighting,
+    lines,
+)
 from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.outliers import LIMIT, MOST
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
-from bwbayes.model.registry import HYSTERESIS, STAGES
-from bwbayes.model.spec import ModelSpec
-
-# Stages that are tried beside any model; those of a time are tried as effects.
-EFFECTS = ("moving-gain", "reversed-sign", "drift", "transient", "step", "oscillation")
-SEARCHED = {name: make for name, make in STAGES.items() if name not in EFFECTS}
+from bwbayes.model.registry import HYSTERESIS
 
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -38,13 +34,13 @@ def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
     present = set(nonlinearity.terms) if nonlinearity else set()
     for terms in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
         if not present.issuperset(terms) and present.issubset(terms):
-            yield from _changed(scene, f"{' and '.join(terms)} nonlinearity", terms)
+            yield from scene.changed(f"{' and '.join(terms)} nonlinearity", stages=terms)
 
 
 def creep(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try slow lags."""
     if scene.posterior.single_record.actuator.creep is None:
-        yield from _changed(scene, "creep", ("creep",))
+        yield from scene.changed("creep", stages=("creep",))
 
 
 def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -53,43 +49,27 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
         return
     frequency = 10 / scene.turn_time
     stiffness, damping = ((2 * np.pi * frequency) ** power for power in (2, 1))
-    yield from _changed(
-        scene,
-        "second-order dynamics",
-        ("second-order",),
-        stated={
-            "mass": Stated(fixed=1.0),
-            "stiffness": Stated(lognormal(stiffness, 2.0)),
-            "damping": Stated(lognormal(damping, 2.0)),
-        },
-        starts=[{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)],
-    )
-
-
-def stages(scene: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try each stage before or behind the hysteresis that the model has not."""
-    present = scene.study.spec.chain if scene.study is not None else ()
-    for name, make in SEARCHED.items():
-        stage, kind = make(), name.replace("-", " ")
-        inputs = scene.posterior.single_record.inputs
-        if name in present or not inputs.has(stage.sees):
-            continue
-        if not (stage.rate_independent or inputs.quantities.has_clock):
-            continue
-        yield from _changed(scene, stage.describe, (name,), kind, stage.advice, starts=stage.starts)
+    stated = {
+        "mass": Stated(fixed=1.0),
+        "stiffness": Stated(lognormal(stiffness, 2.0)),
+        "damping": Stated(lognormal(damping, 2.0)),
+    }
+    starts = [{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)]
+    sighting = Sighting(stated, starts)
+    yield from scene.changed("second-order dynamics", "", ("second-order",), sighting)
 
 
 def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
     """Try the model without each of these stages: a gain says that it is not needed."""
     for name in names:
         # Another operator, hold or noise has taken the place of one.
-        if scene.study is None or name not in {*scene.study.spec.chain} - {*HYSTERESIS}:
+        if name not in {*scene.study.spec.chain} - {*HYSTERESIS}:
             continue
         spec = scene.study.spec.without(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
         rows = [scene.posterior.names.index(one) for one in posterior.names]
-        fit = scene.extended(posterior=posterior, places=scene.places[:, rows])
-        fix = _lines(scene.study.spec, spec)
+        fit = scene.extended(posterior, scene.places[:, rows])
+        fix = lines(scene.study.spec, spec)
         yield scene.explained(name, f"no {name}", fix, fit, spec=spec)
 
 
@@ -99,7 +79,7 @@ def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
     text = "voltage that is held between samples"
     if other == "first":
         text = "voltage that changes steadily between samples"
-    yield from _changed(scene, text, (), "hold", hold=other)
+    yield from scene.changed("hold", text, hold=other)
 
 
 def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -109,65 +89,22 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
     # formula has.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
         kind = f"operator {name}"
-        if scene.study is None or HYSTERESIS[name] is present or not scene.looks_for(kind):
+        if HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
         spec = scene.study.spec.with_stages(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
         # One start finds the best place for nearly all records, in half of the time of five.
         places = map_estimate.local_minima(posterior, scene.generator, 1)
-        fit = scene.extended(posterior=posterior, places=places)
+        fit = scene.extended(posterior, places)
         text = f"another operator, {name}"
-        fix = _lines(scene.study.spec, spec)
+        fix = lines(scene.study.spec, spec)
         yield scene.explained(kind, text, fix, fit, spec=spec, coordinates=fit.coordinates)
 
 
 def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try a discrepancy without corners, in place of a rough one."""
     if isinstance(scene.posterior.single_record.noise, DiscrepancyNoise) and scene.before is None:
-        facts = {"noise": True}
-        yield from _changed(scene, "a smooth discrepancy", (), facts=facts, noise="smooth")
-
-
-def _changed(
-    scene: ResidualAnalysis,
-    text: str | Callable[[Mapping[str, float]], str],
-    stages: Sequence[str],
-    kind: str = "",
-    advice: str = "",
-    stated: Mapping[str, Stated] = MappingProxyType({}),
-    starts: Sequence[Mapping[str, float]] = ({},),
-    facts: Mapping[str, Any] = MappingProxyType({}),
-    **parts: Any,
-) -> Iterator[Explanation]:
-    """Fit the model with further stages from the mode; new parameters start at their medians.
-
-    ``text`` says what was found, of the parameters' values by name, if it hangs on them; ``advice``
-    is what else can be done. ``parts`` are another noise or hold; ``facts`` are other fields of the
-    explanation.
-    """
-    kind = kind or str(text)
-    if scene.study is None or not scene.looks_for(kind):
-        return
-    spec = replace(scene.study.spec, **parts).with_stages(*stages)
-    posterior = scene.rebuilt(scene.study.with_model(spec, stated))
-    places = []
-    for coordinates, start in product(scene.places, starts):
-        values = {**dict(zip(scene.posterior.names, coordinates, strict=True)), **start}
-        places.append([values.get(name, 0.0) for name in posterior.names])
-    fit = scene.extended(posterior=posterior, places=np.array(places))
-    if not fit.follows:
-        return
-    fix = _lines(scene.study.spec, spec)
-    if stated:
-        fix += f", with what is known of {', '.join(stated)} in [parameters]"
-    if advice:
-        fix = f"{advice}, or {fix}"
-    if not isinstance(text, str):
-        theta = posterior.prior.theta(fit.free[np.newaxis])[0].tolist()
-        text = text(dict(zip(posterior.table.names, theta, strict=True)))
-    yield scene.explained(
-        kind, text, fix, fit, spec=spec, stated=stated, coordinates=fit.coordinates, **facts
-    )
+        yield from scene.changed("a smooth discrepancy", flags={"noise": True}, noise="smooth")
 
 
 def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -175,7 +112,7 @@ def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
     Whether the fit has left the prior, or what else it has has made up for it.
     """
-    before, defaults = scene.posterior.prior, scene.study.defaults if scene.study else {}
+    before, defaults = scene.posterior.prior, scene.study.defaults if scene.alone else {}
     for parameter in before.free:
         default = defaults.get(parameter.name)
         if default is None or parameter.prior == default:
@@ -186,16 +123,10 @@ def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
             posterior.prior.unconstrain(before.constrain(scene.places)[0]),
             map_estimate.local_minima(posterior, scene.generator, 1),
         ]
-        fit = scene.extended(posterior=posterior, places=np.concatenate(places))
+        fit = scene.extended(posterior, np.concatenate(places))
         text = f"prior of {parameter.name}, {parameter.prior}, that excludes the record's value"
         fix = conflict_fix(parameter.name, default)
         yield scene.explained(f"prior of {parameter.name}", text, fix, fit, foreign=True)
-
-
-def _lines(before: ModelSpec, after: ModelSpec) -> str:
-    """Return the lines of config that change a model."""
-    changes = before.changes_to(after).items()
-    return f"set {', '.join(f'{key} = {json.dumps(value)}' for key, value in changes)} in [model]"
 
 
 def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -209,11 +140,10 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
     fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
     # Not where they are few and far off: tails that hold those would be too heavy for the others.
-    study = scene.study
-    tailed = study is not None and scene.posterior.single_record.noise.tailed
-    if study is not None and not tailed and nats > isolated_nats(white):
-        spec = replace(study.spec, noise=f"{study.spec.noise} + student")
-        fix = _lines(study.spec, spec)
+    before, tailed = scene.study.spec, scene.posterior.single_record.noise.tailed
+    if scene.alone and not tailed and nats > isolated_nats(white):
+        spec = replace(before, noise=f"{before.noise} + student")
+        fix = lines(before, spec)
     yield Explanation(
         "heavy tails",
         text,

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
+from bwbayes.diagnosis.defects import DEFECTS, late_fix, settle_fix
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.loopfit import LONG_DECAY, LoopFit, find_delay, fit_loop
 from bwbayes.diagnosis.series_patterns import (
@@ -196,7 +197,7 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
         fix = _exclude(record, rows, FrozenRun(first, last))
         samples[rows[np.repeat(shifted, np.diff(edges))]] = True
     start, stop = record.time[rows[at[0]]], record.time[rows[at[-1]]] + record.interval
-    return Finding("jump", text, fix, float(start), float(stop)), samples
+    return Finding(DEFECTS["step"].finding, text, fix, float(start), float(stop)), samples
 
 
 def _exclude(record: Record, rows: IntArray, stuck: FrozenRun) -> str:
@@ -230,8 +231,8 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
     together = float((voltage - voltage.mean()) @ (displacement - displacement.mean()))
     if loop.gain < 0 and together < 0:
         text = f"the displacement falls by {-loop.gain:.3g} um where the voltage rises by 1 V"
-        fix = "change the sign of the displacement's column in the file"
-        yield _whole(record, "reversed sign", text, fix)
+        sign = DEFECTS["sign"]
+        yield _whole(record, sign.finding, text, sign.in_bands[1])
         leads = not leads if leads is not None else None
     if leads:
         text = "the displacement turns before the voltage does"
@@ -259,14 +260,8 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
         return None
     name = "displacement" if delay > 0 else "voltage"
     text = f"the {name} is late by about {1e3 * abs(delay):.2g} ms"
-    return _whole(record, f"late {name}", text, late_fix(delay, record.interval))
-
-
-def late_fix(delay: float, interval: float) -> str:
-    """Return what to do where the displacement comes ``delay`` s after what the voltage does."""
-    rows = max(round(abs(delay) / interval), 1)
-    name = "displacement" if delay > 0 else "voltage"
-    return f"move the {name}'s column up by {rows} row{'s' * (rows > 1)} in the file"
+    kind = f"{DEFECTS['delay'].finding} {name}"
+    return _whole(record, kind, text, late_fix(delay, record.interval))
 
 
 def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
@@ -422,18 +417,7 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     )
     kept_from = int(np.searchsorted(record.time, over))
     fix = settle_fix(record.voltage, kept_from, f"start = {record.clock(over)} under [record]")
-    yield Finding("switch-on transient", text, fix, begin, over)
-
-
-def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:
-    """Return the line that leaves a start of ``settled`` samples out, unless it is too dear.
-
-    A start that holds more than a twentieth of the drive's path is not left out.
-    """
-    steps = np.abs(np.diff(voltage, prepend=voltage[0]))
-    if steps[:settled].sum() > 0.05 * steps.sum():
-        return "measure again once the displacement has settled"
-    return leave_out
+    yield Finding(DEFECTS["transient"].finding, text, fix, begin, over)
 
 
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
@@ -445,4 +429,6 @@ def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
     if share > 0.03 and abs(size) > threshold:
         text = f"at equal voltages the displacement moves by {size:+.3g} um over the record"
         fix = "let it warm up, fit a shorter part (train = [[start, stop]] under [record])"
-        yield _whole(record, "drift", text, f"{fix}, or take the trend out of the file")
+        yield _whole(
+            record, DEFECTS["drift"].finding, text, f"{fix}, or take the trend out of the file"
+        )

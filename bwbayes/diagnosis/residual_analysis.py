@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from itertools import product
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.innovations import innovations
-from bwbayes.diagnosis.laplace import NONE, Effect, LocalFit, climb
+from bwbayes.diagnosis.laplace import LocalFit, climb
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.map_estimate import SAMPLES
@@ -37,6 +40,21 @@ from bwbayes.shown import rounded
 READINGS = 4_000
 
 
+class Sighting(NamedTuple):
+    """From where another model is fitted.
+
+    ``stated`` is said of its new parameters. They start at ``starts``, normal scores by name, and
+    the others at ``places`` (places, free), by default where the fit is. The choice costs ``cost``
+    nats; ``note`` is added to what is said.
+    """
+
+    stated: Mapping[str, Stated] = {}
+    starts: Sequence[Mapping[str, float]] = ({},)
+    places: FloatArray | None = None
+    cost: float = 0.0
+    note: str = ""
+
+
 @dataclass(frozen=True)
 class Explanation(Finding):
     """An extension of a fitted model, worth ``nats`` of log evidence.
@@ -45,8 +63,8 @@ class Explanation(Finding):
     that of the readings that were held out, nan without any. ``shift`` is by how many sds of both
     fits the actuator's parameter moves that moves most. What is ``foreign`` the actuator has not
     done, so that a fit without it has followed it. What is ``noise`` leaves the displacement as it
-    is. ``spec`` is the model that it is a part of, ``stated`` what is stated of new parameters, and
-    ``coordinates`` (free,) where that was fitted.
+    is. ``spec`` is the model that it is a part of, ``stated`` what is stated of new parameters,
+    ``coordinates`` (free,) where that was fitted, and ``cost`` what its choice costs, nats.
     """
 
     rmse: tuple[float, float] = (np.nan, np.nan)
@@ -57,6 +75,7 @@ class Explanation(Finding):
     spec: ModelSpec | None = None
     stated: Mapping[str, Stated] = field(default_factory=dict)
     coordinates: FloatArray | None = field(default=None, repr=False, compare=False)
+    cost: float = 0.0
 
     @property
     def mends(self) -> bool:
@@ -115,12 +134,14 @@ class ResidualAnalysis:
         Coordinates (places, free) to climb from, those of the fit first.
     generator
         Starts the point fits of other models.
+    study
+        The study of the record, which gives other models.
     held_out
         Windows of the record that were held out.
     begin
         Time of the record's first sample, s.
-    study
-        The study of the record, which gives other models, if these are asked.
+    alone
+        Whether no other record is fitted: the actuator's model is one of all of them.
     before
         Fit that explanations are compared with, if it is another one.
     kinds
@@ -131,9 +152,10 @@ class ResidualAnalysis:
     whole: Posterior
     places: FloatArray
     generator: np.random.Generator
+    study: Study
     held_out: tuple[slice, ...] = ()
     begin: float = 0.0
-    study: Study | None = None
+    alone: bool = True
     before: LocalFit | None = None
     kinds: frozenset[str] | None = None
 
@@ -143,9 +165,11 @@ class ResidualAnalysis:
         posterior: Posterior,
         optima: FloatArray,
         generator: np.random.Generator,
+        study: Study,
         held_out: Sequence[slice] = (),
         begin: float = 0.0,
-        study: Study | None = None,
+        *,
+        alone: bool = True,
     ) -> ResidualAnalysis:
         """Fit a posterior of one record once more, from its optima (optima, free).
 
@@ -181,7 +205,7 @@ class ResidualAnalysis:
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = best.distinct(places)
         held_out = thin_windows(held_out, stride_of(posterior, whole))
-        return cls(best, whole, starts, generator, held_out, begin, study)
+        return cls(best, whole, starts, generator, study, held_out, begin, alone)
 
     def of_beginning(self) -> ResidualAnalysis:
         """Return the same of a long record's beginning, if the record cannot be thinned.
@@ -192,7 +216,7 @@ class ResidualAnalysis:
             return self
         short = beginning(self.whole, SAMPLES)
         return ResidualAnalysis.of(
-            short, self.places, self.generator, begin=self.begin, study=self.study
+            short, self.places, self.generator, self.study, begin=self.begin, alone=self.alone
         )
 
     def with_rough_noise(self) -> ResidualAnalysis | None:
@@ -201,7 +225,7 @@ class ResidualAnalysis:
         A smooth discrepancy takes up what an explanation is to explain, and no climb leads from
         there to where it leaves that to the explanation.
         """
-        if self.study is None or not isinstance(self.posterior.single_record.noise, SmoothNoise):
+        if not self.alone or not isinstance(self.posterior.single_record.noise, SmoothNoise):
             return None
         rough = replace(self.study.spec, noise="discrepancy")
         study = self.study.with_model(rough)
@@ -306,7 +330,7 @@ class ResidualAnalysis:
 
     def rebuilt(self, study: Study) -> Posterior:
         """Return the posterior of another model and the same readings."""
-        rebuilt, readings = study.posterior, self.posterior.single_record.displacement
+        rebuilt, readings = self._of_whole(study), self.posterior.single_record.displacement
         posterior = replace(rebuilt, datasets=(thin(rebuilt.single_record, self.stride),))
         if (
             self.stride > 1
@@ -320,19 +344,70 @@ class ResidualAnalysis:
             displacement=readings, training=self.posterior.single_record.training
         )
 
-    def extended(
-        self,
-        effect: Effect = NONE,
-        posterior: Posterior | None = None,
-        places: FloatArray | None = None,
-    ) -> LocalFit:
-        """Fit the model with an effect, or another model from places of its own.
+    def _of_whole(self, study: Study) -> Posterior:
+        """Return the posterior of another model of the whole record."""
+        if self.alone:
+            return study.posterior
+        # The other records have a say in what the actuator counts from.
+        stages = study.posterior.single_record.actuator.stages
+        actuator = replace(self.whole.single_record.actuator, stages=stages)
+        return study.posterior.altered(actuator=actuator)
+
+    def extended(self, posterior: Posterior, places: FloatArray) -> LocalFit:
+        """Fit another model from places of its own.
 
         As long as it may become more probable than the fit by a nat: less pays for no parameter.
         """
-        posterior = self.posterior if posterior is None else posterior
-        places = self.places if places is None else places
-        return climb(posterior, places, effect, self.fit.log_density + 1.0)
+        return climb(posterior, places, self.fit.log_density + 1.0)
+
+    def changed(
+        self,
+        kind: str,
+        words: str | Callable[[Mapping[str, float]], tuple[str, str]] = "",
+        stages: Sequence[str] = (),
+        sighting: Sighting = Sighting(),  # noqa: B008  # never written to
+        flags: Mapping[str, bool] = MappingProxyType({}),
+        **parts: Any,
+    ) -> Iterator[Explanation]:
+        """Fit the model with further stages, or another noise or hold, by ``parts``.
+
+        ``words`` are the text, by default the kind, or say text and advice of the parameters'
+        values by name; ``flags`` are fields of the explanation. There is none of a model that does
+        not follow the readings.
+        """
+        if not self.looks_for(kind):
+            return
+        spec, stated = replace(self.study.spec, **parts).with_stages(*stages), sighting.stated
+        posterior = self.rebuilt(self.study.with_model(spec, stated))
+        before = self.places if sighting.places is None else sighting.places
+        places = []
+        for coordinates, start in product(before, sighting.starts):
+            values = {**dict(zip(self.posterior.names, coordinates, strict=True)), **start}
+            places.append([values.get(name, 0.0) for name in posterior.names])
+        fit = self.extended(posterior, np.array(places))
+        if not fit.follows:
+            return
+        text, advice = words or kind, ""
+        if not isinstance(words, str):
+            theta = posterior.prior.theta(fit.free[np.newaxis])[0].tolist()
+            text, advice = words(dict(zip(posterior.table.names, theta, strict=True)))
+        fix = lines(self.study.spec, spec)
+        if stated:
+            fix += f", with what is known of {', '.join(stated)} in [parameters]"
+        if advice:
+            fix = advice if any(flags.values()) else f"{advice}, or {fix}"
+        yield self.explained(
+            kind,
+            f"{text}{sighting.note}",
+            fix,
+            fit,
+            sighting.cost,
+            shift=self._shift(fit),
+            spec=spec,
+            stated=stated,
+            coordinates=fit.coordinates,
+            **flags,
+        )
 
     def confirmed(self, explanation: Explanation) -> Explanation:
         """Weigh another model on all readings, if the scene looked at some of them."""
@@ -341,12 +416,12 @@ class ResidualAnalysis:
             < self.whole.single_record.readings.rows.size
         )
         spec, coordinates = explanation.spec, explanation.coordinates
-        if not is_short or self.study is None or spec is None or coordinates is None:
+        if not is_short or spec is None or coordinates is None:
             return explanation
-        other = self.study.with_model(spec, explanation.stated).posterior
+        other = self._of_whole(self.study.with_model(spec, explanation.stated))
         fit, before = climb(other, coordinates), self._on_all
-        rmse, nats = (before.rmse, fit.rmse), fit.log_evidence - before.log_evidence
-        return replace(explanation, nats=nats, rmse=rmse)
+        nats = fit.log_evidence - before.log_evidence - explanation.cost
+        return replace(explanation, nats=nats, rmse=(before.rmse, fit.rmse))
 
     @cached_property
     def _on_all(self) -> LocalFit:
@@ -355,30 +430,12 @@ class ResidualAnalysis:
         return climb(self.whole, before.coordinates)
 
     def explained(
-        self,
-        kind: str,
-        text: str,
-        fix: str,
-        fit: LocalFit,
-        cost: float = 0.0,
-        **facts: Any,
+        self, kind: str, text: str, fix: str, fit: LocalFit, cost: float = 0.0, **facts: Any
     ) -> Explanation:
         """Compare a fit with that without any extension.
 
         ``cost`` nats are those of its choice; ``facts`` are other fields of the explanation.
         """
-        shift = 0.0
-        if fit.posterior is self.posterior:
-            # The largest shift of the actuator's parameters, in sds of both fits together.
-            of_record = self.posterior.single_record.table.of_scope("record", "event")
-            rows = [
-                row
-                for row, name in enumerate(self.posterior.names)
-                if name in self.posterior.table.physical and name not in of_record
-            ]
-            variance = np.diag(self.fit.covariance)[rows] + np.diag(fit.covariance)[rows]
-            moved = np.abs(fit.coordinates[rows] - self.fit.coordinates[rows]) / np.sqrt(variance)
-            shift = float(np.max(moved, initial=0.0))
         return Explanation(
             kind,
             text,
@@ -386,6 +443,31 @@ class ResidualAnalysis:
             nats=fit.log_evidence - self.fit.log_evidence - self.lead - cost,
             rmse=(self.without[0], fit.rmse),
             held_out=(self.without[1], fit.error(self.held_out)),
-            shift=shift,
+            cost=cost,
             **facts,
         )
+
+    def _shift(self, fit: LocalFit) -> float:
+        """Return the largest shift of the actuator's parameters, in sds of both fits together.
+
+        Of those that both fits have, with the same priors.
+        """
+        ours, theirs = self.posterior, fit.posterior
+        of_record = ours.single_record.table.of_scope("record", "event")
+        priors = dict(zip(theirs.names, theirs.prior.free, strict=True))
+        shared = [
+            (row, theirs.names.index(parameter.name))
+            for row, parameter in enumerate(ours.prior.free)
+            if parameter.name in {*ours.table.physical} - {*of_record}
+            and priors.get(parameter.name) == parameter
+        ]
+        rows, columns = np.array(shared, dtype=np.intp).reshape(-1, 2).T
+        variance = np.diag(self.fit.covariance)[rows] + np.diag(fit.covariance)[columns]
+        moved = np.abs(fit.coordinates[columns] - self.fit.coordinates[rows]) / np.sqrt(variance)
+        return float(np.max(moved, initial=0.0))
+
+
+def lines(before: ModelSpec, after: ModelSpec) -> str:
+    """Return the lines of config that change a model."""
+    changes = before.changes_to(after).items()
+    return f"set {', '.join(f'{key} = {json.dumps(value)}' for key, value in changes)} in [model]"

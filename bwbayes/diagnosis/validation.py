@@ -28,7 +28,8 @@ from typing import Any, Self
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import LEAD_IN_ALARM, REVERSED_SIGN, UNEXPLAINED, cause
+from bwbayes.diagnosis.causes import LEAD_IN_ALARM, UNEXPLAINED, cause
+from bwbayes.diagnosis.defects import DEFECTS
 from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import Finding, join_findings
@@ -257,7 +258,7 @@ def validate_bands(
         mending = [explanation for explanation in explanations if explanation.mends or not missed]
         why = join_findings(likely_causes(mending))
         if why is None and reasons[0].startswith("the readings fall"):
-            why = REVERSED_SIGN
+            why = Finding("sign", *DEFECTS["sign"].in_bands)
         elif why is None:
             why = UNEXPLAINED if bands.training else cause(bands, background.memory, beyond)
         return replace(doubted, passed=False, reasons=tuple(reasons), cause=why)

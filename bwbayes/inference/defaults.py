@@ -36,6 +36,7 @@ def ranges_of(
     volts = np.concatenate([inputs.voltage[window] for window in windows])
     readings = np.concatenate([displacement[window] for window in windows])
     low, high = float(np.nanmin(readings)), float(np.nanmax(readings))
+    rows = np.concatenate([np.arange(inputs.samples)[window] for window in windows])
     return Ranges(
         voltage=float(np.ptp(volts)) / 2,
         displacement=(high - low) / 2,
@@ -46,6 +47,7 @@ def ranges_of(
         duration=volts.size * inputs.interval,
         rounding=rounding_sd(readings[~np.isnan(readings)]),
         resolution=resolution_sd(readings[~np.isnan(readings)]),
+        begin=inputs.interval * float(rows[np.isfinite(displacement[rows])][0]),
         covariates={name: inputs.range_of(name, windows) for name in inputs.covariates},
     )
 
@@ -104,6 +106,7 @@ def join_ranges(records: Sequence[Ranges]) -> Ranges:
         duration=max(record.duration for record in records),
         rounding=min(record.rounding for record in records),
         resolution=min(record.resolution for record in records),
+        begin=min(record.begin for record in records),
         covariates={
             name: (
                 min(record.covariates[name][0] for record in records),

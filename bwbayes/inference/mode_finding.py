@@ -90,7 +90,7 @@ class Target:
 
     @property
     def size(self) -> int:
-        """How many coordinates there are; those of the posterior come first."""
+        """How many coordinates there are."""
         return len(self.posterior.names)
 
     @cached_property
@@ -108,15 +108,6 @@ class Target:
         """θ (models, parameters) and log prior (models,) of coordinates (models, size)."""
         return self.posterior.prior.theta_at(coordinates)
 
-    def simulate(
-        self,
-        theta: FloatArray,
-        log_prior: FloatArray,
-        coordinates: FloatArray,  # noqa: ARG002  # of more than the posterior's
-    ) -> FloatArray:
-        """Displacement (models, readings), um, nan where the prior is zero."""
-        return self.posterior.displacement(theta, log_prior)
-
     def noise_density(self, coordinates: FloatArray, displacement: FloatArray) -> FloatArray:
         """Log density (models,) where models have these displacements (any, readings) in turn."""
         theta, density = self.prior(coordinates)
@@ -130,19 +121,19 @@ class Target:
     def at(self, coordinates: FloatArray) -> list[Iterate]:
         """Return the states at coordinates (states, size)."""
         theta, density = self.prior(coordinates)
-        possible, moved = np.isfinite(density), self.simulate(theta, density, coordinates)
+        possible, moved = np.isfinite(density), self.posterior.displacement(theta, density)
         if possible.any():
             score = self.posterior.score(theta[possible], moved[:0], moved[possible])
             density[possible] += score.log_density
         density = np.where(np.isfinite(density), density, -np.inf)
         return [Iterate(*state) for state in zip(coordinates, density.tolist(), moved, strict=True)]
 
-    def round(self, states: Sequence[Iterate], noise_steps: int) -> list[Iterate]:
+    def round(self, states: Sequence[Iterate]) -> list[Iterate]:
         """Climb a round from states side by side: in the noise's coordinates, then in the others.
 
-        So many steps at most in the noise's, one of Fisher scoring in the others.
+        Some steps in the noise's, one of Fisher scoring in the others.
         """
-        states = self.step_noise(states, noise_steps)
+        states = self.step_noise(states)
         coordinates = np.stack([state.coordinates for state in states])
         linear = self.linearize(coordinates, np.stack([state.displacement for state in states]))
         gradients = linear.gradient - coordinates[:, self.physical]
@@ -175,7 +166,7 @@ class Target:
         """
 
         def simulate(places: FloatArray) -> FloatArray:
-            return self.simulate(*self.prior(places), places)
+            return self.posterior.displacement(*self.prior(places))
 
         here, slopes = value_and_jacobian(simulate, coordinates, self.physical, displacement)
         readings = np.concatenate([record.readings.values for record in self.posterior.datasets])
@@ -270,15 +261,13 @@ def climb(
     target: Target,
     starts: FloatArray,
     least: float = -np.inf,
-    many_steps: int = NOISE_STEPS,
     watch: Watch = unwatched,
 ) -> Iterate:
     """Climb from starts (starts, size) side by side, to a state near the mode of the best one.
 
     The one that leads after :data:`FIRST_ROUNDS` goes on alone. Each ends where it gains so little
-    that it would never reach a log density of ``least``. A round has ``many_steps`` in the noise's
-    coordinates while there are several. Where no start is possible, that is the state. ``watch``
-    is called with the share of the most rounds that is done.
+    that it would never reach a log density of ``least``. Where no start is possible, that is the
+    state. ``watch`` is called with the share of the most rounds that is done.
     """
     initial_states = target.at(starts)
     climbing = [state for state in initial_states if np.isfinite(state.density)]
@@ -286,7 +275,7 @@ def climb(
     for number in watched(range(1, ROUNDS + FIRST_ROUNDS + 1), watch):
         if not climbing:
             break
-        ahead = target.round(climbing, many_steps if len(climbing) > 1 else NOISE_STEPS)
+        ahead = target.round(climbing)
         gains = [
             state.density - before.density for state, before in zip(ahead, climbing, strict=True)
         ]

@@ -27,7 +27,7 @@ from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import OFFSET
-from bwbayes.model.declaration import Context, Declaration
+from bwbayes.model.declaration import Context, Declaration, Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.operator import Span
 from bwbayes.model.registry import PARTS
@@ -76,6 +76,11 @@ class TrainingRecord:
         """The displacement (samples,), um, of a record that has one."""
         assert self.record.displacement is not None
         return self.record.displacement
+
+    @cached_property
+    def ranges(self) -> Ranges:
+        """What default priors may know of its windows."""
+        return ranges_of(self.record.inputs, self.displacement, self.windows)
 
 
 @dataclass(frozen=True)
@@ -222,14 +227,7 @@ class Study:
         InputError
             Voltage or displacement does not vary there, in any of them.
         """
-        ranges = {
-            name: ranges_of(
-                training.record.inputs,
-                training.displacement,
-                training.windows,
-            )
-            for name, training in self.records.items()
-        }
+        ranges = {name: training.ranges for name, training in self.records.items()}
         varied = [
             extents
             for extents in ranges.values()

@@ -31,7 +31,15 @@ from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, build_part
-from bwbayes.model.stage import Advance, Side, Stage, Timing, begin_stages, pass_stages
+from bwbayes.model.stage import (
+    Advance,
+    Side,
+    Stage,
+    Timing,
+    advance_stage,
+    begin_stages,
+    pass_stages,
+)
 from bwbayes.shown import brief
 
 OFFSET = Declaration(
@@ -340,7 +348,7 @@ class Actuator:
         column: Values,
         inputs: Inputs,
         memories: tuple[FloatArray, ...],
-        advance: Advance = Stage.advance,
+        advance: Advance = advance_stage,
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
         """Return what the stages before the hysteresis make of the voltage (samples,), V.
 

@@ -35,10 +35,10 @@ class Ranges:
     ``voltage`` is U, half the range of the voltage, V; ``displacement`` is Y, um; ``middle`` the
     middle of the displacement's range, um; ``time`` is T, the typical time between turning points
     of the drive, s; ``bias`` the middle of the voltage's range, V; ``interval`` between samples and
-    ``duration`` of the record, s. ``rounding`` is the sd of the rounding of readings that show no
-    other noise, um; 0 where they show some. ``resolution`` is the least sd of a sensor whose
-    readings jump too often to show their noise, um; 0 where they show it. ``covariates`` are the
-    least and the largest value of each, by name.
+    ``duration`` of the record, s; ``begin`` the time of its first reading, s. ``rounding`` is the
+    sd of the rounding of readings that show no other noise, um; 0 where they show some.
+    ``resolution`` is the least sd of a sensor whose readings jump too often to show their noise,
+    um; 0 where they show it. ``covariates`` are the least and the largest value of each, by name.
     """
 
     voltage: float
@@ -50,6 +50,7 @@ class Ranges:
     duration: float = 0.0
     rounding: float = 0.0
     resolution: float = 0.0
+    begin: float = 0.0
     covariates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def middle_of(self, covariate: str) -> float:

@@ -61,6 +61,15 @@ class Inputs:
     voltage_is: VoltageIs = "output"
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
     quantities: Quantities = field(default=DEFAULT, repr=False)
+    _around: tuple[FloatArray, int] | None = field(default=None, init=False, repr=False)
+
+    @property
+    def around(self) -> tuple[FloatArray, int]:
+        """The voltage, V, of which this one is a part, and the first sample of that part.
+
+        A slice knows what goes before it and behind it; other inputs are all that there is.
+        """
+        return self._around or (self.voltage, 0)
 
     @property
     def samples(self) -> int:
@@ -90,12 +99,16 @@ class Inputs:
     def __getitem__(self, samples: slice) -> Self:
         """Return some of the samples, on the same clock."""
         first, _, step = samples.indices(self.samples)
-        return replace(
+        part = replace(
             self,
             **self.each_series(lambda values: values[samples]),
             interval=self.interval * step,
             start=self.start + self.interval * first,
         )
+        if step == 1:
+            whole, begin = self.around
+            object.__setattr__(part, "_around", (whole, begin + first))
+        return part
 
     def followed_by(self, other: Inputs) -> Self:
         """Return these samples and then those of others, which are as far apart.

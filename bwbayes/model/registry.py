@@ -30,6 +30,7 @@ from bwbayes.model.operators.preisach import Preisach
 from bwbayes.model.stage import Stage
 from bwbayes.model.stages.additions import Drift, OffsetStep, Oscillation, Transient
 from bwbayes.model.stages.backlash import Backlash
+from bwbayes.model.stages.delay import Delay
 from bwbayes.model.stages.gain import Heating, MovingGain, Temperature
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.model.stages.reversed_sign import ReversedSign
@@ -69,6 +70,7 @@ DYNAMICS: Mapping[str, Callable[..., Filter]] = {
 STAGES: Mapping[str, Callable[..., Stage]] = {
     stage.name: stage
     for stage in (
+        Delay,
         AmplifierLag,
         SlewLimit,
         Saturation,

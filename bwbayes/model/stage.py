@@ -191,6 +191,17 @@ Advance = Callable[
 """Runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
 
 
+def advance_stage(
+    stage: Stage,
+    numbers: FloatArray,
+    memory: FloatArray,
+    values: FloatArray,
+    seen: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a stage's own :meth:`Stage.advance` does."""
+    return stage.advance(numbers, memory, values, seen)
+
+
 def begin_stages(
     stages: Sequence[Stage],
     column: Values,
@@ -215,7 +226,8 @@ def begin_stages(
             memory = at_rest if stage.rate_independent else stage.settled(numbers, first)[1]
             rest_value = rested
         memories.append(memory)
-        first = stage.advance(numbers, memory, first[:, np.newaxis])[0][:, 0]
+        seen = stage.seen(inputs[:1])
+        first = stage.advance(numbers, memory, first[:, np.newaxis], seen)[0][:, 0]
     return tuple(memories)
 
 
@@ -261,7 +273,7 @@ def pass_stages(
     memories: Sequence[FloatArray],
     inputs: Inputs,
     timing: Timing,
-    advance: Advance = Stage.advance,
+    advance: Advance = advance_stage,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
     """Let values (models, samples) pass stages in a row; return them, and the memories.
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from bwbayes.diagnosis import effects, explanations, model
+from bwbayes.diagnosis import explanations, model
 from bwbayes.diagnosis import residual_analysis as scenes
+from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
     LIMIT,
     better_models,
@@ -20,10 +21,12 @@ from bwbayes.diagnosis.explanations import (
     followed_causes,
     likely_causes,
 )
-from bwbayes.diagnosis.laplace import NONE, climb
+from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.model.stages.slew_limit import SlewLimit
+from bwbayes.inference.noise import DiscrepancyNoise
+from bwbayes.inference.study import Stated
+from bwbayes.model.declaration import normal
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import problem_of
@@ -40,7 +43,7 @@ def scene(
     problem = problem_of(text, folder)
     rng = np.random.default_rng(seed)
     point = pointfit.fit(problem.posterior, rng)
-    return ResidualAnalysis.of(problem.posterior, point.optima, rng, study=problem.study)
+    return ResidualAnalysis.of(problem.posterior, point.optima, rng, problem.study)
 
 
 LINEAR = """
@@ -64,15 +67,16 @@ def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: 
     write_record(plant("drift", (5, 1), seconds=2.0), tmp_path / "record.h5")
     problem = problem_of(f'[record]\nfile = "record.h5"\nfrom_rest = true\n{LINEAR}', tmp_path)
     posterior, readings = problem.posterior, problem.posterior.single_record.readings.values
-    along = np.linspace(0, 1, readings.size)
-    trend = effects.add_shapes(along[np.newaxis], 4.0)
+    time = problem.record.time
+    stated = {"drift": Stated(normal(0.0, 2.0)), "drift_curvature": Stated(fixed=0.0)}
+    drifting = problem.study.with_model(problem.study.spec.with_stages("drift"), stated).posterior
     lag = problem.record.interval * np.abs(np.subtract.outer(*2 * [np.arange(readings.size)]))
     covariance = 0.25 * np.exp(-lag / 0.2) + 0.09 * np.eye(readings.size)
     covariance += 0.09 * np.outer(problem.record.voltage, problem.record.voltage) + 25.0
     center = posterior.simulate(posterior.prior.theta(np.array([[0.7, 0.0]])))[0]
-    for effect, added in ((NONE, 0.0), (trend, 16 * np.outer(along, along))):
+    for model_of, added in ((posterior, 0.0), (drifting, 4 * np.outer(time, time))):
         exact = multivariate_normal.logpdf(readings, center, covariance + added)
-        fitted = climb(posterior, np.zeros((1, 2)), effect)
+        fitted = climb(model_of, np.zeros((1, len(model_of.names))))
         np.testing.assert_allclose(fitted.log_evidence, exact, rtol=1e-6)
 
 
@@ -81,9 +85,11 @@ def test_outliers_are_no_cause_where_none_would_be_set_aside() -> None:
     coarse = np.zeros(3000)
     coarse[::7], coarse[3::7] = 3.0, -3.0
     assert model.tail_nats(coarse) > LIMIT
-    seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0, study=None)
-    readings = SimpleNamespace(values=coarse)
-    seen.posterior = SimpleNamespace(single_record=SimpleNamespace(readings=readings))
+    seen: Any = SimpleNamespace(innovations=coarse, without=(1.0,), lead=0.0, alone=False)
+    readings, seen.study = SimpleNamespace(values=coarse), SimpleNamespace(spec=None)
+    seen.posterior = SimpleNamespace(
+        single_record=SimpleNamespace(readings=readings, noise=DiscrepancyNoise())
+    )
     seen.fit = SimpleNamespace(displacement=np.zeros(3000))
     assert [] == [*model.heavy_tails(seen)]
     coarse[8] = 600.0
@@ -107,11 +113,11 @@ def test_outliers_are_set_aside_where_they_are_few_and_far(kind: str) -> None:
 
 
 FAMILIES: dict[str, Callable[[ResidualAnalysis], Iterator[Explanation]]] = {
-    "transient": effects.transient,
-    "drift": effects.drift,
-    "step": effects.step,
-    "moving gain": effects.moving_gain,
-    "delay": effects.delay,
+    "transient": DEFECTS["transient"].explanations,
+    "drift": DEFECTS["drift"].explanations,
+    "step": DEFECTS["step"].explanations,
+    "moving gain": DEFECTS["moving gain"].explanations,
+    "delay": DEFECTS["delay"].explanations,
     "outliers": model.heavy_tails,
     "noise by speed": model.growing_noise,
     "quadratic": model.nonlinearity,
@@ -148,8 +154,8 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     problem = problem_of('[record]\nfile = "record.h5"\n', tmp_path)
     rng = np.random.default_rng(1)
     optima = pointfit.fit(problem.posterior, rng).optima
-    analysis = ResidualAnalysis.of(problem.posterior, optima, rng)
-    delays = [*effects.delay(analysis), *effects.long_delay(analysis)]
+    analysis = ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
+    delays = [*DEFECTS["delay"].explanations(analysis), *LONG_DELAY.explanations(analysis)]
     found = max(delays, key=lambda explanation: explanation.nats)
     assert found.nats > LIMIT
     assert analysis.unexplained > LIMIT or delays[0].nats > LIMIT  # so that a search tries both
@@ -167,8 +173,8 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
     truth = factor * getattr(drawn(np.random.default_rng((5, 0))), name)
     prior = f'{{ distribution = "lognormal", median = {truth}, sigma = 0.02 }}'
     seen = scene("good", 0, tmp_path, 5.0, f"{name} = {{ prior = {prior} }}")
-    families = model.prior, effects.transient, effects.drift, effects.moving_gain
-    found = [explanation for family in families for explanation in family(seen)]
+    defects = (DEFECTS[kind].explanations for kind in ("transient", "drift", "moving gain"))
+    found = [explanation for family in (model.prior, *defects) for explanation in family(seen)]
     likely = likely_causes(sorted(found, key=lambda each: -each.nats))
     assert ([] if factor == 1.0 else [f"prior of {name}"]) == [each.kind for each in likely]
     for each in likely:
@@ -177,7 +183,7 @@ def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
 
 
 def test_an_oscillation_of_mains_is_called_so(tmp_path: Path) -> None:
-    found = list(effects.oscillation(scene("mains", 0, tmp_path)))
+    found = list(DEFECTS["oscillation"].explanations(scene("mains", 0, tmp_path)))
     assert found[0].nats > LIMIT
     assert found[0].text.endswith("(mains: 50 Hz)")
 
@@ -194,7 +200,9 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
     posterior = problem.posterior.altered(displacement=shifted, training=windows)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(posterior, rng).optima
-    (found,) = effects.step(ResidualAnalysis.of(posterior, optima, rng, [slice(320, 480)]))
+    held_out = [slice(320, 480)]
+    analysis = ResidualAnalysis.of(posterior, optima, rng, problem.study, held_out)
+    (found,) = DEFECTS["step"].explanations(analysis)
     assert found.nats > LIMIT
     assert found.text.endswith(f"um at {time:g} s")
     assert found.fix.endswith(f"to end or begin at {time:g}")
@@ -218,7 +226,7 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(problem.posterior, rng).optima
-    small = ResidualAnalysis.of(problem.posterior, optima, rng, study=problem.study)
+    small = ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
     assert small.unexplained < LIMIT
     fitted: list[float] = []
     explain(small, fitted.append)
@@ -234,12 +242,12 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The twin: from the smooth one alone a fit of the cause does not lead as far."""
-    monkeypatch.setattr(explanations, "ADDITIONS", (effects.drift,))
-    monkeypatch.setattr(explanations, "CHANGES", (model.stages,))
-    monkeypatch.setattr(model, "SEARCHED", {"slew-limit": SlewLimit})
+    slew_limit = DEFECTS["slew limit"].explanations
+    monkeypatch.setattr(explanations, "ADDITIONS", (DEFECTS["drift"].explanations,))
+    monkeypatch.setattr(explanations, "CHANGES", (slew_limit,))
     slow = scene("slew limit", 1, tmp_path, 5.0)
     found = explain(slow)
-    beside_smooth = max(each.nats for each in model.stages(slow))
+    beside_smooth = max(each.nats for each in slew_limit(slow))
     assert beside_smooth < found[0].nats - 20
     assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
@@ -302,7 +310,8 @@ def test_a_thinned_record_has_the_evidence_of_as_many_readings(
         seen = scene(kind, 2, tmp_path)
         assert stride == seen.stride
         assert 500 == seen.posterior.single_record.readings.rows.size
-        families = effects.delay, effects.moving_gain, model.creep, model.hold
+        late, growing = (DEFECTS[defect].explanations for defect in ("delay", "moving gain"))
+        families = late, growing, model.creep, model.hold
         found = [explanation for family in families for explanation in family(seen)]
         found.sort(key=lambda explanation: explanation.nats)
         nats[stride] = {explanation.kind: explanation.nats for explanation in found}

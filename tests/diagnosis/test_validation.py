@@ -13,7 +13,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.causes import WORDS, cause
+from bwbayes.diagnosis.causes import cause
+from bwbayes.diagnosis.defects import DEFECTS
 from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import LIMIT
 from bwbayes.diagnosis.finding import Finding
@@ -448,7 +449,7 @@ def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
 
 
 def test_no_fix_is_a_command_line_which_python_has_not() -> None:
-    assert not [fix for _, fix in WORDS.values() if "bwbayes " in fix]
+    assert not [defect for defect in DEFECTS.values() if "bwbayes " in defect.in_bands[1]]
 
 
 @pytest.mark.parametrize("size", [5.0, 15.0])

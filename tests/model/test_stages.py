@@ -49,6 +49,8 @@ from tests.programs import needs
 SPAN = Span(-80.0, 80.0)
 INTERVAL = 1e-3
 VALUES = {
+    "delay": 2.4e-3,
+    "delay_speed": 300.0,
     "amplifier_lag": 2e-3,
     "amplifier_lag_speed": 500.0,
     "slew_limit": 6e3,
@@ -73,6 +75,7 @@ VALUES = {
     "drift_curvature": -1.5,
     "transient": 3.0,
     "transient_time": 0.1,
+    "transient_begin": 0.02,
     "step": 2.5,
     "step_time": 0.0505,
     "oscillation_sine": 0.3,
@@ -81,7 +84,7 @@ VALUES = {
 }
 # What is sought for a command, or runs a sample at a time, has no more than the voltage.
 COMMANDED = tuple(name for name, stage in STAGES.items() if not stage().sees)
-UNDONE = (*COMMANDED, "heating")
+UNDONE = (*COMMANDED, "heating", "delay")
 # A backlash that turns asks for a jump, which a slew rate does not let pass.
 MANY = tuple(name for name in COMMANDED if name != "slew-limit")
 every_stage = pytest.mark.parametrize("name", STAGES)
@@ -161,7 +164,9 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     t, warmer = inputs.time, inputs.column("temperature_degC") - v["temperature_reference"]
     s = (x - v["sensor_middle"]) / v["sensor_half"]
     middle, reach, phase = v["saturation_middle"], v["saturation_reach"], 2 * np.pi * 50.0 * t
+    samples = np.arange(x.size)
     of_name = {
+        "delay": np.interp(samples - v["delay"] / INTERVAL, samples, x),
         "backlash": _with_backlash(x),
         "slew-limit": _with_slew_limit(x),
         "saturation": middle + reach * np.tanh((x - middle) / reach),
@@ -172,7 +177,8 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
         + v["sensor_half"] * (v["sensor_quadratic"] + v["sensor_cubic"] * s) * (s**2 - 1),
         "reversed-sign": -x,
         "drift": x + v["drift"] * t + v["drift_curvature"] * t**2,
-        "transient": x + v["transient"] * np.exp(-t / v["transient_time"]),
+        "transient": x
+        + v["transient"] * np.exp(-np.maximum(t - v["transient_begin"], 0) / v["transient_time"]),
         "step": x + v["step"] * (t >= v["step_time"]),
         "oscillation": x
         + v["oscillation_sine"] * np.sin(phase)

@@ -61,10 +61,10 @@ def _scene(problem: Problem, name: str, places: FloatArray) -> ResidualAnalysis:
         posterior.for_record(name),
         posterior.select_draws(places, name),
         generator(problem.config.seed, f"explanations {record.sha256}"),
+        problem.study.for_record(name),
         [window for windows in problem.held_out(name).values() for window in windows],
         record.start,
-        # Of several records no other model is built: it would be one of all of them.
-        problem.study if len(problem.records) == 1 else None,
+        alone=len(problem.records) == 1,
     )
 
 

@@ -199,6 +199,8 @@ def _advance_stage(
     seen: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return what :meth:`~bwbayes.model.stage.Stage.advance` does."""
+    if type(stage).advance is not Stage.advance:
+        return stage.advance(numbers, memory, values, seen)  # of all samples at once
     result, after = np.empty(values.shape), memory.copy()
     seen = np.empty(0) if seen is None else seen.copy()  # of one type, for which one is compiled
     _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)

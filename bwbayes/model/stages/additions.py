@@ -64,7 +64,7 @@ class Drift(_Addition):
 
 
 class Transient(_Addition):
-    """Transient after a switch-on: y = x + A exp(−t/τ), of displacement x, um."""
+    """Transient after a switch-on at t₀: y = x + A exp(−(t − t₀)/τ), of displacement x, um."""
 
     name: ClassVar = "transient"
     starts: ClassVar = tuple({"transient_time": z} for z in (-1.2, 0.0, 1.2))
@@ -79,6 +79,15 @@ class Transient(_Addition):
             lambda context: lognormal(context.ranges.duration / 30, 1.1),
             floor=0.0,
         ),
+        Declaration(
+            "transient_begin",
+            "s",
+            "t_0",
+            "time of the switch-on since the record's first sample",
+            lambda context: context.ranges.begin,
+            scope="event",
+            at_rest=0.0,
+        ),
     )
 
     def describe(self, values: Mapping[str, float]) -> str:
@@ -89,12 +98,14 @@ class Transient(_Addition):
     @staticmethod
     def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
         """Return y."""
-        return value + parameters[0] * np.exp(-parameters[2] / parameters[1])
+        after_switch = np.maximum(parameters[3] - parameters[2], 0.0)
+        return value + parameters[0] * np.exp(-after_switch / parameters[1])
 
     @staticmethod
     def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
         """Return x."""
-        return value - parameters[0] * np.exp(-parameters[2] / parameters[1])
+        after_switch = np.maximum(parameters[3] - parameters[2], 0.0)
+        return value - parameters[0] * np.exp(-after_switch / parameters[1])
 
 
 class OffsetStep(_Addition):

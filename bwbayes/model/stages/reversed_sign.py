@@ -18,7 +18,7 @@ class ReversedSign(Stage):
     name: ClassVar = "reversed-sign"
     side: ClassVar[Side] = "output"
     rate_independent: ClassVar = True
-    advice: ClassVar = "change the displacement's sign in the file"
+    advice: ClassVar = "change the sign of the displacement's column in the file"
     parameters: tuple[Declaration, ...] = ()
 
     def describe(self, values: Mapping[str, float]) -> str:  # noqa: ARG002  # there are none

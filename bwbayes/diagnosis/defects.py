@@ -1,0 +1,278 @@
+"""The catalogue of defects: what can be wrong with a record, its readings or its bands, one by one.
+
+A :class:`Defect` has one name. It knows the finding that a record check has of it, the stage of the
+model that it is, from where that is fitted, and what to say and to do about it: where a fit has it,
+and where bands have it that fail (:mod:`bwbayes.diagnosis.causes`). Each stage of the registry is
+one, so that a new stage is looked for by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.innovations import innovations
+from bwbayes.diagnosis.loopfit import find_delay
+from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis, Sighting
+from bwbayes.diagnosis.series_patterns import strongest_line
+from bwbayes.inference import map_estimate
+from bwbayes.inference.study import Stated
+from bwbayes.model.registry import STAGES
+from bwbayes.model.stages.additions import Oscillation
+from bwbayes.model.stages.reversed_sign import ReversedSign
+from bwbayes.record.io.grid import clock
+from bwbayes.record.record import Record
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A defect, with the stage of the model that it is, if it is one.
+
+    Attributes
+    ----------
+    kind
+        Its name.
+    stage
+        Name of the stage.
+    foreign, removes, noise
+        As in :class:`~bwbayes.diagnosis.residual_analysis.Explanation` and
+        :class:`~bwbayes.diagnosis.finding.Finding`.
+    finding
+        Kind of the finding that a record check has of it.
+    in_bands
+        What to say and what to do where bands have it that fail, with gaps to fill in.
+    """
+
+    kind: str
+    stage: str = ""
+    foreign: bool = False
+    removes: bool = False
+    noise: bool = False
+    finding: str = ""
+    in_bands: tuple[str, str] = ("", "")
+
+    def explanations(self, scene: ResidualAnalysis) -> Iterator[Explanation]:
+        """Fit the model with the stage to a record that does not have it yet."""
+        stage, inputs = STAGES[self.stage](), scene.posterior.single_record.inputs
+        if self.stage in scene.study.spec.chain or not inputs.has(stage.sees):
+            return
+        if not (stage.rate_independent or inputs.quantities.has_clock):
+            return
+        flags = {"foreign": self.foreign, "removes": self.removes, "noise": self.noise}
+        words = partial(self.words, scene)
+        for sighting in self.sightings(scene):
+            for found in scene.changed(self.kind, words, (self.stage,), sighting, flags):
+                # No model has mains, whose phase is not known in the next record.
+                yield replace(found, spec=None) if self.noise else found
+
+    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
+        """Yield from where to fit the stage."""
+        yield Sighting(starts=STAGES[self.stage]().starts)
+
+    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:  # noqa: ARG002
+        """Return what to say and what to do, of the parameters' values by name."""
+        stage = STAGES[self.stage]()
+        return stage.describe(values), stage.advice
+
+
+class _Transient(Defect):
+    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+        """Leave the start out, until a five-hundredth of the range is left of the transient."""
+        least = 0.002 * scene.extent
+        until = values["transient_time"] * np.log(max(abs(values["transient"]) / least, 1.0))
+        window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
+        settled = int(np.searchsorted(scene.time[: scene.voltage.size], until))
+        return super().words(scene, values)[0], settle_fix(scene.voltage, settled, window)
+
+
+class _Step(Defect):
+    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+        """Yield the time of the largest innovation, whose choice is paid for.
+
+        Where readings before it were not fitted, the largest of theirs says when it was.
+        """
+        rows = scene.posterior.single_record.readings.rows
+        white = np.abs(scene.innovations)
+        white[: max(white.size // 50, 1)] = 0.0
+        number = int(np.argmax(white))
+        between = scene.posterior.altered(training=(slice(rows[number - 1], rows[number] + 1),))
+        white_between = np.abs(innovations(between, scene.fit.free).white)[1:]
+        row = between.single_record.readings.rows[1 + int(np.argmax(white_between))]
+        stated = {"step_time": Stated(fixed=scene.interval * row)}
+        yield Sighting(stated, cost=float(np.log(rows.size)))
+
+    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+        """Name its time on the record's clock."""
+        time = scene.begin + values["step_time"]
+        text, _ = super().words(scene, {**values, "step_time": time})
+        written = clock(time, scene.interval)
+        return text, f"fit one side: set train to end or begin at {written}"
+
+
+class _Oscillation(Defect):
+    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+        """Yield the innovations' strongest frequency that the drive has not."""
+        rows = scene.posterior.single_record.readings.rows
+        line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
+        if line is not None:
+            cost = float(np.log(rows.size / 2))
+            stated = {"oscillation_frequency": Stated(fixed=line.frequency)}
+            yield Sighting(stated, cost=cost, note=line.source)
+
+
+class _Sign(Defect):
+    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+        """Yield the fit of the readings with their sign changed, if they fall with the voltage."""
+        record = scene.posterior.single_record
+        readings, drive = record.readings, record.voltage[record.readings.rows]
+        if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) < 0:
+            turned = scene.posterior.altered(displacement=-record.displacement)
+            yield Sighting(places=map_estimate.local_minima(turned, scene.generator))
+
+
+class _Delay(Defect):
+    def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
+        """Say which column to move."""
+        fix = late_fix(values["delay"], scene.interval / scene.stride)
+        return super().words(scene, values)[0], fix
+
+
+class _LongDelay(_Delay):
+    def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
+        """Yield a delay up to a quarter of a period, which is told by loops.
+
+        With the modes of the readings as they are without it.
+        """
+        record = scene.posterior.single_record
+        limit = min(0.55 * scene.turn_time, 0.2 * scene.duration)
+        kept = np.full(record.displacement.size, np.nan)
+        for window in record.training:
+            kept[window] = record.displacement[window]
+        late, _ = find_delay(Record(record.voltage, kept, interval=scene.interval), limit)
+        rows = round(late / scene.interval)
+        if abs(late) < max(scene.turn_time / 50, scene.interval / scene.stride) or not rows:
+            return
+        kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
+        whole = (slice(0, kept.size),)
+        moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=whole)
+        places = map_estimate.local_minima(moved, scene.generator)
+        # By its prior, which is as wide as a quarter of the time between two reversals.
+        yield Sighting(starts=[{"delay": 4 * late / scene.turn_time}], places=places)
+
+
+def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:
+    """Return the line that leaves a start of ``settled`` samples out, unless it is too dear.
+
+    A start that holds more than a twentieth of the drive's path is not left out.
+    """
+    steps = np.abs(np.diff(voltage, prepend=voltage[0]))
+    if steps[:settled].sum() > 0.05 * steps.sum():
+        return "measure again once the displacement has settled"
+    return leave_out
+
+
+def late_fix(delay: float, interval: float) -> str:
+    """Return what to do where the displacement comes ``delay`` s after what the voltage does."""
+    rows = max(round(abs(delay) / interval), 1)
+    name = "displacement" if delay > 0 else "voltage"
+    return f"move the {name}'s column up by {rows} row{'s' * (rows > 1)} in the file"
+
+
+REFIT = "fit this record itself, with the same config"
+
+# Those that a good fit refuses at once, in the order in which they are tried.
+QUICK = (
+    _Transient("transient", "transient", foreign=True, removes=True, finding="switch-on transient"),
+    Defect(
+        "drift",
+        "drift",
+        foreign=True,
+        finding="drift",
+        in_bands=(
+            "a drift of the readings",
+            "validate a shorter part: set window in [validation.{name}], or predict with --window",
+        ),
+    ),
+    _Step(
+        "step",
+        "step",
+        foreign=True,
+        finding="jump",
+        in_bands=(
+            "a jump of the offset by {jump} um at {jumped} s",
+            "validate one side: set window in [validation.{name}] to end or begin at {jumped}, or "
+            "predict with --window",
+        ),
+    ),
+    _Oscillation(
+        "oscillation",
+        "oscillation",
+        noise=True,
+        in_bands=("an oscillation of {swing} um at {line}", Oscillation.advice),
+    ),
+    Defect("moving gain", "moving-gain"),
+    _Sign(
+        "sign",
+        "reversed-sign",
+        finding="reversed sign",
+        in_bands=(ReversedSign().describe({}), ReversedSign.advice),
+    ),
+    _Delay(
+        "delay",
+        "delay",
+        finding="late",
+        in_bands=(
+            "a delay (another hold of the voltage, or dynamics that the model lacks)",
+            'set voltage_is to "command" or "output", whichever it is, in [validation.{name}]',
+        ),
+    ),
+)
+LONG_DELAY = _LongDelay("delay", "delay", finding="late")
+SLOW = tuple(
+    Defect(name.replace("-", " "), name)
+    for name in STAGES
+    if name not in [defect.stage for defect in QUICK]
+)
+# Those that no stage is, of bands alone.
+OF_BANDS = (
+    Defect(
+        "outliers",
+        in_bands=(
+            "outliers",
+            "empty their cells in the file, at {spikes} s: they are missing readings then",
+        ),
+    ),
+    Defect(
+        "start",
+        in_bands=(
+            "the start of the record (large residuals until {settled} s)",
+            "set lead_in_start = {settled} in [validation.{name}], or predict with "
+            "--lead-in-start {settled}",
+        ),
+    ),
+    Defect(
+        "offset",
+        in_bands=(
+            "an offset of {size} um",
+            "set estimate_offset = true and a longer lead_in in [validation.{name}], or predict "
+            "with --lead-in and without --same-offset",
+        ),
+    ),
+    Defect("gain", in_bands=("another gain (another actuator, load or sensor range)", REFIT)),
+    Defect(
+        "loop",
+        in_bands=("loop-shaped residuals (model too simple, or a different actuator)", REFIT),
+    ),
+    Defect(
+        "noise",
+        in_bands=(
+            "noise of another size than in training",
+            "train on a record of this sensor with this sampling",
+        ),
+    ),
+)
+DEFECTS = {defect.kind: defect for defect in (*QUICK, *SLOW, *OF_BANDS)}

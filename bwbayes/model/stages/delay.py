@@ -1,0 +1,146 @@
+"""A column of the record that is late: the displacement behind the voltage, or the voltage itself.
+
+Each channel of an instrument has its own latency, and files are put together from channels by rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy
+
+from bwbayes.arrays import FloatArray
+from bwbayes.model.declaration import Declaration, Values, normal
+from bwbayes.model.inputs import Inputs
+from bwbayes.model.stage import Side, Stage, Timing
+
+
+class Delay(Stage):
+    """A delay: y(t) = u(t − δ), of the command u, V; the voltage is late where δ < 0.
+
+    It goes straight between samples, came at one speed before the first, and stays behind the last.
+    It is worked out of all samples at once, since it may be ahead: a controller does not have it.
+    The memory is the speed, V a sample.
+    """
+
+    name: ClassVar = "delay"
+    side: ClassVar[Side] = "input"
+    sees: ClassVar = "voltage"
+    remembers: ClassVar = 1
+    starts: ClassVar = tuple({"delay": z} for z in (-0.1, 0.0, 0.1))
+    advice: ClassVar = "move the column that is late up by rows in the file"
+    parameters: tuple[Declaration, ...] = (
+        Declaration(
+            "delay",
+            "s",
+            r"\delta",
+            "delay of the displacement behind the voltage",
+            # An eighth of a period: a quarter is another sign, nearly.
+            lambda context: normal(0.0, context.ranges.time / 4),
+        ),
+        Declaration(
+            "delay_speed",
+            "V/s",
+            r"v_{\delta}",
+            "speed of the voltage before the record",
+            # Of a triangle's slope, twice.
+            lambda context: normal(0.0, 4 * context.ranges.voltage / context.ranges.time),
+            scope="record",
+            at_rest=0.0,
+        ),
+    )
+
+    def describe(self, values: Mapping[str, float]) -> str:
+        """Say which column is late, and by how much."""
+        column = "displacement" if values["delay"] > 0 else "voltage"
+        return f"{column} that is late by {1000 * abs(values['delay']):.3g} ms"
+
+    def numbers(self, column: Values, timing: Timing) -> FloatArray:
+        """Return δ in samples, (models, 1)."""
+        return column["delay"][:, np.newaxis] / timing.interval
+
+    def numbers_at(self, column: Values, timing: Timing, inputs: Inputs) -> FloatArray:
+        """Return how many samples before those of the whole path it is, (models, 1)."""
+        return self.numbers(column, timing) - inputs.around[1]
+
+    def seen(self, inputs: Inputs) -> FloatArray:
+        """Return the whole path (any,), V, of which the inputs are a part."""
+        return inputs.around[0]
+
+    @staticmethod
+    def settle(parameters: Any, value: Any, after: Any) -> Any:  # noqa: ARG004  # any delay
+        """Return u: what stays is not late."""
+        after[0] = 0.0
+        return value
+
+    def begin(
+        self,
+        column: Values,
+        numbers: FloatArray,  # noqa: ARG002  # whatever the delay
+        first: FloatArray,  # noqa: ARG002
+        timing: Timing,
+    ) -> FloatArray:
+        """Return the speed before the record."""
+        return column["delay_speed"][:, np.newaxis] * timing.interval
+
+    @staticmethod
+    def move(parameters: Any, memory: Any, value: Any, after: Any) -> Any:  # noqa: ARG004
+        """Return u, of a sample by itself."""
+        after[0] = memory[0]
+        return value
+
+    @staticmethod
+    def undo(parameters: Any, memory: Any, value: Any) -> Any:  # noqa: ARG004
+        """Return y, of a sample by itself."""
+        return value
+
+    def advance(
+        self,
+        numbers: FloatArray,
+        memory: FloatArray,
+        values: FloatArray,
+        seen: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the path as late as each model has it, (models, samples)."""
+        if seen is None:
+            return values, memory
+        return _late(numbers, memory, seen, values.shape[1]), memory
+
+    def inverse(
+        self,
+        numbers: FloatArray,
+        memory: FloatArray,
+        values: FloatArray,
+        seen: FloatArray | None = None,  # noqa: ARG002  # what is sought
+    ) -> FloatArray:
+        """Return the commands (models, samples) of which these are late."""
+        values = values - _late(numbers, memory, np.zeros(1), values.shape[1])
+        commands = np.empty(values.shape)
+        for row, (shift,) in enumerate(numbers.tolist()):
+            whole = int(np.floor(shift))
+            part, wanted, late = shift - whole, values[row], whole
+            # From the side on which errors fade: y = (1 − f) u₀ + f u₁, where f is at most a half.
+            backwards = part > 0.5
+            if backwards:
+                part, wanted, late = 1 - part, wanted[::-1], whole + 1
+            fade = [1 - part, part]
+            found, _ = scipy.signal.lfilter([1.0], fade, wanted, zi=[-part / fade[0] * wanted[0]])
+            found = found[::-1] if backwards else found
+            commands[row] = found[np.clip(np.arange(found.size) + late, 0, found.size - 1)]
+        return commands
+
+
+def _late(shifts: FloatArray, speed: FloatArray, path: FloatArray, samples: int) -> FloatArray:
+    """Return the first samples of a path (any,), V, late by shifts (models, 1), in samples.
+
+    Before its first sample the path came at a speed (models, 1), V a sample.
+    """
+    whole = np.floor(shifts)
+    after = np.arange(samples) - whole.astype(np.intp)
+    late, before = (
+        path[np.clip(at, 0, path.size - 1)] + speed * np.minimum(at, 0) for at in (after, after - 1)
+    )
+    result: FloatArray = late + (shifts - whole) * (before - late)
+    return result
