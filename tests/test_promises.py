@@ -14,6 +14,7 @@ import pytest
 
 from tests.measured import assert_quotes, figures, measured, numbers, quotes
 from tests.test_calibration_moving import PARTS
+from tests.test_what_drives_tell import LENGTHS
 
 PROMISES = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
 
@@ -64,6 +65,11 @@ def of_times(kind: str) -> Quoted:
     """Return the coverage where a record is ever fewer correlation times long."""
     times = (0.04, 0.2, 0.5, 1.3)
     return Quoted([f"100 a {kind} discrepancy of {time} s/coverage/95" for time in times])
+
+
+def of_cost(model: str) -> Quoted:
+    """Return the core seconds of a model's fits, from short records to long ones."""
+    return Quoted([f"cost of a fit/{model}/{length}/core s" for length in LENGTHS[model]])
 
 
 CLAIMS: dict[str, Quoted] = {
@@ -267,6 +273,12 @@ CLAIMS: dict[str, Quoted] = {
     ),
     "Inverse over simulation, time for 1,000 draws": Quoted(
         ["extent inverse over simulation/*"], ["count inverse over simulation/*"]
+    ),
+    "Core s of a Bouc-Wen fit of 100/1,000/10,000/100,000 readings": of_cost("bouc-wen"),
+    "... with creep, of 100/1,000/10,000 readings": of_cost("bouc-wen, creep"),
+    "... of four Maxwell-slip elements, 100/1,000/10,000 readings": of_cost("maxwell-slip"),
+    "... simulations for an effective draw, burn-in included": Quoted(
+        ["extent cost of a fit/*/evaluations a draw"]
     ),
     "Log evidence less that of nested sampling (dynesty)": Quoted(
         ["log evidence of the measured record/less dynesty's"]
