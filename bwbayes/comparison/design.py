@@ -174,7 +174,7 @@ SAMPLES, SETTLING = 1_000, 0.25
 
 
 class _Paths:
-    """What draws of a model do along candidates: deviations (draws, samples) from their mean."""
+    """Simulated draws of a model along candidates: deviations (draws, samples) from their mean."""
 
     def __init__(
         self,
@@ -242,9 +242,9 @@ def rank_by_rivals(
     In turn each model, of those that fit the training record about as well as the best, makes the
     readings of a candidate, and the others are fitted to them, linear in their parameters about
     their fit of the training record. Those whose evidence trails by odds of more than twenty to one
-    are told apart. What is left is the root mean square, over all other pairs and all candidates,
-    of what a fitted model differs from the one that made the readings, as a part of what they
-    differ now.
+    are told apart. The remaining difference is the root mean square, over all other pairs and all
+    candidates, of that between a fitted model and the one that made the readings, as a part of
+    their difference now.
 
     Parameters
     ----------

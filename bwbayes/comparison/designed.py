@@ -59,7 +59,7 @@ class DesignScore:
 
 @dataclass(frozen=True)
 class RivalScore(DesignScore):
-    """What a candidate signal tells of a model and its rivals; ``sd_ratio`` is of what they differ.
+    """The score of a candidate signal for telling a model from its rivals, by their difference.
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ class Design(Product, Sequence[DesignScore]):
 
 @dataclass(frozen=True)
 class RivalDesign(Design):
-    """What to measure to tell a model from its rivals: a record to validate on, one to train on."""
+    """Candidates that tell a model from its rivals: a record to validate on, one to train on."""
 
     __repr__ = brief
 
@@ -266,7 +266,7 @@ class RivalDesign(Design):
 
     @property
     def quantity(self) -> str:
-        """What the promises are parts of, in words."""
+        """The quantity whose remaining part the scores are, in words."""
         return "difference of rivals left"
 
     def records(self) -> dict[str, Record]:

@@ -306,7 +306,7 @@ def finish(path: Path, *, quiet: bool, **options: Any) -> int:
     return fit.standing.exit_status
 
 
-# What is called otherwise there.
+# Keywords with another name there.
 OTHERWISE = {"fit": "run", "folder": "out", "displacement_file": "displacement"}
 
 
