@@ -151,8 +151,7 @@ class Quantities:
     def _unit(self, match: re.Match[str]) -> str:
         """Return the unit that stands for one of the package, in brackets where that is needed."""
         before, token, after = match["before"] or "", match["unit"] or "", match["after"] or ""
-        long = {"volt": VOLTAGE, "volts": VOLTAGE}.get(token, DISPLACEMENT)
-        default = VOLTAGE if token == "V" else long
+        default = VOLTAGE if token in ("V", "volt", "volts") else DISPLACEMENT
         own = self.input if default == VOLTAGE else self.output
         if own.unit == default.unit:
             return match[0]
@@ -193,14 +192,9 @@ class Quantities:
         if not isinstance(error, ColumnsError):
             return error
         roles = {"voltage": "input", "displacement": "output"}
-        columns, units = (
-            {roles.get(q, q): text for q, text in error.guess[key].items()}
-            for key in ("columns", "units")
-        )
-        units = {
-            q: {"input": self.input.unit, "output": self.output.unit}.get(q, unit)
-            for q, unit in units.items()
-        }
+        columns = {roles.get(q, q): column for q, column in error.guess["columns"].items()}
+        own = {"voltage": self.input.unit, "displacement": self.output.unit}
+        units = {roles.get(q, q): own.get(q, u) for q, u in error.guess["units"].items()}
         fs = error.fs if self.has_clock else None
         said = ColumnsError(self.say(error.problem), columns, units, error.place, fs)
         said.is_said = True
