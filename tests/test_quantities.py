@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -184,10 +185,22 @@ def test_a_files_note_that_would_be_code_is_none(tmp_path: Path) -> None:
 
 def test_no_default_prior_knows_an_absolute_voltage_or_displacement() -> None:
     """In other units of input and output every default prior is the same one."""
-    warm = {"temperature_degC": (20.0, 30.0)}
-    ranges = Ranges(40.0, 30.0, 4.0, 0.5, 10.0, 0.001, 16.0, 0.01, 0.005, warm)
+    ranges = Ranges(
+        voltage=40.0,
+        displacement=30.0,
+        middle=4.0,
+        time=0.5,
+        bias=10.0,
+        interval=0.001,
+        duration=16.0,
+        rounding=0.01,
+        resolution=0.005,
+        covariates={"temperature_degC": (20.0, 30.0)},
+    )
     per_input, per_output = 1e-3, 1e6
-    scaled = Ranges(4e-2, 3e7, 4e6, 0.5, 1e-2, 0.001, 16.0, 1e4, 5e3, warm)
+    scaled = replace(ranges, voltage=ranges.voltage * per_input, bias=ranges.bias * per_input)
+    for name in ("displacement", "middle", "rounding", "resolution"):
+        scaled = replace(scaled, **{name: getattr(ranges, name) * per_output})
     compared = 0
     for declared in every_declaration():
         stated: dict[str, float | Distribution] = {"exponent": 1.0, "stiffness": 1.0}
