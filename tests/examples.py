@@ -55,7 +55,7 @@ SHORTER = {
 DEFAULTS = {
     "bwbayes.report.figures.plots_of": lambda _: NO_PLOTS,
     "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
-    "bwbayes.report.outputs.picture_of": lambda _: picture_of(Figure),
+    "bwbayes.report.outputs.picture_of": lambda *_: picture_of(Figure),
     "bwbayes.app.fit.calls.USUAL_MODELS": "linear; bouc-wen",
 }
 OPTIONS = {"track": {"draws": 5, "frequencies": [2.0]}, "compare": {"future": False}}
