@@ -119,9 +119,11 @@ def test_white_noise_model_fails_the_bands() -> None:
 class Swapped(Posterior):
     """A posterior whose model has the sign of γ, against β, the wrong way round."""
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_likelihood(
+        self, theta: FloatArray, displacement: FloatArray | None = None
+    ) -> FloatArray:
         """Log likelihood of the model with the wrong sign."""
-        return super().log_likelihood(self._swapped(theta))
+        return super().log_likelihood(self._swapped(theta), displacement)
 
     def simulate(
         self,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
 from bwbayes.inference.mode_finding import Mode, Target, refine
 from bwbayes.inference.thinning import beginning, thin_posterior
+from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, parts, unwatched, watched
 
@@ -80,6 +82,8 @@ def fit(
         for start_point in watched(places, part(watch, 0.5, 0.9)):
             _add_mode(posterior, modes, start_point)
         for start_point in _zero_noise_starts(posterior, modes[0].coordinates, noise):
+            _add_mode(posterior, modes, start_point)
+        for start_point in _exchanged_starts(posterior, modes[0].coordinates):
             _add_mode(posterior, modes, start_point)
     else:
         point = fit(short, generator, part(watch, 0.0, 0.5))
@@ -199,6 +203,25 @@ def _zero_noise_starts(
         places = _beside(start_point, resting)
         start[:] = places[int(np.argmax(posterior.log_density(places)))]
     return starts
+
+
+def _exchanged_starts(posterior: Posterior, start_point: FloatArray) -> list[FloatArray]:
+    """Return starts (free,) with two time constants of lags in a row exchanged, where possible.
+
+    Of lags that differ, one is the actuator's and one the sensor's. The other way round they do
+    nearly the same, in another mode, which no step from the first one finds.
+    """
+    prior, starts = posterior.prior, []
+    (values,), _ = prior.constrain(start_point[np.newaxis])
+    rows: dict[str, list[int]] = {}
+    for row, parameter in enumerate(prior.free):
+        if parameter.plain in TIME_CONSTANTS:
+            rows.setdefault(parameter.record, []).append(row)
+    for pair in (pair for lags in rows.values() for pair in combinations(lags, 2)):
+        exchanged = values.copy()
+        exchanged[[*pair]] = values[[*reversed(pair)]]
+        starts.append(prior.unconstrain(exchanged[np.newaxis])[0])
+    return [start for start in starts if np.isfinite(posterior.log_density(start[np.newaxis]))[0]]
 
 
 def _beside(start_point: FloatArray, noise: FloatArray) -> FloatArray:

@@ -25,15 +25,14 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.model.stages.lags import AmplifierLag, SensorLag
+from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.sampling.secant import SecantMap
 
 LONGEST = 12  # only the longest coordinates bend others
 FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
 
-# Parameters that add up, by name: the squares of sds, and the time constants of lags in a row.
+# Sds whose squares add up, by name.
 SDS = SENSOR_SD.name, DISCREPANCY_SD.name
-LAGS = "lag", AmplifierLag.parameters[0].name, SensorLag.parameters[0].name
 
 
 @dataclass(frozen=True)
@@ -267,7 +266,7 @@ class TotalRatioMap:
         }
         pairs, powers = [], []
         for record in dict.fromkeys(record for _, record in forms):
-            for names, power in ((SDS, 2.0), (LAGS, 1.0)):
+            for names, power in ((SDS, 2.0), (TIME_CONSTANTS, 1.0)):
                 pair = [forms[name, record] for name in names if (name, record) in forms][:2]
                 if len(pair) == 2:
                     pairs.append(pair)

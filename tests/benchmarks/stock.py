@@ -40,7 +40,11 @@ def hysteresis_loop(
 class StockPosterior(Posterior):
     """A posterior with the loop for its hysteresis, for n = 1."""
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_likelihood(
+        self,
+        theta: FloatArray,
+        displacement: FloatArray | None = None,  # noqa: ARG002  # it is simulated each time
+    ) -> FloatArray:
         """Log likelihood (models,) at θ (models, parameters)."""
         column = dict(zip(self.prior.names, theta.T, strict=True))
         shape = (column[name] for name in ("alpha", "beta", "gamma", "initial"))

@@ -140,3 +140,8 @@ class SensorLag(_Lag):
     advice: ClassVar = "widen the sensor's filter"
     side: ClassVar[Side] = "output"
     parameters = _declared("sensor_lag", "\\tau_{s}", "sensor", "um", "displacement")
+
+
+# Time constants of first-order lags in a row, by name. What they are together is plain; which of
+# them is which, a record hardly tells.
+TIME_CONSTANTS = "lag", AmplifierLag.parameters[0].name, SensorLag.parameters[0].name
