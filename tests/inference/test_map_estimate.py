@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from bwbayes.app.config.config import parse
 from bwbayes.arrays import FloatArray
@@ -112,3 +114,24 @@ def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: P
     posterior = problem_of(parse(CONFIG, "config"), tmp_path).posterior
     point = fit(posterior, np.random.default_rng((6, 25)))
     assert point.log_density == pytest.approx(np.max(posterior.log_density(point.optima)))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_lags_in_a_row_have_a_mode_for_either_order(tmp_path: Path, seed: int) -> None:
+    """A sensor of 12 ms behind an actuator of 4 to 10 ms: exchanged, they do the same nearly."""
+    records = bench("good", (8, seed)).records
+    keep = np.exp(-records[0].interval / 0.012)
+    slow = [
+        replace(record, displacement=lfilter([1 - keep], [1, -keep], record.displacement))
+        for record in records
+    ]
+    put(slow, tmp_path)
+    config = CONFIG.replace("from_rest = true\n", "train = [[1.0, 9.0]]\n")
+    config += '[model]\ndynamics = "lag"\nnoise = "discrepancy"\nstages = ["sensor-lag"]\n'
+    posterior = problem_of(parse(config, "config"), tmp_path).posterior
+    point = fit(posterior, np.random.default_rng(seed))
+    free, _ = posterior.prior.constrain(point.optima)
+    lags = free[:, [posterior.names.index(name) for name in ("lag", "sensor_lag")]]
+    np.testing.assert_allclose(lags[0].sum(), lags[1].sum(), rtol=0.05)
+    assert np.prod(np.diff(lags[:2])) < 0
+    assert min(mode_weights(posterior, point)[1]) > 0.1
