@@ -200,7 +200,8 @@ def test_a_record_that_may_start_from_rest_says_what_that_would_change(fit: Run)
         (sine + 40, False, False),
     ):
         planned = Record.from_arrays(voltage, interval=0.02)
-        measured = Record.from_arrays(voltage, 0.7 * voltage, interval=0.02)
+        followed = fit.predict(planned, from_rest=True).mean
+        measured = Record.from_arrays(voltage, followed, interval=0.02)
         for record in (planned, measured):
             remarks = fit.predict(record, from_rest=declared).remarks
             told = any("--from-rest declares" in remark for remark in remarks)
