@@ -162,6 +162,7 @@ class SecantMap:
 
 def linear(posterior: Posterior) -> list[int]:
     """Return which free parameters a displacement is linear in; none if there are more stages."""
-    if any(dataset.actuator.stages for dataset in posterior.datasets):
+    rows = [row for row, p in enumerate(posterior.prior.free) if p.plain in LINEAR]
+    if rows and any(dataset.actuator.stages for dataset in posterior.datasets):
         return []
-    return [row for row, p in enumerate(posterior.prior.free) if p.plain in LINEAR]
+    return rows
