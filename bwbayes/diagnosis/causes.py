@@ -32,7 +32,7 @@ LEAD_IN_ALARM = 0.002
 # Time constants of a bad start, as fractions of the record, evenly probable.
 DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
 
-# Of a training record, whose explanations are fitted: all other causes compare with training.
+# Of a training record, whose explanations are fitted; causes other than outliers compare with it.
 UNEXPLAINED = Finding(
     "unknown",
     "unknown (no explanation takes most of the error away)",

@@ -260,7 +260,9 @@ def validate_bands(
         if why is None and reasons[0].startswith("the readings fall"):
             why = Finding("sign", *DEFECTS["sign"].in_bands)
         elif why is None:
-            why = UNEXPLAINED if bands.training else cause(bands, background.memory, beyond)
+            why = cause(bands, background.memory, beyond)
+            # A fit has no other gain, offset or noise than its own.
+            why = UNEXPLAINED if bands.training and why.kind != "outliers" else why
         return replace(doubted, passed=False, reasons=tuple(reasons), cause=why)
     doubts = [
         f"{text}, which may be luck (p = {chance:.1g}){standard.offset_advice}"

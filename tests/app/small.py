@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -132,3 +133,8 @@ def assert_same_end(expected: Path, got: Path) -> None:
                 np.testing.assert_array_equal(left[name], right[name], err_msg=f"{one} {name}")
     assert numbers(expected) == numbers(got)
     assert (expected / "bands.csv").read_bytes() == (got / "bands.csv").read_bytes()
+
+
+def without_progress(text: str) -> str:
+    """Leave out how far a step is, which is said after ten seconds, as a busy machine may take."""
+    return re.sub(r"^.*   ETA .*\n", "", text, flags=re.MULTILINE)

@@ -379,6 +379,7 @@ def test_rivals_are_fitted_once_and_kept_with_the_run(
             .widening_rivals("record")
         )
 
+    copy.rivals.unlink(missing_ok=True)
     assert rivals(1.0) is None
     assert not copy.rivals.exists()
     fitted = rivals(0.0)

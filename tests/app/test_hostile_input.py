@@ -39,6 +39,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.watching import Watch
 from tests.app.mutations import KINDS, QUICK, Case, case, made
+from tests.app.small import without_progress
 from tests.measured import keep
 
 SEED = 1
@@ -102,7 +103,8 @@ def check(one: Case, place: Path, seconds: int = SECONDS) -> Said:
         except SystemExit as end:
             status = end.code
     assert isinstance(status, int)
-    return Said(status, out.getvalue(), err.getvalue(), time.process_time() - begun)
+    said = without_progress(err.getvalue())
+    return Said(status, out.getvalue(), said, time.process_time() - begun)
 
 
 @contextlib.contextmanager

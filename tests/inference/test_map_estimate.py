@@ -122,7 +122,9 @@ def test_two_lags_in_a_row_have_a_mode_for_either_order(tmp_path: Path, seed: in
     records = bench("good", (8, seed)).records
     keep = np.exp(-records[0].interval / 0.012)
     slow = [
-        replace(record, displacement=lfilter([1 - keep], [1, -keep], record.displacement))
+        replace(
+            record, displacement=lfilter([1 - keep], [1, -keep], np.asarray(record.displacement))
+        )
         for record in records
     ]
     put(slow, tmp_path)

@@ -120,7 +120,9 @@ def log_banana(x: FloatArray) -> FloatArray:
 def any_totals(free: int, generator: np.random.Generator) -> TotalRatioMap:
     rows = generator.permutation(free)[: free // 2 * 2].reshape(-1, 2)
     center, scale = generator.normal(0, 5, rows.shape), np.exp(generator.normal(0, 1, rows.shape))
-    return TotalRatioMap(rows, center, scale, 1.0 + generator.integers(2, size=len(rows)))
+    return TotalRatioMap(
+        rows, center, scale, generator.integers(1, 3, len(rows)).astype(np.float64)
+    )
 
 
 def any_skew(free: int, generator: np.random.Generator) -> SkewMap:

@@ -255,11 +255,12 @@ class Run(Shown, Stages):
         with copied.locked():
             shutil.copytree(self.folder.chain, copied.chain)
             shutil.copyfile(self.folder.backend, copied.backend)
+            run.write_files(self, copied, FigureWorker())
+            # Predictions that were asked for now may have needed them.
             pairs = ((self.folder.search, copied.search), (self.folder.rivals, copied.rivals))
             for kept, copy in pairs:
                 if kept.exists():
                     shutil.copyfile(kept, copy)
-            run.write_files(self, copied, FigureWorker())
         return copied.path
 
     @property

@@ -260,7 +260,8 @@ def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArr
 
 def _half_units(values: FloatArray) -> FloatArray | None:
     """Return half a unit of the last significant digit of each number, if they have at most 12."""
-    size = np.abs(values)
+    # Below the smallest normal numbers there are no digits to count.
+    size = np.where(np.abs(values) < 1e-290, 0.0, np.abs(values))
     exponent = np.floor(np.log10(np.where(size > 0, size, 1.0)))
     for digits in range(3, 13):
         unit = 10.0 ** (exponent - digits + 1)
