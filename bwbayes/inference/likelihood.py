@@ -31,9 +31,9 @@ from bwbayes.shown import brief
 def batches(models: int, samples: int, elements: int = 1 << 23) -> Iterator[slice]:
     """Cut a number of models into batches of so many elements, by default what memory holds.
 
-    A batch has 64 at most: enough to share the loop over turns.
+    A batch has 64 at most, or what 16,384 elements hold: enough to share what is done once for all.
     """
-    size = min(max(elements // samples, 1), 64)
+    size = min(max(elements // samples, 1), max(64, (1 << 14) // samples))
     return (slice(i, min(i + size, models)) for i in range(0, models, size))
 
 
