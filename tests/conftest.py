@@ -4,12 +4,14 @@ Elsewhere hypothesis looks for new ones in every run, and keeps those that fail 
 The tests of the whole come first: they take longest, and no worker shall end with one alone. Before
 them come the tools, which need nothing compiled: while one worker checks types, another compiles.
 Rooms whose files take a second or two come last, so that all workers end at about the same time.
+Commands of other processes take this checkout too, and what is compiled of it, not an installation.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -18,6 +20,8 @@ from tests.programs import REQUIRED, VARIABLE
 
 # As the command line does: what is compiled here makes as many objects that stay.
 gc.set_threshold(50_000)
+
+os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
 
 settings.register_profile("busy", deadline=None, derandomize=os.environ.get(VARIABLE) == REQUIRED)
 settings.load_profile("busy")
