@@ -75,7 +75,8 @@ def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folde
 
 def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(folder: Path) -> None:
     """And a chain from before the voltage's noise was removed is not read."""
-    text = TEXT + 'hysteresis = "linear"\n[sampling]\ness = 100\nsteps = 200\nblock = 25\n'
+    model = 'hysteresis = "linear"\nsearch = "none"\n'
+    text = f"{TEXT}{model}[sampling]\ness = 100\nsteps = 200\nblock = 25\n"
     kept = RunFolder.create(folder / "run", resolve_config(parse(text, "my.toml"), folder))
     fit = resume(kept, small.quiet(), workers=1, predict=False)
     posterior, chain = fit.problem.posterior, fit.chain
