@@ -42,7 +42,6 @@ alpha = { prior = { distribution = "normal", mean = 0.3, sd = 0.05 } }
 sensor_sd = { prior = { distribution = "lognormal", median = 0.5, sigma = 0.3 } }
 
 [sampling]
-engine = "numpy"
 ess = 100
 walkers = 12
 block = 10

@@ -39,7 +39,8 @@ PLAN = SamplingPlan(ess=100, walkers=12, block=10, max_pilot_steps=30, max_steps
 def small(**changes: object) -> CalibrationSetup:
     """Return an experiment of 80 samples, of which 20 are held out."""
     posterior = short_posterior("white", 80, fixed=FIXED, priors=PRIORS, training=(slice(0, 60),))
-    return replace(CalibrationSetup(posterior, PLAN, {"record": [slice(60, 80)]}), **changes)  # type: ignore[arg-type]
+    fast = replace(posterior, engine="numba")
+    return replace(CalibrationSetup(fast, PLAN, {"record": [slice(60, 80)]}), **changes)  # type: ignore[arg-type]
 
 
 def test_replicate_depends_on_seed_and_number_alone() -> None:
