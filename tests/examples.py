@@ -51,8 +51,9 @@ SHORTER = {
 }
 
 # So are what a command does by default, and its options: pictures are blank, pages have no plots,
-# models and simulated actuators are few.
+# no stage of others is tried, models and simulated actuators are few.
 DEFAULTS = {
+    "bwbayes.app.running.explaining.explain": lambda *_, **__: (),
     "bwbayes.report.figures.plots_of": lambda _: NO_PLOTS,
     "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
     "bwbayes.report.outputs.picture_of": lambda *_: picture_of(Figure),

@@ -38,19 +38,21 @@ def block(name: str) -> str:
 
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Run the README's first command, but for the installation."""
+    """Run the README's first command, but for the installation, pictures and explanations."""
     folder = tmp_path_factory.mktemp("readme") / "ring_bender"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["bwbayes", "run", "runs/ring_bender.toml", "--out", str(folder)])
         patch.chdir(ROOT)
         small.without_pictures(patch)
+        small.without_explanations(patch)
         with pytest.raises(SystemExit) as ended:
             cli.main()
     assert ended.value.code == 0
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 
-def test_the_lines_of_python_go_from_arrays_to_bands() -> None:
+def test_the_lines_of_python_go_from_arrays_to_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    small.without_explanations(monkeypatch)
     stand = VirtualTestStand(discrepancy="none", sample_rate=500.0)
     generator = np.random.default_rng(1)
     record = stand.run(Waveform(Sine(100.0, 1.0), 7.0, decay=Decay(0.0, 0.1)), generator)

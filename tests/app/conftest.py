@@ -41,6 +41,12 @@ def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     small.without_pictures(monkeypatch)
 
 
+@pytest.fixture
+def _without_explanations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the time that fits of every defect take."""
+    small.without_explanations(monkeypatch)
+
+
 @dataclass(frozen=True)
 class Said:
     """What a command said, and its exit status."""

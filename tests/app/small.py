@@ -74,6 +74,11 @@ def without_pictures(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
 
 
+def without_explanations(patch: pytest.MonkeyPatch) -> None:
+    """Spare the time that fits of every defect take, where none is looked for."""
+    patch.setattr("bwbayes.app.running.explaining.explain", lambda *_, **__: ())
+
+
 def quiet() -> Console:
     """Return a console that prints nothing."""
     return Console(quiet=True)
