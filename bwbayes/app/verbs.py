@@ -1,12 +1,14 @@
-"""The verbs of a run, a line each, from which their commands, methods and help come.
+"""The verbs, a line each, from which commands, methods of a fit and the help of both come.
 
-A verb is a function of a ``fit`` and a ``watch`` that returns a
-:class:`~bwbayes.report.report.Product`. Its command takes the FOLDER of a run, shows the progress,
-saves and shows the product, and ends with the worse of the run's and the product's status. Its
-method of :class:`bwbayes.Run` warns where the command shows a note. Positional arguments are words;
-keyword arguments are options of the same names, types and defaults. The help is the docstring: its
-text before the parameters, the first sentence on each parameter, and the first command among the
-examples.
+A verb is a function. Its positional arguments are words of the command, its keyword arguments
+options of the same names, types and defaults. The help is the docstring: its text before the
+parameters, the first sentence on each parameter, and the first command among the examples.
+
+`VERBS` are functions of a ``fit`` and a ``watch`` that return a
+:class:`~bwbayes.report.report.Product`. Their commands take the FOLDER of a run, show the progress,
+save and show the product, and end with the worse of the run's and the product's status; their
+methods of :class:`bwbayes.Run` warn where the commands show a note. `COMMANDS` are all others. They
+return an exit status, a text to be shown, or the files that they have written.
 
 A verb's source is read, not loaded: loading it takes a second, and neither ``--help`` nor
 completion should wait for that.
@@ -16,61 +18,76 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
 class Verb:
-    """A function of a run, and its names on the command line where they differ.
+    """A function that is a command, and its names on the command line where they differ.
 
     Parameters
     ----------
     place
         Where it is: ``"package.module:name"``.
+    also
+        The function whose keyword arguments its ``**options`` are, with their help.
+    command
+        The command's name, if not the function's.
     flags
-        Names of options that differ from their arguments'.
+        Names of options and words that differ from their arguments'; one without is no option.
     either
-        The ways to give the argument after the fit: a word, an option, or an option with a FILE;
+        The ways to give the first argument: a word, an option, or an option with a FILE;
         and how the error for none or two of them calls each. The argument's description has a
         sentence on each way, in their order.
     instead
-        The option that takes the place of that argument.
+        The option that takes the place of that argument, and how that error calls it.
     below
-        Subfolder of FOLDER for the files, by default the verb's name; NAME is the argument's.
+        Subfolder of a run's FOLDER for the files, by default the verb's name; NAME is the
+        argument's.
+    parts
+        Whether the help lists the parts that a model may have.
     """
 
     place: str
+    also: str = ""
+    command: str = ""
     flags: Mapping[str, str] = field(default_factory=dict)
     either: Mapping[str, str] = field(default_factory=dict)
-    instead: str = ""
+    instead: Mapping[str, str] = field(default_factory=dict)
     below: str = ""
+    parts: bool = False
 
     @property
     def name(self) -> str:
-        """The name of function, command and method."""
-        return self.place.partition(":")[2]
+        """The name of the command and the method."""
+        return self.command or self.place.partition(":")[2]
 
     def load(self, name: str = "") -> Any:
         """Return the function itself, or what has another name in its module."""
-        return getattr(import_module(self.place.partition(":")[0]), name or self.name)
+        module, _, function = self.place.partition(":")
+        return getattr(import_module(module), name or function)
 
     @cached_property
     def _source(self) -> ast.FunctionDef:
         # The packages between would be loaded, if one asked for the module itself.
-        package, *inner = self.place.partition(":")[0].split(".")
+        module, _, name = self.place.partition(":")
+        package, *inner = module.split(".")
         spec = find_spec(package)
         path = Path(str(spec and spec.origin))
         if inner:
             path = path.parent.joinpath(*inner).with_suffix(".py")
-        body = ast.parse(path.read_text(encoding="utf-8")).body
-        functions = (node for node in body if isinstance(node, ast.FunctionDef))
-        return next(function for function in functions if function.name == self.name)
+        # Only the function's lines are parsed, to the next one that begins at the margin.
+        lines = rf"^def {name}\b.*\n(?:(?:[ )].*)?\n)*"
+        (text,) = re.findall(lines, path.read_text(encoding="utf-8"), re.MULTILINE)
+        (function,) = ast.parse(text).body
+        assert isinstance(function, ast.FunctionDef)
+        return function
 
     @cached_property
     def _sections(self) -> dict[str, str]:
@@ -98,31 +115,63 @@ class Verb:
         return returned.partition(" | ")[0]
 
     @property
-    def words(self) -> dict[str, str]:
-        """The type hints of the arguments after the fit without a default, or with None for one."""
-        args = self._source.args
-        defaults = [ast.unparse(default) for default in args.defaults]
-        has_value = [False] * (len(args.args) - len(defaults)) + [d != "None" for d in defaults]
-        return {
-            arg.arg: ast.unparse(arg.annotation).removesuffix(" | None")
-            for arg, valued in zip(args.args[1:], has_value[1:], strict=True)
-            if arg.annotation and not valued and arg.arg != "folder"  # --out, as of any command
-        }
+    def is_of_run(self) -> bool:
+        """Whether its first argument is a fit."""
+        first = self._source.args.args[:1]
+        return any(arg.annotation and ast.unparse(arg.annotation) == "Run" for arg in first)
 
-    def options(self) -> Iterator[tuple[str, str, Any, str]]:
-        """Yield name, type hint, default and help of the keyword arguments.
+    @property
+    def words(self) -> list[tuple[str, str, Literal["one", "optional", "several"]]]:
+        """Name, type hint and number of the arguments besides a fit.
 
-        All but those that every command has otherwise: ``--out``, ``--quiet`` and its progress.
+        Those without a default, or with None for one.
         """
         args = self._source.args
+        defaults = [""] * (len(args.args) - len(args.defaults))
+        defaults += [ast.unparse(default) for default in args.defaults]
+        words: list[tuple[str, str, Literal["one", "optional", "several"]]] = []
+        for arg, default in zip(args.args, defaults, strict=True):
+            # A run's folder for files is --out, as of any command of one.
+            is_word = default in ("", "None") and not (self.is_of_run and arg.arg == "folder")
+            if arg.annotation and is_word:
+                hint = ast.unparse(arg.annotation)
+                optional = self.either or hint.endswith(" | None")
+                words.append((arg.arg, hint, "optional" if optional else "one"))
+        if args.vararg is not None and args.vararg.annotation is not None:
+            words.append((args.vararg.arg, ast.unparse(args.vararg.annotation), "several"))
+        return words[1:] if self.is_of_run else words
+
+    def options(self) -> dict[str, tuple[str, Any, str]]:
+        """Return type hint, default and help of the keyword arguments, by name.
+
+        All but those that are no option of a command, or one of every command of a run.
+        """
+        args = self._source.args
+        further = Verb(self.also).options() if self.also else {}
+        options = dict[str, tuple[str, Any, str]]()
         for arg, default in zip(args.kwonlyargs, args.kw_defaults, strict=True):
-            if arg.annotation and default and arg.arg not in ("folder", "progress", "watch"):
+            if arg.annotation and arg.arg not in ("folder", "progress", "watch"):
                 hint = ast.unparse(arg.annotation).removesuffix(" | None")
-                yield arg.arg, hint, ast.literal_eval(default), self.sentences(arg.arg)[0]
+                value = None if default is None else ast.literal_eval(default)
+                text = self.sentences(arg.arg)[0] or further.get(arg.arg, ("", None, ""))[2]
+                options[arg.arg] = hint, value, text
+        words = [word.arg for word in args.args]
+        return options | {
+            key: option
+            for key, option in further.items()
+            if key not in options and key not in words
+        }
 
 
+# Of a run.
 VERBS = (
-    Verb("bwbayes.app.jobs.predict:predict"),
+    Verb(
+        "bwbayes.app.jobs.predict:predict",
+        flags={"estimate_offset": "estimate-offset/same-offset", "name": ""},
+        either={"--record/--voltage FILE": "a record"},
+        instead={"signal": "a signal"},
+        below="predictions/NAME.csv",
+    ),
     Verb(
         "bwbayes.app.jobs.control:compensate",
         flags={"smoothed": "smooth"},
@@ -132,8 +181,48 @@ VERBS = (
     Verb(
         "bwbayes.app.jobs.design:design",
         either={"--parameter": "a parameter", "--drive FILE": "a drive"},
-        instead="validate",
+        instead={"validate": "--validate"},
     ),
     Verb("bwbayes.app.jobs.control:export"),
     Verb("bwbayes.app.jobs.control:track", flags={"frequencies": "frequency"}),
+)
+
+PAIR = "--voltage FILE and --displacement FILE"
+
+# All others: from a record to a run, many of them, and what there is without any.
+COMMANDS = (
+    Verb("bwbayes.app.commands.fitting:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}),
+    Verb(
+        "bwbayes.app.commands.fitting:check", either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR}
+    ),
+    Verb(
+        "bwbayes.app.commands.fitting:run",
+        also="bwbayes.app.fit.calls:fit",
+        either={"CONFIG": "CONFIG,", "--voltage FILE": PAIR},
+    ),
+    Verb("bwbayes.app.commands.fitting:resume", also="bwbayes.app.fit.calls:resume"),
+    Verb("bwbayes.app.commands.fitting:report"),
+    Verb("bwbayes.app.commands.studies:compare", also="bwbayes.app.fit.calls:compare", parts=True),
+    Verb(
+        "bwbayes.app.commands.studies:campaign",
+        also="bwbayes.app.fit.calls:campaign",
+        flags={"resumed": "resume"},
+    ),
+    Verb(
+        "bwbayes.app.commands.studies:calibrate",
+        also="bwbayes.app.jobs.calibrate:resume",
+        flags={"resumed": "resume"},
+    ),
+    Verb("bwbayes.app.jobs.simulate:simulate"),
+    Verb(
+        "bwbayes.app.config.reference:config_reference",
+        command="config",
+        flags={"requested": "KEY"},
+    ),
+    Verb(
+        "bwbayes.app.config.reference:parts_reference",
+        command="models",
+        flags={"requested": "NAME"},
+        parts=True,
+    ),
 )

@@ -418,6 +418,11 @@ class Product(Shown):
         """Return what is saved beside the report, as CSV, by name."""
         return {}
 
+    @classmethod
+    def files(cls, folder: Path) -> list[Path]:
+        """Return the files that say that it is saved there already."""
+        return [folder / f"{cls.NAME}.json"]
+
     def save(
         self, folder: str | Path, *, overwrite: bool = False, watch: Watch = unwatched
     ) -> list[Path]:

@@ -11,9 +11,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
+from bwbayes.app.commands.cli import cli
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS
@@ -43,6 +45,15 @@ def test_help_names_every_command(bwbayes: Type) -> None:
         assert (0, "") == (said.status, said.err)
         assert all(f"  {command} " in said.out for command in COMMANDS.split())
     assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", bwbayes("--version").out)
+
+
+def test_help_explains_every_option() -> None:
+    for name in COMMANDS.split():
+        command = cli.commands[name]
+        assert "Example: bwbayes" in str(command.help)
+        for option in command.params:
+            if isinstance(option, click.Option):
+                assert (option.help or "").endswith("."), f"{name} {option.opts}"
 
 
 def test_python_runs_the_package_as_the_command() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.commands.products import predict
+from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.problem.problem import resolve_config
@@ -39,7 +39,7 @@ def resumed(folder: RunFolder) -> None:
 
 
 def predicted(folder: RunFolder) -> None:
-    small.typed(predict, folder.path, "--signal", "sine")
+    small.typed(cli, "predict", folder.path, "--signal", "sine")
 
 
 @pytest.mark.parametrize("use", [redraw, resumed, predicted])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.commands.products import predict
+from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import StandConfig
 from bwbayes.app.fit.fitted import Run
@@ -184,7 +184,7 @@ def test_a_prediction_is_the_command_lines(
 ) -> None:
     copy, out = tmp_path / "sine.h5", tmp_path / "theirs.csv"
     shutil.copyfile(folder / "records/sine.h5", copy)
-    small.typed(predict, folder, "--record", copy, "--from-rest", "--out", out, *words)
+    small.typed(cli, "predict", folder, "--record", copy, "--from-rest", "--out", out, *words)
     write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True, **options)])
     assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
 

@@ -18,36 +18,24 @@ import threading
 import warnings
 from collections import UserDict
 from concurrent.futures import BrokenExecutor
-from importlib import import_module
 from types import FrameType
 from typing import Any
 
 import click
 
 from bwbayes.app.commands.shared import as_typed
-from bwbayes.app.verbs import VERBS, Verb
+from bwbayes.app.verbs import COMMANDS, VERBS
 from bwbayes.errors import ColumnsError, ExitStatus, InputError, NotConvergedError, one_line
-
-# Commands that are more than a verb of a run, by their modules.
-COMMANDS = {
-    "fitting": ("check", "init", "report", "resume", "run"),
-    "products": ("predict",),
-    "studies": ("calibrate", "campaign", "compare", "config", "models", "simulate"),
-}
 
 
 class Commands(UserDict[str, Any]):
-    """Commands by name, each loaded or made when it is asked for."""
+    """Commands by name, each made of its verb when it is asked for."""
 
     def __getitem__(self, name: str) -> click.Command:
         """Return a command."""
-        source = self.data[name]
-        if isinstance(source, Verb):
-            from bwbayes.app.commands.products import command_of
+        from bwbayes.app.commands.command import command_of
 
-            return command_of(source)
-        command: click.Command = getattr(import_module(f"bwbayes.app.commands.{source}"), name)
-        return command
+        return command_of(self.data[name])
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -61,8 +49,7 @@ def cli() -> None:
     """
 
 
-cli.commands = Commands({verb.name: verb for verb in VERBS})
-cli.commands.update({name: module for module, names in COMMANDS.items() for name in names})
+cli.commands = Commands({verb.name: verb for verb in (*VERBS, *COMMANDS)})
 
 
 def _failure(error: BaseException) -> tuple[str, int]:

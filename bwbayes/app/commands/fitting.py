@@ -9,23 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from bwbayes.app.commands.shared import (
-    FILE,
     command_as_typed,
-    file_argument,
     finish,
-    folder_argument,
-    naming_options,
-    options_of,
-    quiet_option,
     refuse_beside_config,
     resumable,
-    search_option,
-    seed_option,
+    show_paths,
     show_report,
     working,
 )
 from bwbayes.app.running.figure_worker import open_figure_worker
-from bwbayes.app.verbs import Verb
 from bwbayes.errors import (
     ColumnsError,
     InputError,
@@ -39,40 +31,58 @@ if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.config.proposal import ConfigProposal
 
+type Reading = dict[str, Any]
+"""How a record's file is read, as keyword arguments of ``read_record``."""
 
-@click.command()
-@file_argument("record")
-@naming_options
-@click.option("--out", type=FILE, help="The config; default: NAME-OF-RECORD.toml.")
-def init(record: Path, out: Path | None, **naming: Any) -> int:
+
+def init(record: Path, *, reading: Reading, out: Path | None) -> int:
     """Write a commented config for RECORD.
 
-    Example: bwbayes init my_record.csv --unit displacement=nm
+    Parameters
+    ----------
+    record
+        A record's file. A record's file with the voltage, if --displacement has the rest.
+    out
+        The config; default: NAME-OF-RECORD.toml.
+
+    Examples
+    --------
+    bwbayes init my_record.csv --unit displacement=nm
     """
     out = out or record.with_suffix(".toml")
     if out.exists():
         raise InputError(f"{out}: exists; edit it, or choose another name with --out")
-    proposal = _proposed(record, out.parent, naming)
+    proposal = _proposed(record, out.parent, reading)
     with refuse_unwritable(out, "choose another place with --out"):
         out.write_text(proposal.text, encoding="utf-8")
     _show(proposal, f"wrote {out}; next: `bwbayes check {out}`, then `bwbayes run {out}`")
     return 0
 
 
-@click.command()
-@file_argument("config")
-@click.option("--record", type=FILE, help="Check this record instead of the config's.")
-@naming_options
-@click.option("--out", type=FILE, help="Folder of the page; default: results/NAME-check.")
-@search_option
 def check(
-    config: Path, record: Path | None, out: Path | None, search: str | None, **naming: Any
+    config: Path,
+    *,
+    record: Path | None,
+    reading: Reading,
+    out: Path | None,
+    search: str | None,
 ) -> int:
     """Check a CONFIG or record for issues and compute a MAP estimate; no sampling.
 
-    Example: bwbayes check runs/measured_stack.toml --record my_record.csv
+    Parameters
+    ----------
+    config
+        A config, or a record. A record's file with the voltage, if --displacement has the rest.
+    record
+        Check this record instead of the config's.
+    out
+        Folder of the page; default: results/NAME-check.
+
+    Examples
+    --------
+    bwbayes check runs/measured_stack.toml --record my_record.csv
     """
-    chosen, _ = _config_or_proposal(config, record, naming, "check", quiet=True)
+    chosen, _ = _config_or_proposal(config, record, reading, "check", quiet=True)
     chosen = chosen.searched(search)
     out = out or Path("results") / f"{config.stem}-check"
     with working() as watch:
@@ -84,32 +94,35 @@ def check(
     return 0
 
 
-@click.command()
-@file_argument("config")
-@click.option("--record", type=FILE, help="Fit this record instead of the config's.")
-@naming_options
-@click.option("--out", type=FILE, help="The run's folder; default: results/NAME-OF-CONFIG.")
-@seed_option
-@search_option
-@options_of(Verb("bwbayes.app.fit.calls:fit"))
-@quiet_option
 def run(
     config: Path,
+    *,
     record: Path | None,
+    reading: Reading,
     out: Path | None,
     seed: int | None,
-    overwrite: bool,
     search: str | None,
+    overwrite: bool,
     workers: int | None,
-    executor: str | None,
     quiet: bool,
-    **naming: Any,
+    **options: Any,
 ) -> int:
     """Fit a model to a record: sample the posterior, predict, write the report.
 
     CONFIG is a config in TOML, or a record without one.
 
-    Example: bwbayes run runs/ring_bender.toml --out results/ring_bender
+    Parameters
+    ----------
+    config
+        A config, or a record. A record's file with the voltage, if --displacement has the rest.
+    record
+        Fit this record instead of the config's.
+    out
+        The run's folder; default: results/NAME-OF-CONFIG.
+
+    Examples
+    --------
+    bwbayes run runs/ring_bender.toml --out results/ring_bender
     """
     # First of all: it loads what draws while this process loads what samples.
     with open_figure_worker(workers) as figure_worker:
@@ -119,7 +132,7 @@ def run(
             from bwbayes.report.report import Report, remarks_banner
             from bwbayes.report.tables import priors_table
 
-        chosen, is_proposal = _config_or_proposal(config, record, naming, "run", quiet=quiet)
+        chosen, is_proposal = _config_or_proposal(config, record, reading, "run", quiet=quiet)
         chosen = chosen.renamed(path_text(config.stem), seed)
         path = out or Path("results") / config.stem
         chosen = chosen.searched(search)
@@ -135,44 +148,43 @@ def run(
                 said: Any = {"banners": banners, "quantities": problem.quantities}
                 priors = priors_table(problem.posterior.prior)
                 show_report(Report(title="priors", blocks=[priors], **said))
-            options = {"workers": workers, "executor": executor, "figure_worker": figure_worker}
+            options |= {"workers": workers, "figure_worker": figure_worker}
             return finish(folder.path, quiet=quiet, problem=problem, **options)
 
 
-@click.command()
-@folder_argument
-@options_of(Verb("bwbayes.app.fit.calls:resume"))
-@quiet_option
-def resume(folder: Path, quiet: bool, **options: Any) -> int:
+def resume(folder: Path, *, workers: int | None, quiet: bool, **options: Any) -> int:
     """Resume the run in FOLDER, interrupted or short of its target.
 
-    Example: bwbayes resume results/ring_bender --steps 40000
+    Examples
+    --------
+    bwbayes resume results/ring_bender --steps 40000
     """
-    with open_figure_worker(options["workers"]) as figure_worker:
+    with open_figure_worker(workers) as figure_worker:
         with working():
             import bwbayes.app.running.run  # noqa: F401  # what takes long to load
 
-        return finish(folder, quiet=quiet, figure_worker=figure_worker, **options)
+        options |= {"workers": workers, "figure_worker": figure_worker}
+        return finish(folder, quiet=quiet, **options)
 
 
-@click.command()
-@folder_argument
 def report(folder: Path) -> int:
     """Draw the pictures and the page of the run in FOLDER again.
 
-    Example: bwbayes report results/ring_bender
+    Examples
+    --------
+    bwbayes report results/ring_bender
     """
     with working() as watch:
         from bwbayes.app.running.folder import RunFolder
         from bwbayes.app.running.run import redraw
 
         redraw(RunFolder.open(folder), watch)
-    click.echo(f"wrote {folder / 'report.html'}")
+    show_paths([folder / "report.html"])
     return 0
 
 
 def _config_or_proposal(
-    path: Path, record: Path | None, naming: dict[str, Any], command: str, *, quiet: bool
+    path: Path, record: Path | None, reading: Reading, command: str, *, quiet: bool
 ) -> tuple[Config, bool]:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
 
@@ -183,23 +195,23 @@ def _config_or_proposal(
 
     if is_config(path):
         config = load(path)
-        refuse_beside_config(path, naming)
+        refuse_beside_config(path, reading)
         return config if record is None else config.with_record(record), False
     try:
-        proposal = _proposed(path, path.parent, naming)
+        proposal = _proposed(path, path.parent, reading)
     except NoNumbersError:
         raise InputError(
             f"{path}: is no config, and no record; a config has a table [record], a record columns "
             "of numbers"
         ) from None
     config = proposal.config
-    tables = {key: naming[key] for key in ("columns", "units", "covariates")}
+    tables = {key: reading[key] for key in ("columns", "units", "covariates")}
     init = f"bwbayes init {shlex.quote(str(path))}"
     options = ("table", "displacement_file", "input", "output")
     for key in options:
         option = key.removesuffix("_file")
-        init += "" if naming[key] is None else f" --{option} {shlex.quote(str(naming[key]))}"
-    init = with_naming(init, tables, naming["fs"])
+        init += "" if reading[key] is None else f" --{option} {shlex.quote(str(reading[key]))}"
+    init = with_naming(init, tables, reading["fs"])
     if command != "check" and proposal.blocking_issue is not None:
         raise InputError(
             f"{path}: {proposal.blocking_issue.error}; if the record is right as it is, "
@@ -215,14 +227,14 @@ def _config_or_proposal(
     return config if record is None else config.with_record(record), True
 
 
-def _proposed(path: Path, where: Path, naming: dict[str, Any]) -> ConfigProposal:
+def _proposed(path: Path, where: Path, reading: Reading) -> ConfigProposal:
     """Propose a config; of unknown columns say the command that settles them."""
     try:
         with working():
             from bwbayes.app.config.proposal import draft_config
             from bwbayes.record.io.columns import Naming
 
-            stated = Naming.stated(**naming)
+            stated = Naming.stated(**reading)
             with stated.quantities.spoken():
                 return draft_config(path, where, stated)
     except ColumnsError as error:

@@ -1,4 +1,4 @@
-"""Commands that need no run: studies of many fits, ``simulate``, and the printed reference."""
+"""Studies of many fits: ``bwbayes compare``, ``campaign`` and ``calibrate``."""
 
 from __future__ import annotations
 
@@ -9,52 +9,19 @@ import click
 from rich.console import Console
 
 from bwbayes.app.commands.shared import (
-    FILE,
-    WithParts,
-    column_options,
-    options_of,
     present,
-    quiet_option,
-    reading_of,
     refuse_beside_config,
     require_new_or_resumed,
     resumable,
-    seed_option,
     show_report,
     working,
 )
-from bwbayes.app.config import USUAL_MODELS
-from bwbayes.app.verbs import Verb
 from bwbayes.errors import ExitStatus
 
 
-@click.command()
-@click.argument("out", type=FILE)
-@options_of(Verb("bwbayes.app.jobs.simulate:simulate"))
-def simulate(out: Path, **options: Any) -> int:
-    """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
-
-    Example: bwbayes simulate ring.csv --signal verification --seed 7
-    """
-    with working():
-        from bwbayes.app.jobs.simulate import simulate as write
-
-        files = write(out, **options)
-    for path in files:
-        click.echo(f"wrote {path}")
-    return 0
-
-
-@click.command()
-@click.argument("config", type=FILE, required=False)
-@click.option("--resume", "resumed", type=FILE, help="Resume the calibration in this folder.")
-@click.option("--out", type=FILE, help="Its folder; default: results/NAME-OF-CONFIG-calibration.")
-@seed_option
-@click.option("--overwrite", is_flag=True, help="Replace an existing calibration.")
-@options_of(Verb("bwbayes.app.jobs.calibrate:resume"))
-@quiet_option
 def calibrate(
     config: Path | None,
+    *,
     resumed: Path | None,
     out: Path | None,
     seed: int | None,
@@ -69,7 +36,18 @@ def calibrate(
     as a run does. Exit status 4: the posteriors are not what they say, or more than 1% of the
     replicates did not converge.
 
-    Example: bwbayes calibrate runs/calibration.toml --replicates 500
+    Parameters
+    ----------
+    resumed
+        Resume the calibration in this folder.
+    out
+        Its folder; default: results/NAME-OF-CONFIG-calibration.
+    overwrite
+        Replace an existing calibration.
+
+    Examples
+    --------
+    bwbayes calibrate runs/calibration.toml --replicates 500
     """
     with working():
         from bwbayes.app.config.config import load
@@ -101,25 +79,15 @@ def calibrate(
     return ExitStatus.NOT_CONVERGED
 
 
-@click.command()
-@click.argument("folder", type=FILE, required=False)
-@click.option("--config", type=FILE, help="Config of all records; default: each proposes its own.")
-@click.option("--out", type=FILE, help="The campaign's folder; default: results/NAME-OF-FOLDER.")
-@click.option("--resume", "resumed", type=FILE, help="Resume the campaign in this folder.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing campaign.")
-@click.option("--no-pictures", is_flag=True, help="Leave out the runs' own figures and reports.")
-@column_options
-@options_of(
-    Verb("bwbayes.app.fit.calls:campaign"), "config", "folder", "overwrite", "pictures", "progress"
-)
-@quiet_option
 def campaign(
     folder: Path | None,
+    *,
     config: Path | None,
     out: Path | None,
     resumed: Path | None,
     overwrite: bool,
-    no_pictures: bool,
+    pictures: bool = True,
+    reading: dict[str, Any],
     quiet: bool,
     **options: Any,
 ) -> int:
@@ -129,14 +97,28 @@ def campaign(
     Exit status: 2 if records were refused, else 4 if some did not converge, else 3 if validation
     failed for some, else 5 if it is inconclusive; every record is in the table in any case.
 
-    Example: bwbayes campaign records/ --config my.toml --out results/batch
+    Parameters
+    ----------
+    config
+        Config of all records; default: each proposes its own.
+    out
+        The campaign's folder; default: results/NAME-OF-FOLDER.
+    resumed
+        Resume the campaign in this folder.
+    overwrite
+        Replace an existing campaign.
+    pictures
+        Draw each run's own figures and report.
+
+    Examples
+    --------
+    bwbayes campaign records/ --config my.toml --out results/batch
     """
     with working():
         from bwbayes.app.jobs.campaign import config_text, resume, start
         from bwbayes.app.running.folder import CampaignFolder
 
-    reading = reading_of(options, folder, "a FOLDER of records")
-    new = {"out": out, "config": config, "overwrite": overwrite, "pictures": no_pictures}
+    new = {"out": out, "config": config, "overwrite": overwrite, "pictures": not pictures}
     require_new_or_resumed(
         "campaign", "a FOLDER of records or --resume CAMPAIGN", folder, resumed, new
     )
@@ -148,7 +130,7 @@ def campaign(
             refuse_beside_config(config, reading)
             text, where = config_text(config), config.parent
         out = out or Path("results") / folder.absolute().name
-        kept = {"pictures": not no_pictures, "overwrite": overwrite}
+        kept = {"pictures": pictures, "overwrite": overwrite}
         batch = start(folder, text, where, out, **kept, reading=reading)
     with resumable(batch.resuming):
         result = resume(batch, Console(stderr=True, quiet=quiet), **options)
@@ -161,15 +143,7 @@ def campaign(
     return result.exit_status
 
 
-@click.command(cls=WithParts)
-@click.argument("paths", type=FILE, nargs=-1, required=True)
-@click.option("--models", help=f"Models to fit to a CONFIG's record; default: {USUAL_MODELS}.")
-@click.option("--out", type=FILE, help="Its folder; default: results/comparison, or by the config.")
-@options_of(Verb("bwbayes.app.fit.calls:compare"), "models")
-@quiet_option
-def compare(
-    paths: tuple[Path, ...], models: str | None, out: Path | None, quiet: bool, **options: Any
-) -> int:
+def compare(*paths: Path, models: str | None, out: Path | None, quiet: bool, **options: Any) -> int:
     """Compare the runs in folders PATHS, or models that one config is run with.
 
     Reports joint log scores of later readings given earlier ones, with errors; log evidence; a
@@ -177,7 +151,16 @@ def compare(
     dynamics and noise follow after plus signs. Models out of reach at their MAP estimates are only
     screened.
 
-    Example: bwbayes compare results/bender results/bender_plays
+    Parameters
+    ----------
+    models
+        Models to fit to a CONFIG's record; default: seven usual ones, see below.
+    out
+        Its folder; default: results/comparison, or by the config.
+
+    Examples
+    --------
+    bwbayes compare results/bender results/bender_plays
     """
     with working():
         import bwbayes.app.jobs.compare  # noqa: F401  # what takes long to load
@@ -187,29 +170,3 @@ def compare(
     out = out or Path("results") / (f"{paths[0].stem}-comparison" if alone else "comparison")
     comparison = compare_runs(*paths, models=models, folder=out, progress=not quiet, **options)
     return present(comparison, [out / "comparison.html"], comparison.standing, quiet=quiet)
-
-
-@click.command()
-@click.argument("key", required=False)
-def config(key: str | None) -> int:
-    """Print the keys of a config: type, unit, default and an example; of all, or of one KEY.
-
-    Example: bwbayes config record.train
-    """
-    from bwbayes.app.config.reference import config_reference
-
-    click.echo(config_reference(key))
-    return 0
-
-
-@click.command(cls=WithParts)
-@click.argument("name", required=False)
-def models(name: str | None) -> int:
-    """Print the parts of a model, or of one NAME its equation, parameters and default priors.
-
-    Example: bwbayes models prandtl-ishlinskii
-    """
-    from bwbayes.app.config.reference import parts_reference
-
-    click.echo(parts_reference(name))
-    return 0

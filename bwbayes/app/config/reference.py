@@ -45,12 +45,22 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 
 
 def config_reference(requested: str | None) -> str:
-    """Describe a config's keys: all of them, or those of a name or path.
+    """Describe the keys of a config: type, unit, default and an example; of all, or of one KEY.
 
-    A path may have the user's own names in it, and may leave out its first tables:
-    ``parameters.d.prior``, ``ess``.
+    Parameters
+    ----------
+    requested
+        Its name or path. A path may have the user's own names in it, and may leave out its first
+        tables: ``parameters.d.prior``, ``ess``.
 
-    Raises InputError: there is no such key.
+    Raises
+    ------
+    InputError
+        There is no such key.
+
+    Examples
+    --------
+    bwbayes config record.train
     """
     documented = keys(Config)
     if requested is None:
@@ -104,11 +114,21 @@ def _wrapped(text: str, indent: str = "") -> str:
 
 
 def parts_reference(requested: str | None) -> str:
-    """Describe a model's parts: each in a line, or one of them in full.
+    """Describe the parts of a model, or of one NAME its equation, parameters and default priors.
 
-    ``requested`` is a part's name or the import path of one from outside.
+    Parameters
+    ----------
+    requested
+        A part's name, or the import path of one from outside.
 
-    Raises InputError: there is no such part.
+    Raises
+    ------
+    InputError
+        There is no such part.
+
+    Examples
+    --------
+    bwbayes models prandtl-ishlinskii
     """
     if requested is not None:
         matches = [

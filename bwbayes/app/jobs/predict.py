@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
-from bwbayes.diagnosis.validation import ValidationSummary
-from bwbayes.errors import InputError, path_text, refuse_unwritable, suggestion
+from bwbayes.errors import InputError, path_text, suggestion
 from bwbayes.prediction.initial_state import InitialConditions
-from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_named
 from bwbayes.record.waveforms import signal as named_signal
-from bwbayes.report.figures import picture_of
-from bwbayes.report.outputs import write_bands, write_summary
-from bwbayes.watching import Watch, WatchSteps, part, unwatched
+from bwbayes.watching import WatchSteps, unwatched
 
 
 def predict(
@@ -43,16 +42,19 @@ def predict(
     reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
 ) -> Prediction:
-    """Predict another record, a planned voltage without a displacement, or a signal.
+    """Predict displacement bands for another record or voltage.
+
+    A record of the same columns as the run's is read as that was. Beside the bands, their scores
+    (JSON) and a figure. Exit status 3: validation failed on the record; 5: it is inconclusive.
 
     Parameters
     ----------
     fit
         The fit to use.
     record
-        The record or its file, at any sampling interval. A file of the same columns as that of the
-        training record is read as that was. A voltage without readings is a plan, and drives the
-        model as it is, noise included.
+        The record to predict, measured or a voltage alone, or its file; at any sampling interval.
+        A file of the same columns as that of the training record is read as that was. A voltage
+        without readings is a plan, and drives the model as it is, noise included.
     signal
         A signal to predict instead, by its name.
     name
@@ -94,6 +96,12 @@ def predict(
     -----
     InputWarning
         A drive beyond what was fitted; bands that do not hold, with the likeliest cause.
+
+    Examples
+    --------
+    ``fit.predict("new.csv", lead_in=2.0).save("new_bands.csv")`` writes what this writes::
+
+        bwbayes predict results/ring_bender --record new.csv --lead-in 2
     """
     if (record is None) == (signal is None):
         raise InputError("predict: give either a record or a signal")
@@ -101,7 +109,7 @@ def predict(
         raise InputError(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
-    problem = fit.problem
+    problem, watching, hints = fit.problem, partial(watch, "predictions"), list[str]()
     of = of or next(iter(problem.records))
     if of not in problem.records:
         hint = suggestion(of, problem.records)
@@ -115,10 +123,10 @@ def predict(
                 "predicted whole"
             )
         if after:
-            watching = partial(watch, "predictions")
-            return predict_after(
+            prediction = predict_after(
                 problem, fit.flat_draws, voltage, name, of, fit.widening_rivals, watching
             )
+            return replace(prediction, run_validation=fit.standing)
         record = Record(voltage, None, interval=interval, origin=f"{signal} signal")
     elif not isinstance(record, Record | str | Path):
         raise InputError(
@@ -127,11 +135,17 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
-        reading = {**(reading or {}), "table": table, "displacement_file": displacement_file}
-        reading_options = column_options_from(record, problem.config.records[of].read_as, reading)
+        file = Path(record)
+        reading = {"table": table, "displacement_file": displacement_file, **(reading or {})}
+        reading_options = column_options_from(file, problem.config.records[of].read_as, reading)
         voltage_is = reading_options.pop("voltage_is", None)
         naming = Naming.stated(**reading_options)
-        record = read_named(Path(record), naming, voltage_is, need_displacement=False)
+        record = read_named(file, naming, voltage_is, need_displacement=False)
+        if record.displacement is None:
+            hints.append(
+                f"{file}: has no displacement that is recognized, so the bands are not validated; "
+                "if a column is one, say --column displacement=NAME"
+            )
     record = record.like(problem.records[of])
     record = record.without_values(problem.config.records[of].missing or ())
     hold = problem.config.model.hold
@@ -140,28 +154,15 @@ def predict(
         from_rest, estimate_offset, lead_in, lead_in_start, declared_hold, after
     )
     other = Validation((), record, start, window, of)
-    name, watching = name or "prediction", partial(watch, "predictions")
-    return predict_another(problem, fit.flat_draws, other, name, fit.widening_rivals, watching)
-
-
-def write_prediction(
-    prediction: Prediction,
-    files: Sequence[Path],
-    standing: ValidationSummary,
-    watch: Watch = unwatched,
-    quantities: Quantities = DEFAULT,
-) -> None:
-    """Write a prediction's bands (CSV), its scores with the run's standing (JSON), and a figure.
-
-    ``watch`` is called with the share that is done.
-
-    Raises InputError: they cannot be written.
-    """
-    table, numbers, picture = files
-    with refuse_unwritable(table):
-        table.parent.mkdir(parents=True, exist_ok=True)
-        write_bands(table, [prediction], part(watch, 0.0, 0.8), quantities)
-        said = prediction.numbers() | {"run_validation": standing.numbers}
-        write_summary(numbers, quantities.rendered(said))
-        picture.write_bytes(picture_of(prediction.said_in(quantities).plot))
-        watch(1.0)
+    prediction = predict_another(
+        problem, fit.flat_draws, other, name or "prediction", fit.widening_rivals, watching
+    )
+    is_said = any("--from-rest" in remark for remark in prediction.remarks)
+    if record.displacement is None and not (from_rest or after or is_said):
+        width = prediction.upper["sensor", 95] - prediction.lower["sensor", 95]
+        hints.append(
+            "the state that the actuator starts from is unknown: the 95% sensor band is "
+            f"{width[0]:.3g} um wide at first, {np.median(width):.3g} um in the median; if it is "
+            "demagnetized, say --from-rest"
+        )
+    return replace(prediction, hints=tuple(hints), run_validation=fit.standing)

@@ -27,7 +27,7 @@ def simulate(
     rate: float = 1000.0,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write a record, and beside it its true parameters; return what was written.
+    """Write a record of the virtual test stand to OUT (.csv, .h5, .mat), its truth beside it.
 
     Parameters
     ----------
@@ -55,6 +55,10 @@ def simulate(
     ------
     InputError
         An unknown signal, impossible values, or a file that exists already or cannot be written.
+
+    Examples
+    --------
+    bwbayes simulate ring.csv --signal verification --seed 7
     """
     parameters = out.with_name(f"{out.stem}.truth.json")
     truth_file = out.with_name(f"{out.stem}.truth{out.suffix}")

@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise, zip_longest
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from bwbayes.diagnosis.validation import (
     ValidationSummary,
     validate_bands,
 )
-from bwbayes.errors import Renamed
+from bwbayes.errors import ExitStatus, InputError, Renamed, refuse_unwritable
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
 
@@ -46,12 +47,13 @@ from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
 from bwbayes.record.record import Record
 from bwbayes.record.voltage_path import estimate_path
-from bwbayes.report.figures import draw_styled
+from bwbayes.report.figures import draw_styled, picture_of
+from bwbayes.report.outputs import refuse_existing, write_bands, write_summary
 from bwbayes.report.report import (
     Block,
     Figure,
+    Product,
     Report,
-    Shown,
     Text,
     remarks_banner,
     standing_banner,
@@ -66,17 +68,22 @@ To be called with a watch: they may have to be fitted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prediction(Shown, Bands):
+class Prediction(Product, Bands):
     """Bands of one record or window, and how they turned out.
 
     ``scores`` and ``validation`` hold the bands against the readings and are None without any;
-    ``remarks`` say where the drive leaves what was fitted. All else is as of
+    ``remarks`` say where the drive leaves what was fitted, ``hints`` what may be known of it and
+    was not stated; ``run_validation`` is that of the run's own bands. All else is as of
     :class:`bwbayes.Bands`.
     """
+
+    NAME: ClassVar[str] = "prediction"
 
     scores: Scores | None = None
     validation: BandValidation | None = None
     remarks: tuple[str, ...] = ()
+    hints: tuple[str, ...] = ()
+    run_validation: ValidationSummary | None = None
 
     holds, verdict = Renamed("passed"), Renamed("validation")
 
@@ -89,6 +96,11 @@ class Prediction(Shown, Bands):
     def standing(self) -> ValidationSummary:
         """Whether the bands hold, as one carries that along."""
         return ValidationSummary.of([self.validation] if self.validation else [])
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """The exit status of its command, unless the run's validation is worse."""
+        return self.standing.exit_status
 
     @property
     def notes(self) -> list[str]:
@@ -143,10 +155,45 @@ class Prediction(Shown, Bands):
         blocks += rivals_table([self])
         if self.passed:
             blocks.append(Text(f"{name}: validation passed for drives like this one", on="both"))
+        of_run = standing_banner(self.run_validation) if self.run_validation else []
         remarks = remarks_banner([*self.remarks, *notes])
-        return Report(
-            title=name, banners=[*standing_banner(self.standing), *remarks], blocks=blocks
-        )
+        banners = [*of_run, *remarks_banner(self.hints), *standing_banner(self.standing), *remarks]
+        return Report(title=name, banners=banners, blocks=blocks)
+
+    @classmethod
+    def files(cls, path: Path) -> list[Path]:
+        """Return the files of bands in a CSV: that, their scores (JSON), and a figure.
+
+        Raises InputError: another suffix than that of a table.
+        """
+        files = [path, path.with_suffix(".json"), path.with_suffix(".png")]
+        if path in files[1:]:
+            raise InputError(f"{path}: the bands are a table; give a name that ends in .csv")
+        return files
+
+    def save(
+        self, path: str | Path, *, overwrite: bool = False, watch: Watch = unwatched
+    ) -> list[Path]:
+        """Write the bands to a CSV, scores (JSON) and a figure beside it, and return the files.
+
+        ``watch`` is called with the share that is done.
+
+        Raises
+        ------
+        InputError
+            A file that exists, unless it may be replaced, or that cannot be written.
+        """
+        table, numbers, picture = files = self.files(Path(path))
+        refuse_existing(files, overwrite=overwrite)
+        with refuse_unwritable(table):
+            table.parent.mkdir(parents=True, exist_ok=True)
+            write_bands(table, [self], part(watch, 0.0, 0.8), self.quantities)
+            standing = self.run_validation
+            said = self.numbers() | {"run_validation": standing and standing.numbers}
+            write_summary(numbers, self.quantities.rendered(said))
+            picture.write_bytes(picture_of(self.plot))
+            watch(1.0)
+        return files
 
     @property
     def heading(self) -> str:

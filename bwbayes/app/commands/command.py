@@ -1,0 +1,248 @@
+"""A verb as a command: words and options from its arguments, help from its docstring.
+
+All of it is read from the function's source: loading it takes a second, which neither ``--help``
+nor completion should wait for.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bwbayes.app.commands.shared import command_as_typed, present, show_paths, working
+from bwbayes.app.config import MAX_SEED, USUAL_MODELS
+from bwbayes.app.verbs import Verb
+from bwbayes.errors import ColumnsError, InputError, path_text
+
+FILE = click.Path(path_type=Path)
+
+# Arguments that have a range.
+RANGES = {
+    "workers": click.IntRange(1),
+    "replicates": click.IntRange(1),
+    "steps": click.IntRange(1),
+    "ess": click.FloatRange(1),
+    "seed": click.IntRange(0, MAX_SEED),
+}
+
+# Help of options that many commands have, where a docstring says nothing of them.
+TEXTS = {
+    "overwrite": "Replace existing files.",
+    "quiet": "Print nothing but errors.",
+    "search": "Longest time of the search for stages, as 60s or 2min; none: no search.",
+    "seed": "Seed, instead of the config's.",
+}
+
+# Options that say how a file is read: of each verb whose function has the argument `reading`.
+READING = Verb(
+    "bwbayes.record.io.formats:read_record",
+    flags={
+        "columns": "column",
+        "units": "unit",
+        "covariates": "covariate",
+        "displacement_file": "displacement",
+        "voltage_is": "",
+        "need_displacement": "",
+    },
+)
+
+
+class WithParts(click.Command):
+    """A command whose help lists the parts that a model may have, as the registries do."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the parts, by kind."""
+        # Here, because it is slow to load.
+        from bwbayes.app.config.reference import PARTS
+
+        del ctx
+        with formatter.section("Parts"):
+            formatter.write_dl([(kind, ", ".join(names)) for kind, names in PARTS.items()])
+        with formatter.section("Models that are compared by default"):
+            formatter.write_text(USUAL_MODELS)
+
+
+def command_of(verb: Verb) -> click.Command:
+    """Return the command of a verb."""
+    words, options, reading = [*_words(verb)], _options(verb), dict[str, click.Option]()
+    if options.pop("reading", None):
+        reading = _options(READING)
+        if not any("--voltage" in usage for usage in verb.either):
+            del reading["displacement_file"]
+
+    def called(**given: Any) -> int:
+        if given.get("executor") is not None:
+            # It is refused before anything is done. Here, because it is slow to load.
+            from bwbayes.app.running.workers import require_executor
+
+            require_executor(given["executor"])
+        if reading:
+            _require_file(verb, words, given, reading)
+            given["reading"] = {key: given.pop(key) for key in reading}
+        arguments = []
+        for word in words:
+            value = given.pop(str(word.name))
+            arguments += value if word.nargs == -1 else [value]
+        if verb.either:
+            arguments = [value for value in arguments if value is not None]
+            if len(arguments) + sum(bool(given[key]) for key in verb.instead) != 1:
+                ways = [*verb.either.values(), *verb.instead.values()]
+                raise InputError(f"{verb.name}: give either {' or '.join(ways)}")
+        return (_make_product if verb.is_of_run else _call)(verb, arguments, **given)
+
+    about, *example = verb.help
+    if verb.is_of_run:
+        where = f"Where it goes; default: FOLDER/{verb.below or verb.name}."
+        options["out"] = _option("out", "out", "Path", None, where)
+        options |= {key: _option(key, key, "bool", False) for key in ("overwrite", "quiet")}
+        example.insert(0, "FOLDER has the run, with whose status the command ends.")
+    last = {key: options.pop(key) for key in ("out", "overwrite", "quiet") if key in options}
+    folder = [click.Argument(["folder"], type=FILE)] if verb.is_of_run else []
+    params = [*folder, *words, *(options | reading | last).values()]
+    text = "\n\n".join([about, *example])
+    kind = WithParts if verb.parts else click.Command
+    return kind(verb.name, params=params, help=text, callback=called)
+
+
+def _require_file(
+    verb: Verb, words: list[click.Parameter], given: dict[str, Any], reading: Iterable[str]
+) -> None:
+    """Refuse options that say how a file is read, where none is given."""
+    files = [word for word in words if word.type is FILE]
+    has_file = any(given[str(word.name)] is not None for word in files)
+    if not has_file and any(given[key] not in (None, {}) for key in reading):
+        problem = "--column, --unit, --covariate, --fs and --table are for a file"
+        file = (
+            files[0].opts[0] if isinstance(files[0], click.Option) else str(files[0].name).upper()
+        )
+        raise InputError(f"{verb.name}: {problem}; give {file}, or remove them")
+
+
+def _make_product(
+    verb: Verb,
+    arguments: list[Any],
+    *,
+    folder: Path,
+    out: Path | None,
+    overwrite: bool,
+    quiet: bool,
+    **options: Any,
+) -> int:
+    """Make the product of the run in FOLDER; save and show it."""
+    given = [*arguments, *(options[key] for key in verb.instead)]
+    stem = "".join(path_text(Path(value).stem) for value in given if isinstance(value, str | Path))
+    out = out or folder / (verb.below or verb.name).replace("NAME", stem)
+    with working() as watch:
+        from bwbayes.app.fit.fitted import open_converged
+        from bwbayes.report.outputs import refuse_existing
+
+        # Refuse before the computation; saving refuses every single file.
+        refuse_existing(verb.load(verb.product).files(out), overwrite=overwrite)
+        fit = open_converged(folder)
+        try:
+            with fit.quantities.spoken():
+                product = verb.load()(fit, *arguments, watch=watch, **options)
+        except ColumnsError as error:
+            raise error.in_command(command_as_typed()) from None
+        product.said_in(fit.quantities)
+        saved = product.save(out, overwrite=overwrite, watch=partial(watch, "figures"))
+    return present(product, saved, fit.standing, quiet=quiet)
+
+
+def _call(verb: Verb, arguments: list[Any], **options: Any) -> int:
+    """Call a function; show the text that it returns, or the files that it has written."""
+    if verb.product == "int":  # an exit status, of what shows all by itself
+        status: int = verb.load()(*arguments, **options)
+        return status
+    with working():
+        result: str | list[Path] = verb.load()(*arguments, **options)
+    if isinstance(result, str):
+        click.echo(result)
+    else:
+        show_paths(result)
+    return 0
+
+
+def _words(verb: Verb) -> Iterator[click.Parameter]:
+    """Yield the words, and the options in place of one, that give a verb's arguments."""
+    for name, hint, number in verb.words:
+        for usage, text in zip(
+            verb.either or [verb.flags.get(name, name)], verb.sentences(name), strict=False
+        ):
+            flags, _, value = usage.partition(" ")
+            if flags.startswith("--"):
+                kind = FILE if value else str
+                yield click.Option(flags.split("/"), type=kind, help=text)
+            else:
+                yield click.Argument(
+                    [flags.lower()],
+                    type=_type_of(name, hint),
+                    required=number != "optional",
+                    nargs=-1 if number == "several" else 1,
+                )
+
+
+def _options(verb: Verb) -> dict[str, click.Option]:
+    """Return the options of a verb, by the keyword arguments that they give."""
+    options = {}
+    for key, (hint, default, text) in verb.options().items():
+        flag = verb.flags.get(key, key).replace("_", "-")
+        if flag:
+            options[key] = _option(flag, key, hint, default, text)
+    return options
+
+
+def _type_of(name: str, hint: str) -> Any:
+    """Return the type of an argument with a type hint, as click has it; None if it is a text."""
+    if name in RANGES:
+        return RANGES[name]
+    choices = re.search(r"Literal(\[.*?\])", hint)
+    if choices:
+        return click.Choice(ast.literal_eval(choices[1]))
+    if "Path" in hint:
+        return FILE
+    types = {"tuple[float, float]": (float, float), "tuple[float, ...]": float}
+    return {**types, "float": float, "int": int}.get(hint)
+
+
+def _option(flag: str, key: str, hint: str, default: Any, text: str = "") -> click.Option:
+    """Return the option of an argument with a type hint."""
+    text = text or TEXTS.get(key, "")
+    if hint == "bool":
+        off = "" if "/" in flag or not default else f"/--no-{flag}"
+        return click.Option(
+            [f"--{flag.replace('/', '/--')}{off}", key],
+            is_flag=True,
+            default=bool(default),
+            help=text,
+        )
+    if hint.startswith("Mapping[str, str"):
+        metavar = f"QUANTITY={flag.upper()}"
+        return click.Option(
+            [f"--{flag}", key], multiple=True, metavar=metavar, callback=_pairs, help=text
+        )
+    return click.Option(
+        [f"--{flag}", key],
+        type=_type_of(key, hint),
+        metavar="FROM TO" if hint == "tuple[float, float]" else None,
+        multiple=hint == "tuple[float, ...]",
+        default=default,
+        show_default=default is not None,
+        help=text,
+    )
+
+
+def _pairs(_: click.Context, option: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+    """Read what stands to the left and right of equals signs."""
+    for text in texts:
+        if "=" not in text:
+            flag = option.opts[0]
+            raise InputError(f"{flag} {text}: write {flag} displacement=..., with a value")
+    pairs = (text.partition("=") for text in texts)
+    return {quantity.strip(): value.strip() for quantity, _, value in pairs}
