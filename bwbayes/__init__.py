@@ -49,7 +49,7 @@ __all__ = [
 if TYPE_CHECKING:
     from bwbayes.app.fit.calls import campaign, compare, fit, open_run, resume
     from bwbayes.app.fit.fitted import Run
-    from bwbayes.app.running.campaign import Campaign
+    from bwbayes.app.jobs.campaign import Campaign
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.diagnosis.record_checks import inspect
     from bwbayes.errors import InputError, InputWarning, NotConvergedError

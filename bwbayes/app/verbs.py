@@ -24,6 +24,7 @@ from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import MethodType
 from typing import Any, Literal
 
 
@@ -72,6 +73,13 @@ class Verb:
         """Return the function itself, or what has another name in its module."""
         module, _, function = self.place.partition(":")
         return getattr(import_module(module), name or function)
+
+    def __get__(self, fit: Any, _: object = None) -> Any:
+        """Return it as a method of a fit, loaded when it is asked for."""
+        from bwbayes.app.jobs.fit_methods import fit_method  # noqa: PLC0415
+
+        method = fit_method(self.load())
+        return method if fit is None else MethodType(method, fit)
 
     @cached_property
     def _source(self) -> ast.FunctionDef:

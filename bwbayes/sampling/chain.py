@@ -202,13 +202,28 @@ def thinning(draws: int, limit: int | None = None) -> int:
     return thin
 
 
-def draws(posterior: Posterior, chain: Chain, phase: Phase = "sampling") -> FloatArray:
+def draws(
+    posterior: Posterior,
+    chain: Chain,
+    phase: Phase = "sampling",
+    covariances: tuple[FloatArray, FloatArray] | None = None,
+) -> FloatArray:
     """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
 
-    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most.
+    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most. With
+    ``covariances`` (free, free), that of the posterior and more, they are wider, see
+    :func:`~bwbayes.inference.voltage_noise.widen_draws`; where the prior allows no such place, as
+    sampled.
     """
-    thin = thinning(chain.draws(phase))
-    return constrain_steps(posterior, chain.coordinates(phase, thin))
+    coordinates = chain.coordinates(phase, thinning(chain.draws(phase)))
+    if covariances is not None:
+        from bwbayes.inference.voltage_noise import widen_draws  # noqa: PLC0415  # slow to load
+
+        wide = widen_draws(coordinates, *covariances)
+        _, log_prior = posterior.prior.constrain(wide.reshape(-1, wide.shape[-1]))
+        possible = np.isfinite(log_prior).reshape(*wide.shape[:-1], 1)
+        coordinates = np.where(possible, wide, coordinates)
+    return constrain_steps(posterior, coordinates)
 
 
 def log_densities(chain: Chain, phase: Phase = "sampling") -> FloatArray:

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from bwbayes.app.jobs.campaign import STATUSES, Campaign, Row
 from bwbayes.app.jobs.check import check
-from bwbayes.app.running.campaign import STATUSES, Campaign, Row
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.designed import Design, DesignScore
 from bwbayes.diagnosis.validation import ValidationSummary

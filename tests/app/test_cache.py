@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import bwbayes as bw
+from bwbayes.app.fit.fitted import STAGES
 from bwbayes.app.running.fingerprint import load, save
-from bwbayes.app.running.stages import STAGES
 from bwbayes.sampling import sampler
 
 

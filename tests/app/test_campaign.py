@@ -16,9 +16,8 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
-from bwbayes.app.jobs.campaign import config_text, resume, start
+from bwbayes.app.jobs.campaign import Campaign, Row, config_text, resume, start
 from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.running.campaign import Campaign, Row
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run

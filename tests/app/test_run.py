@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import xarray
 
-from bwbayes.app.fit.fitted import open_finished
+from bwbayes.app.fit.fitted import STAGES, open_finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
-from bwbayes.app.running.stages import STAGES
 from bwbayes.errors import InputError
 from bwbayes.model.distributions import Distribution
 from bwbayes.record import read_record

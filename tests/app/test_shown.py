@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
-from bwbayes.app.running.campaign import Row
+from bwbayes.app.jobs.campaign import Row
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
+from bwbayes.app.fit.fitted import VOLTAGE_NOISE
 from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.running.draws import VOLTAGE_NOISE
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume

@@ -18,9 +18,8 @@ from rich.console import Console
 
 import bwbayes as bw
 from bwbayes.app.config.config import load
-from bwbayes.app.jobs.campaign import config_text, resume, start
+from bwbayes.app.jobs.campaign import Campaign, config_text, resume, start
 from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.running.campaign import Campaign
 from tests.benchmarks.measuring import ROOT, timed
 from tests.measured import keep
 

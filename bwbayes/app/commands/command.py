@@ -85,7 +85,7 @@ def command_of(verb: Verb) -> click.Command:
         if reading:
             _require_file(verb, words, given, reading)
             given["reading"] = {key: given.pop(key) for key in reading}
-        arguments = []
+        arguments = list[Any]()
         for word in words:
             value = given.pop(str(word.name))
             arguments += value if word.nargs == -1 else [value]

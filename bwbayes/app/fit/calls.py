@@ -19,7 +19,7 @@ from bwbayes.errors import InputError
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.fit.fitted import Run
-    from bwbayes.app.running.campaign import Campaign
+    from bwbayes.app.jobs.campaign import Campaign
     from bwbayes.comparison.compared import Comparison
     from bwbayes.record import Record
 

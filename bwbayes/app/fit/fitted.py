@@ -1,28 +1,34 @@
-"""A run as Python users have it: one object with the posterior, its bands, figures and remarks.
+"""A run: one object with the posterior, its bands, figures and remarks.
 
 :func:`bwbayes.fit` returns a :class:`Run`, :func:`bwbayes.open_run` opens one, and ``bwbayes run``
-makes the same one by the same functions. Without a folder of one's own it lives in a temporary one,
-as long as the object does.
+makes one. Without a folder of one's own it lives in a temporary one, as long as the object does.
+
+Its stages are computed once, when first asked for, and kept in its folder. A stage knows what it
+needs and asks for that. Progress and figures listen to stages; no computation knows of them. To
+open a run is to read files: a stage loads what it needs when it is computed.
 """
 
 from __future__ import annotations
 
-import shutil
-from functools import cached_property
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property, partial, wraps
 from pathlib import Path
-from types import MethodType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.stages import Stages
-from bwbayes.app.verbs import VERBS, Verb
-from bwbayes.errors import InputError, Renamed
+from bwbayes.app.verbs import VERBS
+from bwbayes.errors import InputError, NotConvergedError, Renamed
 from bwbayes.quantities import DEFAULT
 from bwbayes.report.report import Shown
-from bwbayes.sampling.chain import draws, log_densities
+from bwbayes.sampling.chain import PHASES, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
+from bwbayes.watching import Watch, WatchSteps, counted, parts, unwatched, watched
 
 if TYPE_CHECKING:
     import xarray
@@ -32,33 +38,67 @@ if TYPE_CHECKING:
     from bwbayes.app.jobs.control import export as export_fit
     from bwbayes.app.jobs.control import track as track_fit
     from bwbayes.app.jobs.design import design as design_fit
-    from bwbayes.app.jobs.fit_methods import fit_method
+    from bwbayes.app.jobs.fit_methods import Scratch, fit_method
     from bwbayes.app.jobs.predict import predict as predict_record
+    from bwbayes.app.problem.problem import Problem
+    from bwbayes.app.running.figure_worker import FigureWorker
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.compared import Comparison
-    from bwbayes.diagnosis.validation import ValidationSummary
+    from bwbayes.diagnosis.consistency import Consistency
+    from bwbayes.diagnosis.drive_lock import DriveLock
+    from bwbayes.diagnosis.identifiability import InformationGain
+    from bwbayes.diagnosis.innovations import Innovations
+    from bwbayes.diagnosis.predictive_checks import PredictiveChecks
+    from bwbayes.diagnosis.residual_analysis import Explanation
+    from bwbayes.diagnosis.rivals import Rival
+    from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
+    from bwbayes.prediction.bands import Bands
+    from bwbayes.prediction.loops import Loops
+    from bwbayes.prediction.scores import Scores
+    from bwbayes.prediction.steps import StepResponse
     from bwbayes.quantities import Quantities
     from bwbayes.report.report import Report
+    from bwbayes.report.result import Result
+    from bwbayes.sampling.diagnostics import SamplingResult
 
 
-class _Method:
-    """A verb as the method of a fit, loaded when it is asked for."""
-
-    def __init__(self, verb: Verb) -> None:
-        self.verb = verb
-
-    def __get__(self, fit: Run | None, _: object = None) -> Any:
-        from bwbayes.app.jobs.fit_methods import fit_method
-
-        method = fit_method(self.verb.load())
-        return method if fit is None else MethodType(method, fit)
+# By this a chain notes what noise on the voltages leaves unsure: a covariance, (free, free).
+VOLTAGE_NOISE = "voltage_noise_covariance"
 
 
-class Run(Shown, Stages):
+class RunStage[T](cached_property[T]):
+    """A stage of a run, from the function that computes it, of the run and a watch.
+
+    What an earlier process has kept is not computed again. Unless a stage is there ``always``, to
+    ask for it without convergence raises a NotConvergedError.
+    """
+
+    def __init__(self, compute: Callable[[Any, Watch], T], *, always: bool = False) -> None:
+        self.compute, self.always = compute, always
+
+        @wraps(compute)
+        def stage(run: Run) -> Any:
+            if not always:
+                run.require_converged()
+            name = compute.__name__
+            if name in run.kept:
+                return run.kept[name]
+            return self.compute(run, partial(run.watch, name.replace("_", " ")))
+
+        super().__init__(stage)
+
+
+def always[T](compute: Callable[[Any, Watch], T]) -> RunStage[T]:
+    """Make a stage that is there without convergence, too."""
+    return RunStage(compute, always=True)
+
+
+@dataclass(eq=False, repr=False)
+class Run(Shown):
     """A fit with all that is computed of it: posterior, bands, notes on both.
 
-    Attributes
+    Parameters
     ----------
     chain
         The draws.
@@ -66,6 +106,8 @@ class Run(Shown, Stages):
         The run's folder.
     seconds
         Wall time of the sampling.
+    watch
+        Called with the name of a stage, and the share of it that is done.
 
     Notes
     -----
@@ -73,6 +115,358 @@ class Run(Shown, Stages):
     :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them.
     Everything else is computed, and its libraries are loaded, when it is first asked for.
     """
+
+    chain: ChainFile
+    folder: RunFolder
+    seconds: float = 0.0
+    watch: WatchSteps = unwatched
+    _scratch: Scratch | None = None
+
+    def with_cache(self, **results: object) -> Self:
+        """Return this run with attributes that are there already, computed ones too."""
+        run = copy(self)
+        run.__dict__.update(results)  # a cached property is a plain attribute
+        return run
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What was fitted: config in explicit numbers, record, priors.
+
+        Raises
+        ------
+        InputError
+            Config or records were edited, so that the chain is another posterior's.
+        """
+        from bwbayes.app.running.fingerprint import require_own
+
+        problem = self.folder.problem()
+        require_own(problem, self.folder.chain, self.chain.attributes())
+        return problem
+
+    @cached_property
+    def kept(self) -> dict[str, Any]:
+        """What was computed before of the chain as it is now, by stage; nothing if it has grown."""
+        from bwbayes.app.running.fingerprint import load, state_of
+
+        return load(self.folder.result, state_of(self.problem, self.chain)) or {}
+
+    def keep(self, folder: RunFolder) -> None:
+        """Write what is computed to a folder: all that neither the chain nor the config holds."""
+        from bwbayes.app.running.fingerprint import save, state_of
+
+        state = state_of(self.problem, self.chain)
+        save(folder.result, state, {"outcome": self.outcome, **self._computed})
+
+    @cached_property
+    def outcome(self) -> SamplingResult:
+        """How the sampling ended, or stands."""
+        if self.kept:
+            outcome: SamplingResult = self.kept["outcome"]
+            return outcome
+        from bwbayes.app.running.workers import open_executor
+        from bwbayes.sampling.sampler import sample
+
+        plan = replace(self.problem.plan, max_steps=self.chain.steps("sampling"))
+        with open_executor(1) as pool:
+            return sample(self.problem.posterior, plan, self.chain, pool)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the sampling has converged."""
+        return self.outcome.converged
+
+    @property
+    def more_steps(self) -> int:
+        """Twice the steps that the sampling had, or all it needs."""
+        needed = np.nan_to_num(self.outcome.check.steps_needed, posinf=0.0)
+        return max(2 * self.problem.config.sampling.steps, int(needed))
+
+    @property
+    def resuming(self) -> str:
+        """The command that resumes the run, with more steps."""
+        return f"bwbayes resume {self.folder.path} --steps {self.more_steps}"
+
+    def require_converged(self) -> None:
+        """Raise a NotConvergedError unless the sampling has converged."""
+        if not self.converged:
+            call = "fit.resume(" if self._scratch else f"bwbayes.resume({str(self.folder.path)!r}, "
+            raise NotConvergedError(
+                f"not converged: {self.outcome.stop_reason}; intervals are withheld; resume with "
+                f"`{call}steps={self.more_steps})`, and look at the traces"
+            )
+
+    @cached_property
+    def flat_draws(self) -> FloatArray:
+        """All draws, (draws, free), parameters in their own units."""
+        return self._draws.reshape(-1, self._draws.shape[-1])
+
+    @cached_property
+    def _draws(self) -> FloatArray:
+        """The draws in their own units, wider by what noise on the voltages leaves unsure."""
+        posterior, noted = self.problem.posterior, self.chain.attributes().get(VOLTAGE_NOISE)
+        if noted is None:
+            return draws(posterior, self.chain)
+        covariances = self.chain.point.covariance, np.array(json.loads(str(noted)))
+        return draws(posterior, self.chain, covariances=covariances)
+
+    @cached_property
+    def sampled(self) -> Result:
+        """The draws, and what the problem says of them, before anything is computed of them."""
+        from bwbayes.report.result import Result
+
+        problem, chain, plan = self.problem, self.chain, self.problem.plan
+        steps = ", ".join(f"{chain.steps(phase)} steps of {phase}" for phase in PHASES)
+        accepted = {
+            phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
+            for phase in PHASES
+        }
+        facts = {
+            "sampling": f"{plan.ensembles} ensembles of {plan.walkers} walkers; {steps}",
+            "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
+            "engine": problem.posterior.engine,
+        }
+        return Result(
+            name=problem.config.name or "run",
+            outcome=self.outcome,
+            parameters=problem.parameters,
+            draws=self._draws,
+            log_density=log_densities(chain),
+            moves=chain.moves("sampling"),
+            facts=problem.facts | facts,
+            truth=problem.config.truth,
+            quantities=problem.quantities,
+        )
+
+    @cached_property
+    def subset(self) -> FloatArray:
+        """Draws (draws, free) that are enough to simulate with."""
+        from bwbayes.app.problem.records import generator
+        from bwbayes.prediction.prediction import thin_draws
+
+        return thin_draws(self.flat_draws, generator(self.problem.config.seed, "draws"))
+
+    @property
+    def best(self) -> FloatArray:
+        """The most probable draw, (1, free)."""
+        return self.flat_draws[[int(np.argmax(self.sampled.log_density))]]
+
+    @cached_property
+    def background(self) -> ValidationContext:
+        """What the validation of bands needs to know of the fit."""
+        from bwbayes.diagnosis.validation import ValidationContext
+
+        return ValidationContext.of(self.problem.posterior, self.flat_draws)
+
+    @RunStage
+    def step_responses(self, _: Watch) -> dict[str, StepResponse]:
+        """Return the responses to the steps among what was predicted, by name."""
+        from bwbayes.prediction.steps import measure_steps
+
+        records = self.problem.others
+        if len(self.problem.records) > 1:
+            records = {**self.problem.records, **records}
+        return measure_steps(self.problem.posterior, self.subset, records)
+
+    @RunStage
+    def predictions(self, watch: Watch) -> tuple[Bands, ...]:
+        """Return the bands of all that was held out, and of the training windows."""
+        from bwbayes.app.running.predictions import predictions
+
+        return predictions(self.problem, self.flat_draws, self.widening_rivals, watch)
+
+    @RunStage
+    def scores(self, watch: Watch) -> dict[str, Scores]:
+        """Return the scores of all bands with a measurement, by name."""
+        from bwbayes.prediction.scores import score
+
+        return {
+            bands.name: score(bands, self.background.extent)
+            for bands in watched(self.predictions, watch)
+            if bands.scored(bands.measured).any()
+        }
+
+    @RunStage
+    def innovations(self, watch: Watch) -> dict[str, Innovations]:
+        """Return the innovation of each reading at the most probable draw, by record."""
+        from bwbayes.diagnosis.innovations import innovations
+
+        records = self.problem.records
+        return {
+            name: innovations(single, theta[0], records[name].start)
+            for name, single, theta in watched([*self.problem.posterior.each(self.best)], watch)
+        }
+
+    @RunStage
+    def consistency(self, watch: Watch) -> dict[str, Consistency]:
+        """Return how each of several records agrees with the others, by record."""
+        from bwbayes.diagnosis.consistency import agreements
+
+        starts = {name: record.start for name, record in self.problem.records.items()}
+        return agreements(self.problem.posterior, self.chain.point, starts, watch)
+
+    @RunStage
+    def loops(self, watch: Watch) -> Loops:
+        """Return the major and a minor loop and the initial curve."""
+        from bwbayes.prediction.loops import measure_loops
+
+        return measure_loops(self.problem.posterior, self.subset, watch)
+
+    @RunStage
+    def drive_locks(self, _: Watch) -> dict[str, DriveLock]:
+        """Return whether what the model misses follows the drive, by record."""
+        from bwbayes.app.problem.records import generator
+        from bwbayes.diagnosis.drive_lock import drive_locks
+
+        source = generator(self.problem.config.seed, "drive lock")
+        return drive_locks(self.problem.posterior, self.subset, source)
+
+    def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...]:
+        """Return rivals of the model on a training record, by its name.
+
+        They are fitted when first needed, and kept in the folder. ``watch`` is called with the
+        share that is done.
+        """
+        from bwbayes.app.problem.records import generator
+        from bwbayes.app.running.fingerprint import fingerprint, load, save
+        from bwbayes.diagnosis.rivals import fit_rivals
+
+        problem, path, state = self.problem, self.folder.rivals, fingerprint(self.problem)
+        fitted = load(path, state) or {}
+        if of not in fitted:
+            rng = generator(problem.config.seed, f"rivals of {problem.records[of].sha256}")
+            fitted[of] = fit_rivals(problem.study.for_record(of), rng, watch)
+            # What predicts elsewhere may only read the folder.
+            with suppress(OSError):
+                save(path, state, fitted)
+        rivals: tuple[Rival, ...] = fitted[of]
+        return rivals
+
+    def widening_rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...] | None:
+        """Return the rivals; None unless the model's error of that record follows the drive."""
+        return self.rivals(of, watch) if self.drive_locks[of].locked else None
+
+    @RunStage
+    def explanations(self, watch: Watch) -> dict[str, tuple[Explanation, ...]]:
+        """Return what may explain each record's readings better than the model, the best first."""
+        from bwbayes.app.running.explaining import explain_record
+        from bwbayes.app.running.fingerprint import fingerprint, load
+        from bwbayes.inference.map_estimate import distinct
+
+        # The search for stages ended with all of this.
+        if searched := load(self.folder.search, fingerprint(self.problem)):
+            return searched
+        best = self.problem.posterior.prior.unconstrain(self.best)
+        modes = distinct([*best, *self.chain.point.optima], self.chain.point.covariance)
+        return {
+            name: explain_record(self.problem, name, modes, of_record)
+            for name, of_record in parts([*self.problem.records], watch)
+        }
+
+    @always
+    def validation(self, _: Watch) -> dict[str, BandValidation]:
+        """Return whether the bands hold, and why not, by the bands' name."""
+        from bwbayes.app.running.predictions import validate_predictions
+
+        if not self.converged:
+            return {}
+        return validate_predictions(
+            self.problem, self.predictions, self.background, self.explanations
+        )
+
+    @cached_property
+    def _check_source(self) -> np.random.Generator:
+        from bwbayes.app.problem.records import generator
+
+        return generator(self.problem.config.seed, "checks")
+
+    @RunStage
+    def information_gain(self, watch: Watch) -> InformationGain:
+        """Return information gained from the data: prior against posterior."""
+        from bwbayes.diagnosis.identifiability import information_gain
+
+        prior, sampled = self.problem.posterior.prior, self.sampled
+        source = self._check_source
+        return information_gain(prior, sampled.draws, sampled.log_density, source, watch)
+
+    @RunStage
+    def posterior_checks(self, watch: Watch) -> dict[str, PredictiveChecks]:
+        """Return where each record lies among replicated ones."""
+        from bwbayes.diagnosis.predictive_checks import check_predictions
+
+        _ = self.information_gain  # first: it draws from the same source
+        posterior, subset, source = self.problem.posterior, self.subset, self._check_source
+        return {
+            name: check_predictions(posterior, subset, source, name, of_record)
+            for name, of_record in parts([*self.problem.records], watch)
+        }
+
+    @always
+    def remarks(self, watch: Watch) -> tuple[str, ...]:
+        """Return what to know of the record, the priors and the fit, one line each."""
+        from bwbayes.app.running.explaining import lines
+        from bwbayes.app.running.fingerprint import version_remarks, versions
+        from bwbayes.diagnosis.conflict import conflicts
+        from bwbayes.diagnosis.consistency import disagreements
+        from bwbayes.diagnosis.explanations import likely_causes
+        from bwbayes.diagnosis.identifiability import undetermined
+        from bwbayes.diagnosis.innovations import departures
+
+        problem, posterior = self.problem, self.problem.posterior
+        looked_at = counted(3, watch)
+        remarks = [
+            *version_remarks(self.chain.attributes().get("versions"), versions(posterior.engine)),
+            *problem.remarks,
+            *self.outcome.remarks,
+        ]
+        looked_at(1)
+        remarks += map(str, conflicts(posterior.prior, self.flat_draws, problem.defaults))
+        looked_at(1)
+        remarks += map(str, undetermined(posterior, self.chain.point))
+        looked_at(1)
+        if not self.converged:
+            return tuple(remarks)
+        remarks += map(str, disagreements(self.consistency))
+        of = {name: f"{name}: " if len(problem.records) > 1 else "" for name in problem.records}
+        for name, whitened in self.innovations.items():
+            remarks += [f"{of[name]}{finding}" for finding in departures(whitened)]
+        for name, lock in self.drive_locks.items():
+            remarks += [f"{of[name]}{finding}" for finding in lock.findings]
+        for name, explanations in self.explanations.items():
+            remarks += [of[name] + line for line in lines(likely_causes(explanations))]
+        for bands in self.predictions:
+            remarks += [f"{bands.name}: {bands.model_error_note}"] * bool(bands.model_error_note)
+        for name, verdict in self.validation.items():
+            remarks += [f"{name}: {note}" for note in verdict.notes]
+        return tuple(remarks)
+
+    @property
+    def _computed(self) -> dict[str, Any]:
+        """What is computed by now, by stage."""
+        return {name: vars(self)[name] for name in STAGES if name in vars(self)}
+
+    def compute(
+        self, watch: WatchSteps = unwatched, figure_worker: FigureWorker | None = None
+    ) -> Result:
+        """Compute all stages in turn; return the run as the report is made of it.
+
+        ``watch`` is called with the name of a stage and the share of it that is done; the
+        ``figure_worker`` draws what there is to see, after each of them.
+        """
+        self.watch = watch
+        result = self.sampled
+        for name, stage in STAGES.items():
+            if figure_worker is not None:
+                figure_worker.draw(result)
+            if self.converged or stage.always:
+                getattr(self, name)
+                result = replace(self.sampled, **self._computed)
+        self.watch = unwatched
+        return result
+
+    @cached_property
+    def result(self) -> Result:
+        """The run in numbers and arrays, as the report is made of."""
+        return self.compute()
 
     @property
     def name(self) -> str:
@@ -106,8 +500,12 @@ class Run(Shown, Stages):
     @property
     def notes(self) -> tuple[str, ...]:
         """The remarks, what does not hold, and a sampling that has not converged."""
-        unconverged = f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
-        return (*self.remarks, *self.standing.messages, *[unconverged] * (not self.converged))
+        unconverged = [] if self.converged else [self._unconverged]
+        return (*self.remarks, *self.standing.messages, *unconverged)
+
+    @property
+    def _unconverged(self) -> str:
+        return f"NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -248,20 +646,9 @@ class Run(Shown, Stages):
         InputError
             The folder exists and ``overwrite`` is not given, or it cannot be written.
         """
-        from bwbayes.app.running import run
-        from bwbayes.app.running.figure_worker import FigureWorker
+        from bwbayes.app.running.run import copy_run
 
-        copied = RunFolder.create(Path(folder), self.problem, overwrite)
-        with copied.locked():
-            shutil.copytree(self.folder.chain, copied.chain)
-            shutil.copyfile(self.folder.backend, copied.backend)
-            run.write_files(self, copied, FigureWorker())
-            # Predictions that were asked for now may have needed them.
-            pairs = ((self.folder.search, copied.search), (self.folder.rivals, copied.rivals))
-            for kept, copy in pairs:
-                if kept.exists():
-                    shutil.copyfile(kept, copy)
-        return copied.path
+        return copy_run(self, Path(folder), overwrite).path
 
     @property
     def heading(self) -> str:
@@ -274,7 +661,7 @@ class Run(Shown, Stages):
         if self.converged:
             scope = f" {drives_like(self.problem.facts)}" if self.standing.passed else ""
             return f"{name}: converged, validation {self.standing.status}{scope}"
-        return f"{name}: NOT CONVERGED: {self.outcome.stop_reason}; intervals are withheld"
+        return f"{name}: {self._unconverged}"
 
     def report(self) -> Report:
         """Return what the page of the run says."""
@@ -283,8 +670,11 @@ class Run(Shown, Stages):
         return run_report(self.result, self.numbers)
 
 
+# In their order.
+STAGES = {name: stage for name, stage in vars(Run).items() if isinstance(stage, RunStage)}
+
 for verb in VERBS:
-    setattr(Run, verb.name, _Method(verb))
+    setattr(Run, verb.name, verb)
 
 
 def open_finished(folder: RunFolder) -> Run:

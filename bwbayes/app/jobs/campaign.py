@@ -13,29 +13,418 @@ import os
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
+import numpy as np
 from rich.console import Console
 
 from bwbayes.app.config.config import dump, parse, read_toml, validated_config
 from bwbayes.app.config.proposal import draft_config
+from bwbayes.app.fit.fitted import Run, open_finished
+from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
-from bwbayes.app.running.campaign import SPECIMEN, Campaign
+from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
+from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.errors import InputError, InputWarning, one_line
-from bwbayes.population.specimen import specimen_of
+from bwbayes.arrays import FloatArray
+from bwbayes.diagnosis.validation import ValidationSummary
+from bwbayes.errors import ExitStatus, InputError, InputWarning, one_line
+from bwbayes.population.population import (
+    FEWEST,
+    Population,
+    PopulationParameter,
+    next_specimen,
+    population,
+)
+from bwbayes.population.specimen import Specimen, specimen_of
+from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import SUFFIXES
+from bwbayes.report.figures import draw_styled
 from bwbayes.report.outputs import save, write_summary
+from bwbayes.report.report import (
+    Banner,
+    Block,
+    Figure,
+    Kind,
+    Picture,
+    Product,
+    Report,
+    Section,
+    Table,
+    TableColumn,
+    Text,
+)
+from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
+from bwbayes.shown import brief
+from bwbayes.watching import WatchSteps, unwatched, watched
+
+# How a record ended, in the order in which they matter, and the exit status of each.
+STATUSES = {
+    "refused": ExitStatus.INVALID_INPUT,
+    "not converged": ExitStatus.NOT_CONVERGED,
+    "validation failed": ExitStatus.VALIDATION_FAILED,
+    "validation inconclusive": ExitStatus.VALIDATION_INCONCLUSIVE,
+    "passed": ExitStatus.SUCCESS,
+}
+
+# What a population needs of a run, in the run's folder.
+SPECIMEN = "specimen.npz"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One record of a campaign: how it ended, why, and its numbers.
+
+    ``numbers`` are those of the run's ``summary.json``, empty for a record that was refused.
+    """
+
+    __repr__ = brief
+
+    name: str
+    file: str
+    status: str
+    reason: str
+    numbers: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, folder: CampaignFolder, file: Path, refusal: str) -> Self:
+        """Return the row of a record's file, which was refused, or whose run has ended."""
+        if refusal:
+            return cls(file.stem, file.name, "refused", refusal, {})
+        numbers = RunFolder(folder.run(file.stem)).numbers()
+        if not numbers["converged"]:
+            reason = f"{numbers['stop_reason']}; resume with `{numbers['go_on']}`"
+            return cls(file.stem, file.name, "not converged", reason, numbers)
+        standing = ValidationSummary.read(numbers)
+        status = standing.status if standing.passed else f"validation {standing.status}"
+        return cls(file.stem, file.name, status, "; ".join(standing.lines), numbers)
+
+    @property
+    def parameters(self) -> Mapping[str, Mapping[str, Any]]:
+        """The parameters' means and intervals by name; none without convergence."""
+        return self.numbers.get("parameters") or {}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Campaign(Product):
+    """Records that were fitted one by one, and what they say together.
+
+    ``rows`` say how each record ended; ``together`` is their population, or why there is none.
+    """
+
+    NAME: ClassVar[str] = "campaign"
+
+    folder: CampaignFolder
+    rows: tuple[Row, ...]
+    together: Population | str
+    _scratch: object = field(default=None, repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        folder: CampaignFolder,
+        files: Sequence[Path],
+        refused: Mapping[str, str],
+        watch: WatchSteps = unwatched,
+    ) -> Self:
+        """Return what came of the records' files; ``refused`` says why, by the name of the file.
+
+        ``watch`` is called with the name of a step and the share of it that is done.
+        """
+        rows = tuple(
+            Row.of(folder, file, refused.get(file.name, ""))
+            for file in watched(files, partial(watch, "results"))
+        )
+        names = [row.name for row in rows if row.parameters]
+        specimens = [
+            Specimen.load(name, folder.run(name) / SPECIMEN)
+            for name in watched(names, partial(watch, "draws"))
+        ]
+        if len(specimens) < FEWEST:
+            return cls(folder, rows, f"a population needs {FEWEST} records or more")
+        try:
+            together = population(
+                specimens, generator(1, "population"), partial(watch, "population")
+            )
+            return cls(folder, rows, together)
+        except InputError as error:
+            return cls(folder, rows, str(error))
+
+    @property
+    def population(self) -> Population:
+        """Population mean and spread of each parameter, and every specimen among the others.
+
+        Raises
+        ------
+        InputError
+            There is none, and why.
+        """
+        if isinstance(self.together, str):
+            raise InputError(f"campaign: no population: {self.together}")
+        return self.together
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many records ended in each way."""
+        counted = Counter(row.status for row in self.rows)
+        return {status: counted[status] for status in STATUSES}
+
+    @property
+    def exit_status(self) -> ExitStatus:
+        """The status of the command: 2 if records were refused, else 4, 3, 5 or 0 as of a run."""
+        return next((s for name, s in STATUSES.items() if self.counts[name]), ExitStatus.SUCCESS)
+
+    @property
+    def outliers(self) -> dict[str, list[str]]:
+        """The parameters in which a record lies off the population, by record."""
+        off: dict[str, list[str]] = {}
+        for name, spread in self._spreads.items():
+            for record in spread.outliers:
+                off.setdefault(record, []).append(name)
+        return off
+
+    @property
+    def short(self) -> dict[str, str]:
+        """Why records were refused, did not converge, or have bands that do not hold, by record."""
+        return {row.name: f"{row.status}: {row.reason}" for row in self.rows if row.reason}
+
+    @property
+    def notes(self) -> list[str]:
+        """What is short, and what lies off the population, a line each."""
+        notes = [f"{name}: {why}" for name, why in self.short.items()]
+        return notes + [
+            f"{n}: off the population in {', '.join(o)}" for n, o in self.outliers.items()
+        ]
+
+    @cached_property
+    def table(self) -> Any:
+        """A pandas.DataFrame with a row for each record: status, reason, means, intervals.
+
+        It is what ``campaign.csv`` holds; the columns of numbers are ``QUANTITY_what_UNIT``.
+        """
+        import pandas as pd  # noqa: PLC0415  # slow to load, and only needed here
+
+        quantities = ("mean", "sd", "lower_95", "upper_95")
+        lines = [
+            {
+                "record": row.name,
+                "file": row.file,
+                "status": row.status,
+                "reason": row.reason,
+                "outlier_in": " ".join(self.outliers.get(row.name, ())),
+                "steps": row.numbers.get("steps"),
+                **{
+                    f"{name}_{key}_{unit}": self._estimates(row).get(name, {}).get(key)
+                    for name, unit in self._units.items()
+                    for key in (
+                        *quantities,
+                        *(f"shrunk_{edge}" for edge in quantities[2:] if name in self._spreads),
+                    )
+                },
+            }
+            for row in self.rows
+        ]
+        return pd.DataFrame(lines).astype({"steps": "Int64"}).set_index("record")
+
+    def fit(self, name: str) -> Run:
+        """Return the fit of one record.
+
+        Raises
+        ------
+        InputError
+            It has none.
+        """
+        return open_finished(RunFolder.open(self.folder.run(name)))
+
+    def predict(
+        self, record: Record | str | Path, *, from_rest: bool = False, lead_in: float | None = None
+    ) -> Prediction:
+        """Predict a specimen that was not measured, along a record or a planned voltage.
+
+        Its parameters are drawn from the population; noise and offset are those of the campaign's
+        first record that has converged. `from_rest` and `lead_in` are as in :meth:`Run.predict`.
+
+        Raises
+        ------
+        InputError
+            There is no population, or the record cannot be used.
+        """
+        first = self.fit(self.population.names[0])
+        problem = first.problem
+        if not isinstance(record, Record):
+            options = column_options_from(
+                record, next(iter(problem.config.records.values())).read_as
+            )
+            record = read_record(record, need_displacement=False, **options)
+        source = generator(problem.config.seed, "next specimen")
+        draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
+        start, like = InitialConditions(from_rest, True, lead_in), next(iter(problem.records))
+        other = Validation((), record, start, of=like)
+        return predict_another(problem, draws, other, "next specimen", first.widening_rivals)
+
+    def plot(self) -> Figure:
+        """Draw each parameter's intervals side by side, with the population.
+
+        Raises
+        ------
+        InputError
+            No record has converged.
+        """
+        if not self._units:
+            raise InputError("campaign: no record has converged, so there is nothing to draw")
+        return draw_styled(self._draw, quantities=self.quantities)
+
+    def report(self) -> Report:
+        """Return how the records of a campaign ended, and what they say together."""
+        kinds: list[Kind] = [STATUS_KINDS.get(row.status, "bad") for row in self.rows]
+        worst: Kind = min(kinds, key=["bad", "note", "good"].index, default="good")
+        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items() if count)
+        outliers = [f"{record}: {', '.join(names)}" for record, names in self.outliers.items()]
+        attention = [(row.name, mark(row.status), row.reason) for row in self.rows if row.reason]
+        columns = ("Record", "Status", "Reason")
+        picture = Picture(
+            "parameters",
+            "Parameters side by side",
+            "Median and 95% interval of every record that has converged: gray, by itself; blue, "
+            "with the population for a prior; red, if it lies off the population that all others "
+            "show. Line and band: the population's middle, and where 95% of specimens not "
+            "measured yet lie.",
+            self._draw,
+        )
+        population: Block = Text(f"No population: {self.together}.", on="both")
+        if self._spreads:
+            population = self._population_table()
+        name = self.folder.path.name
+        return Report(
+            title=f"{name}, campaign",
+            heading=f"Campaign: {name}",
+            banners=[
+                Banner(worst, f"{len(self.rows)} records", [counts]),
+                *[Banner("note", "Off the population, and without weight in it", items=outliers)]
+                * bool(outliers),
+            ],
+            blocks=[
+                *[Table("short", "Records to look at", columns, attention, on="both")]
+                * bool(attention),
+                population,
+                *[picture] * bool(self._units),
+                Section("Records", [self._records_table()]),
+            ],
+            numbers=self._numbers(),
+            csv=self.table.to_csv(float_format="%.7g", lineterminator="\n"),
+        )
+
+    @property
+    def _spreads(self) -> Mapping[str, PopulationParameter]:
+        return {} if isinstance(self.together, str) else self.together.parameters
+
+    @property
+    def _units(self) -> dict[str, str]:
+        return {name: str(e["unit"]) for row in self.rows for name, e in row.parameters.items()}
+
+    def _estimates(self, row: Row) -> dict[str, dict[str, Any]]:
+        """Return a record's estimates by parameter: by itself, and what the population says."""
+        estimates = {name: dict(estimate) for name, estimate in row.parameters.items()}
+        for name in estimates.keys() & self._spreads.keys():
+            among = self._spreads[name].specimens.get(row.name)
+            if among is not None:
+                estimates[name] |= {
+                    "shrunk_median": among.median,
+                    "shrunk_lower_95": among.lower,
+                    "shrunk_upper_95": among.upper,
+                    "off_population_p": among.p,
+                    "outlier": among.outlier,
+                    "pareto_k": among.pareto_k,
+                    "taken_for_normal": among.normal,
+                }
+        return estimates
+
+    def _numbers(self) -> dict[str, object]:
+        """Return a campaign's numbers as ``campaign.json`` holds them."""
+        copied = ("steps", "validation", "remarks", "data_sha256")
+        records = {
+            row.name: {
+                "file": row.file,
+                "status": row.status,
+                "reason": row.reason or None,
+                "parameters": self._estimates(row) or None,
+                **{key: row.numbers.get(key) for key in copied},
+            }
+            for row in self.rows
+        }
+        alone = isinstance(self.together, str)
+        return {
+            "counts": self.counts,
+            "exit_status": self.exit_status,
+            "records": records,
+            "outliers": self.outliers,
+            "population": None if alone else self.population.summary(),
+            "no_population_because": self.together if alone else None,
+        }
+
+    def _draw(self) -> Figure:
+        from bwbayes.report.figures.studies import draw_parameters  # noqa: PLC0415  # slow to load
+
+        estimates = {row.name: self._estimates(row) for row in self.rows if row.parameters}
+        return draw_parameters(estimates, {name: s.new for name, s in self._spreads.items()})
+
+    def _records_table(self) -> Table:
+        """Return a row for each record: its parameters by themselves."""
+        rows = []
+        for row in self.rows:
+            estimates = [row.parameters.get(name) for name in self._units]
+            intervals = [_range(e["lower_95"], e["upper_95"]) if e else "" for e in estimates]
+            rows.append([row.name, mark(row.status), *intervals])
+        labels = [label_with_unit(name, unit) for name, unit in self._units.items()]
+        return Table(
+            "records",
+            "Records, 95% intervals of each by itself",
+            ["Record", "Status", *labels],
+            rows,
+            records=self.table.reset_index().to_dict("records"),
+            note="More is in campaign.json; each record's own run is in records/.",
+        )
+
+    def _population_table(self) -> Table:
+        def normal(spread: PopulationParameter) -> str:
+            count = sum(among.normal for among in spread.specimens.values())
+            return f"{count} of {len(spread.specimens)}"
+
+        columns = (
+            TableColumn("Parameter", text=lambda spread: spread.name),
+            TableColumn("Unit", text=lambda spread: unit_text(spread.unit)),
+            TableColumn("Middle", text=lambda spread: _estimate(spread.mean)),
+            TableColumn("Spread", text=lambda s: _estimate(s.spread, percent=s.logarithmic)),
+            TableColumn(
+                "A specimen not measured yet, 95%",
+                text=lambda spread: _range(*np.quantile(spread.new, [0.025, 0.975])),
+            ),
+            TableColumn("Outliers", on="screen", text=lambda spread: ", ".join(spread.outliers)),
+            TableColumn("Pareto k", on="page", text=lambda spread: f"{spread.pareto_k:.2f}"),
+            TableColumn("Taken for normal", on="page", text=normal),
+        )
+        return Table.of(
+            "population",
+            "Population",
+            self._spreads.values(),
+            columns,
+            note="Medians, and 95% intervals. A parameter above zero has a population that is "
+            "normal in the logarithm: its middle is the median, its spread relative, in percent. "
+            "Each parameter by itself. The records' own posteriors were reweighted; where Pareto k "
+            "is above 0.7, or few draws count, a record's likelihood was taken for normal.",
+            on="both",
+        )
 
 
 def config_text(path: Path) -> str:
@@ -205,3 +594,13 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)
     return RunFolder.create(path, problem, overwrite=False), problem
+
+
+def _estimate(draws: FloatArray, *, percent: bool = False) -> str:
+    """Write a median and a 95% interval; a relative spread in percent."""
+    low, median, high = np.quantile(draws, [0.025, 0.5, 0.975]) * (100 if percent else 1)
+    return f"{median:.3g}{'%' if percent else ''} ({_range(low, high)})"
+
+
+def _range(low: float, high: float) -> str:
+    return f"{digits(low, high - low)} to {digits(high, high - low)}"

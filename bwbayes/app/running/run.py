@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from functools import partial
+from pathlib import Path
 
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
-from bwbayes.app.fit.fitted import Run, open_finished
+from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run, open_finished
 from bwbayes.app.problem.problem import Problem
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.draws import voltage_noise
 from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.figure_worker import FigureWorker
 from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
@@ -31,13 +31,14 @@ from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine, resolve_engine
 from bwbayes.inference.map_estimate import MAPEstimate
+from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import write_bands, write_summary
 from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import WatchSteps, part, unwatched
+from bwbayes.watching import Watch, WatchSteps, part, unwatched
 
 
 def begin(folder: RunFolder) -> tuple[Problem, MAPEstimate]:
@@ -141,7 +142,7 @@ def _open_chain(
         given = problem.config
         with StepProgress(console, "choosing the model ...") as watch:
             problem, point, steps, explanations = choose_model(problem, watch)
-            unsure = voltage_noise(problem, point, partial(watch, "noise on the voltage"))
+            unsure = _voltage_noise(problem, point, partial(watch, "noise on the voltage"))
         posterior, config = problem.posterior, problem.config
         for step in map(problem.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
@@ -175,11 +176,38 @@ def _open_chain(
     return problem, chain
 
 
+def _voltage_noise(problem: Problem, point: MAPEstimate, watch: Watch) -> dict[str, str]:
+    """Return what a chain notes of what noise on the voltages leaves unsure; nothing without."""
+    paths = {name: record.path for name, record in problem.records.items()}
+    if not any(path.noise_sd for path in paths.values()):
+        return {}
+    source = generator(problem.config.seed, "voltage noise")
+    covariance = path_covariance(problem.posterior, paths, point, source, watch)
+    return {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
+
+
 def _rewrite(folder: RunFolder, config: Config) -> None:
     text = dump(config)
     parse(text, "resume")  # refuses what a config cannot say
     with draft_of(folder.config) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def copy_run(fit: Run, path: Path, overwrite: bool) -> RunFolder:
+    """Write all of a run into a new folder.
+
+    Raises InputError: the folder exists and ``overwrite`` is not given, or it cannot be written.
+    """
+    folder = RunFolder.create(path, fit.problem, overwrite)
+    with folder.locked():
+        shutil.copytree(fit.folder.chain, folder.chain)
+        shutil.copyfile(fit.folder.backend, folder.backend)
+        write_files(fit, folder, FigureWorker())
+        # Predictions that were asked for now may have needed them.
+        for kept, copy in ((fit.folder.search, folder.search), (fit.folder.rivals, folder.rivals)):
+            if kept.exists():
+                shutil.copyfile(kept, copy)
+    return folder
 
 
 def write_files(
