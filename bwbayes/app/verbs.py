@@ -34,7 +34,7 @@ class Verb:
 
     Parameters
     ----------
-    place
+    function
         Where it is: ``"package.module:name"``.
     also
         The function whose keyword arguments its ``**options`` are, with their help.
@@ -55,7 +55,7 @@ class Verb:
         Whether the help lists the parts that a model may have.
     """
 
-    place: str
+    function: str
     also: str = ""
     command: str = ""
     flags: Mapping[str, str] = field(default_factory=dict)
@@ -67,11 +67,11 @@ class Verb:
     @property
     def name(self) -> str:
         """The name of the command and the method."""
-        return self.command or self.place.partition(":")[2]
+        return self.command or self.function.partition(":")[2]
 
     def load(self, name: str = "") -> Any:
         """Return the function itself, or what has another name in its module."""
-        module, _, function = self.place.partition(":")
+        module, _, function = self.function.partition(":")
         return getattr(import_module(module), name or function)
 
     def __get__(self, fit: Any, _: object = None) -> Any:
@@ -84,7 +84,7 @@ class Verb:
     @cached_property
     def _source(self) -> ast.FunctionDef:
         # The packages between would be loaded, if one asked for the module itself.
-        module, _, name = self.place.partition(":")
+        module, _, name = self.function.partition(":")
         package, *inner = module.split(".")
         spec = find_spec(package)
         path = Path(str(spec and spec.origin))

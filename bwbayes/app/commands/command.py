@@ -76,25 +76,25 @@ def command_of(verb: Verb) -> click.Command:
         if not any("--voltage" in usage for usage in verb.either):
             del reading["displacement_file"]
 
-    def called(**given: Any) -> int:
-        if given.get("executor") is not None:
+    def called(**values: Any) -> int:
+        if values.get("executor") is not None:
             # It is refused before anything is done. Here, because it is slow to load.
             from bwbayes.app.running.workers import require_executor
 
-            require_executor(given["executor"])
+            require_executor(values["executor"])
         if reading:
-            _require_file(verb, words, given, reading)
-            given["reading"] = {key: given.pop(key) for key in reading}
+            _require_file(verb, words, values, reading)
+            values["reading"] = {key: values.pop(key) for key in reading}
         arguments = list[Any]()
         for word in words:
-            value = given.pop(str(word.name))
+            value = values.pop(str(word.name))
             arguments += value if word.nargs == -1 else [value]
         if verb.either:
             arguments = [value for value in arguments if value is not None]
-            if len(arguments) + sum(bool(given[key]) for key in verb.instead) != 1:
+            if len(arguments) + sum(bool(values[key]) for key in verb.instead) != 1:
                 ways = [*verb.either.values(), *verb.instead.values()]
                 raise InputError(f"{verb.name}: give either {' or '.join(ways)}")
-        return (_make_product if verb.is_of_run else _call)(verb, arguments, **given)
+        return (_make_product if verb.is_of_run else _call)(verb, arguments, **values)
 
     about, *example = verb.help
     if verb.is_of_run:
@@ -111,12 +111,12 @@ def command_of(verb: Verb) -> click.Command:
 
 
 def _require_file(
-    verb: Verb, words: list[click.Parameter], given: dict[str, Any], reading: Iterable[str]
+    verb: Verb, words: list[click.Parameter], values: dict[str, Any], reading: Iterable[str]
 ) -> None:
     """Refuse options that say how a file is read, where none is given."""
     files = [word for word in words if word.type is FILE]
-    has_file = any(given[str(word.name)] is not None for word in files)
-    if not has_file and any(given[key] not in (None, {}) for key in reading):
+    has_file = any(values[str(word.name)] is not None for word in files)
+    if not has_file and any(values[key] not in (None, {}) for key in reading):
         problem = "--column, --unit, --covariate, --fs and --table are for a file"
         file = (
             files[0].opts[0] if isinstance(files[0], click.Option) else str(files[0].name).upper()
@@ -135,8 +135,8 @@ def _make_product(
     **options: Any,
 ) -> int:
     """Make the product of the run in FOLDER; save and show it."""
-    given = [*arguments, *(options[key] for key in verb.instead)]
-    stem = "".join(path_text(Path(value).stem) for value in given if isinstance(value, str | Path))
+    named = [*arguments, *(options[key] for key in verb.instead)]
+    stem = "".join(path_text(Path(value).stem) for value in named if isinstance(value, str | Path))
     out = out or folder / (verb.below or verb.name).replace("NAME", stem)
     with working() as watch:
         from bwbayes.app.fit.fitted import open_converged

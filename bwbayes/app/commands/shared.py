@@ -101,8 +101,8 @@ def present(
         show_report(report)
         show_paths(files)
     # Where no banner says it.
-    own: ValidationSummary = getattr(product, "standing", standing)
-    messages = dict.fromkeys([*standing.messages, *own.messages])
+    of_product: ValidationSummary = getattr(product, "standing", standing)
+    messages = dict.fromkeys([*standing.messages, *of_product.messages])
     for line in messages if quiet or not report.banners else ():
         click.echo(line, err=True)
     if product.shortfall and (quiet or product.shortfall not in product.remarks):

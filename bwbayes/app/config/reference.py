@@ -181,7 +181,9 @@ def _part(kind: str, name: str, component: Any) -> str:
                 "`bwbayes check` prints yours."
             ),
         ]
-    for _, numbered in groupby(declared, lambda one: re.sub(r"_\d+$", "_#", one.name)):
+    for _, numbered in groupby(
+        declared, lambda declaration: re.sub(r"_\d+$", "_#", declaration.name)
+    ):
         lines += ["", *_parameter(list(numbered), "residual" if kind == "noise" else "actuator")]
     return "\n".join(lines)
 

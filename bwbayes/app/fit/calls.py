@@ -202,18 +202,18 @@ def compare(
 
 
 def _asked(
-    given: Any, keys: Mapping[str, Any], call: str
+    subject: Any, keys: Mapping[str, Any], call: str
 ) -> tuple[Config, Path, dict[str, Record]]:
     """Return what is to be fitted, where its files are, and the records in memory by name."""
     from bwbayes.app.config.config import is_config, load
     from bwbayes.app.config.keywords import config_of
 
-    if not isinstance(given, str | Path) or not is_config(Path(given)):
-        config, records = config_of(given, keys, call)
+    if not isinstance(subject, str | Path) or not is_config(Path(subject)):
+        config, records = config_of(subject, keys, call)
         return config, Path(), records
     for name in keys:
         raise InputError(f"{call}: {name}: say it in the config, or give a record")
-    path = Path(given)
+    path = Path(subject)
     return load(path).renamed(path.stem, None), path.parent, {}
 
 

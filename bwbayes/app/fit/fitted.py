@@ -528,8 +528,8 @@ class Run(Shown):
             "versions": versions(self.problem.posterior.engine),
             "data_sha256": self.problem.sha256,
         }
-        said: dict[str, object] = self.quantities.rendered(numbers)
-        return said
+        rendered: dict[str, object] = self.quantities.rendered(numbers)
+        return rendered
 
     @cached_property
     def posterior(self) -> Any:

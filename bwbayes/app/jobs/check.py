@@ -33,7 +33,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     """
     from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, point, steps, found = choose_model(resolve_config(config, folder), watch)
+    problem, point, steps, explained = choose_model(resolve_config(config, folder), watch)
     posterior, seed = problem.posterior, config.seed
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, generator(seed, "around"))
@@ -42,10 +42,12 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     remarks = [remark for remark in problem.remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
-    if found is None:
+    if explained is None:
         explaining = partial(watch, "explanations")
-        found = {n: explain_record(problem, n, point.optima, explaining) for n in problem.records}
-    for explanations in found.values():
+        explained = {
+            n: explain_record(problem, n, point.optima, explaining) for n in problem.records
+        }
+    for explanations in explained.values():
         remarks += lines(explanations)
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [

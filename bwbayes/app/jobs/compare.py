@@ -243,9 +243,9 @@ def _candidate(
         posterior, problem.plan, flat, windows, rng, pool, future=future, watch=of_this
     )
     for prediction in bands:
-        part = bands_part(prediction)
-        if part is not None and problem.validations[prediction.name].record is not None:
-            parts[prediction.name] = part
+        scores = bands_part(prediction)
+        if scores is not None and problem.validations[prediction.name].record is not None:
+            parts[prediction.name] = scores
     extent = max(dataset.extent for dataset in posterior.datasets)
     return replace(
         plain,

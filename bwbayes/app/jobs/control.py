@@ -185,7 +185,9 @@ def _from_rest_remark(waited: Compensation, rested: Compensation) -> list[str]:
 
     Otherwise say nothing: it hardly matters.
     """
-    unknown, error_from_rest = (float(np.mean(one.compensated.largest)) for one in (waited, rested))
+    unknown, error_from_rest = (
+        float(np.mean(compensation.compensated.largest)) for compensation in (waited, rested)
+    )
     if error_from_rest > 0.5 * unknown:
         return []
     return [

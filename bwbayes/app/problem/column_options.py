@@ -63,8 +63,8 @@ def column_options_from(
     if not names <= {*noted.get("all_columns", ())}:
         return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
-    kept = ("units", "fs", "voltage_is", "input", "output")
-    options = {key: noted[key] for key in noted if key in kept}
+    stored = ("units", "fs", "voltage_is", "input", "output")
+    options = {key: noted[key] for key in noted if key in stored}
     further = Naming(covariates=noted.get("covariates", ())).covariate_columns
     options["covariates"] = {name: column for name, column in further.items() if column in names}
     return options | as_stated | {"columns": columns}

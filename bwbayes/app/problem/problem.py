@@ -186,7 +186,7 @@ class Problem:
             # A held-out part goes on with the loops of the rest, and its readings test them.
             is_window = validation.record is None
             beyond_by_name[name] = [
-                each for each in beyond if not (is_window and each.kind == "reversals")
+                finding for finding in beyond if not (is_window and finding.kind == "reversals")
             ]
         return beyond_by_name
 
@@ -252,16 +252,11 @@ def resolve_config(
 
     Raises InputError: anything in the config or the records that cannot be used.
     """
-    with _quantities(config, records or {}).spoken():
-        return _resolved(config, folder, records or {})
-
-
-def _quantities(config: Config, in_memory: Mapping[str, Record]) -> Quantities:
-    """Return what the first record of a config is of."""
-    name, source = next(iter(config.records.items()))
-    if name in in_memory:
-        return in_memory[name].quantities
-    return Quantities.of(source.input, source.output)
+    in_memory = records or {}
+    first, source = next(iter(config.records.items()))
+    stated = in_memory[first].quantities if first in in_memory else None
+    with (stated or Quantities.of(source.input, source.output)).spoken():
+        return _resolved(config, folder, in_memory)
 
 
 def _resolved(config: Config, folder: Path, in_memory: Mapping[str, Record]) -> Problem:

@@ -125,10 +125,10 @@ def without_clock(config: Config, records: Mapping[str, Record]) -> tuple[Config
     first = next(iter(records.values()))
     for name, record in records.items():
         if record.quantities != first.quantities:
-            own = record.quantities
+            of = record.quantities
             raise InputError(
-                f"{place_of(name)}: is of {own.input} and {own.output} along {own.clock}, the "
-                "first record of others; give records of the same quantities"
+                f"{place_of(name)}: is of {of.input} and {of.output} along {of.clock}, the first "
+                "record of others; give records of the same quantities"
             )
     if first.quantities.has_clock:
         return config, []
@@ -295,10 +295,10 @@ def validations_of(
             continue
         if source.signal is None:
             covariates = source.covariates or config.records[of].covariates
-            told = {"covariates": covariates}
+            stated = {"covariates": covariates}
             for key in ("input", "output"):
-                told[key] = getattr(source, key) or getattr(config.records[of], key)
-            told_source = source.model_copy(update=told)
+                stated[key] = getattr(source, key) or getattr(config.records[of], key)
+            told_source = source.model_copy(update=stated)
             record = _read(told_source, folder, in_memory.get(name), table).like(training[of])
             if source.missing is None:
                 record = record.without_values(config.records[of].missing or ())

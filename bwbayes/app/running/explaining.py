@@ -193,17 +193,17 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     while True:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         scene = _scene(problem, name, point.optima)
-        found = explain(scene, step, begin + seconds)
+        explanations = explain(scene, step, begin + seconds)
         is_over = time.process_time() > begin + seconds
         # The last one has just been weighed.
         needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
-        models = [cause for cause in found if cause.spec is not None]
+        models = [cause for cause in explanations if cause.spec is not None]
         parts = likely_causes([cause for cause in models if not cause.misleads])
         if needless:
             chosen = max(needless, key=lambda removal: removal.nats)
             del notes[chosen.kind]
             note = f"left out again: {chosen.kind}"
-        elif parts and all(cause.spec is not None for cause in followed_causes(found)):
+        elif parts and all(cause.spec is not None for cause in followed_causes(explanations)):
             # Of those that tie a stage before another hold, and the one with the fewest parameters.
             chosen, chain = min(parts, key=partial(_size, problem)), problem.study.spec.chain
             assert chosen.spec is not None
@@ -233,7 +233,7 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
         )
     spec = problem.study.spec
     problem = problem.with_model(spec, remarks=remarks, stages=spec.keys["stages"])
-    return ChosenModel(problem, point, tuple(steps), None if is_over else {name: found})
+    return ChosenModel(problem, point, tuple(steps), None if is_over else {name: explanations})
 
 
 def _size(problem: Problem, cause: Explanation) -> tuple[bool, int]:

@@ -189,8 +189,8 @@ class Prediction(Product, Bands):
             table.parent.mkdir(parents=True, exist_ok=True)
             write_bands(table, [self], part(watch, 0.0, 0.8), self.quantities)
             standing = self.run_validation
-            said = self.numbers() | {"run_validation": standing and standing.numbers}
-            write_summary(numbers, self.quantities.rendered(said))
+            summary = self.numbers() | {"run_validation": standing and standing.numbers}
+            write_summary(numbers, self.quantities.rendered(summary))
             picture.write_bytes(picture_of(self.plot))
             watch(1.0)
         return files
@@ -292,10 +292,11 @@ def _from_rest_remark(
     if np.allclose(widths[0], widths[1], rtol=0.1) and np.ptp(shares or [0.0]) < 0.1:
         return ""
     covers = [f" and covers {share:.1%}" for share in shares]
-    unknown, known = (f"{w:.3g} um wide{c}" for w, c in zip_longest(widths, covers, fillvalue=""))
+    texts = zip_longest(widths, covers, fillvalue="")
+    unknown, at_rest = (f"{width:.3g} um wide{cover}" for width, cover in texts)
     return (
         f"the record starts at 0 V, perhaps from rest: the 95% sensor band is {unknown}; "
-        f"{known} if the actuator was demagnetized and nothing moved, which --from-rest declares"
+        f"{at_rest} if the actuator was demagnetized and nothing moved, which --from-rest declares"
     )
 
 
@@ -306,8 +307,8 @@ def _held_lead_in_remark(problem: Problem, other: Validation, bands: Bands) -> s
     """
     record, lead = other.record, bands.lead_in
     assert record is not None
-    known = other.start.from_rest or problem.config.model.hysteresis == "linear"
-    if lead is None or known or not other.start.estimate_offset:
+    is_known = other.start.from_rest or problem.config.model.hysteresis == "linear"
+    if lead is None or is_known or not other.start.estimate_offset:
         return ""
     voltage, extent = record.path.voltage, float(np.ptp(record.path.voltage))
     first, last = np.searchsorted(record.time, [lead.start, lead.stop]).tolist()
@@ -345,15 +346,15 @@ def predict_after(
     source = generator(seed, f"forecast {planned.sha256}")
     alone, own_draws = _reaching(problem, subset, of, longer, beyond)
 
-    error, found = None, _rivals(rivals, of, beyond, part(watch, 0.0, 0.5))
-    if found is not None:
+    error, fitted_rivals = None, _rivals(rivals, of, beyond, part(watch, 0.0, 0.5))
+    if fitted_rivals is not None:
         rng = generator(seed, f"rivals {planned.sha256}")
 
         def follow(posterior: Posterior, draws: FloatArray) -> Bands:
             return forecast(posterior, draws, record, voltage, rng)
 
         study = problem.study.for_record(of)
-        error = disagreement(alone, own_draws, study, found, follow, rng)
+        error = disagreement(alone, own_draws, study, fitted_rivals, follow, rng)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
     return Prediction(**vars(bands), remarks=_notes(bands, beyond))
@@ -407,15 +408,15 @@ def _of_another(
     record = other.record
     assert record is not None
     alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
-    error, found = None, _rivals(rivals, other.of, beyond, part(watch, 0.0, 0.5))
-    if found is not None:
+    error, fitted_rivals = None, _rivals(rivals, other.of, beyond, part(watch, 0.0, 0.5))
+    if fitted_rivals is not None:
         rng = generator(problem.config.seed, f"rivals {record.sha256}")
 
         def predict(posterior: Posterior, draws: FloatArray) -> Bands:
             return predict_record(posterior, draws, record, other.start, rng)
 
         study = problem.study.for_record(other.of)
-        error = disagreement(alone, own_draws, study, found, predict, rng)
+        error = disagreement(alone, own_draws, study, fitted_rivals, predict, rng)
     source = generator(problem.config.seed, f"predict {record.sha256}")
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     return predict_record(

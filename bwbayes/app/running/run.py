@@ -38,7 +38,7 @@ from bwbayes.report.page import render
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import Watch, WatchSteps, part, unwatched
+from bwbayes.watching import WatchSteps, part, unwatched
 
 
 def begin(folder: RunFolder) -> tuple[Problem, MAPEstimate]:
@@ -139,14 +139,20 @@ def _open_chain(
 ) -> tuple[Problem, ChainFile]:
     """Open the run's chain where it stands, or start it with a point fit; its problem first."""
     if not folder.chain.exists():
-        given = problem.config
+        config_before = problem.config
         with StepProgress(console, "choosing the model ...") as watch:
             problem, point, steps, explanations = choose_model(problem, watch)
-            unsure = _voltage_noise(problem, point, partial(watch, "noise on the voltage"))
-        posterior, config = problem.posterior, problem.config
+            posterior, config = problem.posterior, problem.config
+            paths = {name: record.path for name, record in problem.records.items()}
+            unsure: dict[str, str] = {}
+            if any(path.noise_sd for path in paths.values()):
+                source = generator(config.seed, "voltage noise")
+                watch_noise = partial(watch, "noise on the voltage")
+                covariance = path_covariance(posterior, paths, point, source, watch_noise)
+                unsure = {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
         for step in map(problem.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
-        if config != given:
+        if config != config_before:
             _rewrite(folder, config)
         if explanations is not None:
             save(folder.search, fingerprint(problem), explanations)
@@ -176,16 +182,6 @@ def _open_chain(
     return problem, chain
 
 
-def _voltage_noise(problem: Problem, point: MAPEstimate, watch: Watch) -> dict[str, str]:
-    """Return what a chain notes of what noise on the voltages leaves unsure; nothing without."""
-    paths = {name: record.path for name, record in problem.records.items()}
-    if not any(path.noise_sd for path in paths.values()):
-        return {}
-    source = generator(problem.config.seed, "voltage noise")
-    covariance = path_covariance(problem.posterior, paths, point, source, watch)
-    return {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
-
-
 def _rewrite(folder: RunFolder, config: Config) -> None:
     text = dump(config)
     parse(text, "resume")  # refuses what a config cannot say
@@ -204,9 +200,12 @@ def copy_run(fit: Run, path: Path, overwrite: bool) -> RunFolder:
         shutil.copyfile(fit.folder.backend, folder.backend)
         write_files(fit, folder, FigureWorker())
         # Predictions that were asked for now may have needed them.
-        for kept, copy in ((fit.folder.search, folder.search), (fit.folder.rivals, folder.rivals)):
-            if kept.exists():
-                shutil.copyfile(kept, copy)
+        for original, copy in (
+            (fit.folder.search, folder.search),
+            (fit.folder.rivals, folder.rivals),
+        ):
+            if original.exists():
+                shutil.copyfile(original, copy)
     return folder
 
 
