@@ -215,11 +215,15 @@ COMMANDS = (
         "bwbayes.app.commands.studies:campaign",
         also="bwbayes.app.fit.calls:campaign",
         flags={"resumed": "resume"},
+        either={"FOLDER": "a FOLDER of records"},
+        instead={"resumed": "--resume CAMPAIGN"},
     ),
     Verb(
         "bwbayes.app.commands.studies:calibrate",
         also="bwbayes.app.jobs.calibrate:resume",
         flags={"resumed": "resume"},
+        either={"CONFIG": "a CONFIG"},
+        instead={"resumed": "--resume FOLDER"},
     ),
     Verb("bwbayes.app.jobs.simulate:simulate"),
     Verb(

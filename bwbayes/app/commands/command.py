@@ -114,14 +114,17 @@ def _require_file(
     verb: Verb, words: list[click.Parameter], values: dict[str, Any], reading: Iterable[str]
 ) -> None:
     """Refuse options that say how a file is read, where none is given."""
-    files = [word for word in words if word.type is FILE]
-    has_file = any(values[str(word.name)] is not None for word in files)
+    ways = zip(words, verb.either.values(), strict=True)
+    files = {
+        str(word.name): word.opts[0] if isinstance(word, click.Option) else way
+        for word, way in ways
+        if word.type is FILE
+    }
+    has_file = any(values[name] is not None for name in files)
     if not has_file and any(values[key] not in (None, {}) for key in reading):
         problem = "--column, --unit, --covariate, --fs and --table are for a file"
-        file = (
-            files[0].opts[0] if isinstance(files[0], click.Option) else str(files[0].name).upper()
-        )
-        raise InputError(f"{verb.name}: {problem}; give {file}, or remove them")
+        give = next(iter(files.values()))
+        raise InputError(f"{verb.name}: {problem}; give {give}, or remove them")
 
 
 def _make_product(

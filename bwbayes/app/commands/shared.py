@@ -82,16 +82,6 @@ def resumable(command: str) -> Iterator[None]:
         raise click.exceptions.Exit(ExitStatus.INTERRUPTED) from None
 
 
-def require_new_or_resumed(
-    command: str, either: str, new: object, resumed: object, options: Mapping[str, object]
-) -> None:
-    """Refuse neither a new study nor one to resume, both, and options of a new one to resume."""
-    if (new is None) == (resumed is None):
-        raise InputError(f"{command}: give either {either}")
-    if new is None and any(value not in (None, False) for value in options.values()):
-        raise InputError(f"{command}: --resume takes no other options; remove them")
-
-
 def present(
     product: Product, files: Iterable[Path], standing: ValidationSummary, *, quiet: bool = False
 ) -> int:

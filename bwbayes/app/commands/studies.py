@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,15 @@ from rich.console import Console
 from bwbayes.app.commands.shared import (
     present,
     refuse_beside_config,
-    require_new_or_resumed,
     resumable,
     show_report,
     working,
 )
-from bwbayes.errors import ExitStatus
+from bwbayes.errors import ExitStatus, InputError
 
 
 def calibrate(
-    config: Path | None,
+    config: Path | None = None,
     *,
     resumed: Path | None,
     out: Path | None,
@@ -56,7 +56,7 @@ def calibrate(
         from bwbayes.report.calibration import calibration_report
 
     new = {"out": out, "seed": seed, "overwrite": overwrite}
-    require_new_or_resumed("calibrate", "a CONFIG or --resume FOLDER", config, resumed, new)
+    _refuse_beside_resume("calibrate", resumed, new)
     if config is None:
         folder = CalibrationFolder.open(Path(str(resumed)))
     else:
@@ -80,7 +80,7 @@ def calibrate(
 
 
 def campaign(
-    folder: Path | None,
+    folder: Path | None = None,
     *,
     config: Path | None,
     out: Path | None,
@@ -119,9 +119,7 @@ def campaign(
         from bwbayes.app.running.folder import CampaignFolder
 
     new = {"out": out, "config": config, "overwrite": overwrite, "pictures": not pictures}
-    require_new_or_resumed(
-        "campaign", "a FOLDER of records or --resume CAMPAIGN", folder, resumed, new
-    )
+    _refuse_beside_resume("campaign", resumed, new)
     if folder is None:
         batch = CampaignFolder.open(Path(str(resumed)))
     else:
@@ -141,6 +139,12 @@ def campaign(
         if row.reason:
             click.echo(f"{row.status.upper()}: {row.name}: {row.reason}", err=True)
     return result.exit_status
+
+
+def _refuse_beside_resume(command: str, resumed: object, new: Mapping[str, object]) -> None:
+    """Refuse options of a new study to resume one."""
+    if resumed is not None and any(value not in (None, False) for value in new.values()):
+        raise InputError(f"{command}: --resume takes no other options; remove them")
 
 
 def compare(*paths: Path, models: str | None, out: Path | None, quiet: bool, **options: Any) -> int:
