@@ -19,7 +19,7 @@ from pathlib import Path
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.column_options import record_naming
-from bwbayes.app.problem.parameters import as_config, recoverable, study_of, with_model
+from bwbayes.app.problem.parameters import as_config, recoverable, study_of
 from bwbayes.app.problem.records import (
     Slices,
     Validation,
@@ -211,14 +211,13 @@ class Problem:
         ``stated`` is stated of new parameters, ``remarks`` are added to those of the records, and
         ``keys`` are what [model] says from now on.
         """
-        config = with_model(self.config, spec, self.records, stated)
-        changes: dict[str, object] = {"model": config.model.model_copy(update=keys)}
+        changes: dict[str, object] = {"model": self.config.model.model_copy(update=keys)}
         if remarks:
-            record = config.record
+            record = self.config.record
             assert isinstance(record, RecordConfig)
             noted = [*(record.remarks or []), *remarks]
             changes["record"] = record.model_copy(update={"remarks": noted})
-        config = config.model_copy(update=changes)
+        config = self.config.model_copy(update=changes)
         if spec != self.study.spec:
             return _problem(config, self.study.with_model(spec, stated), self.validations)
         same = copy(self)  # with all that is known of it
@@ -395,12 +394,14 @@ def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()
     }
+    scopes = {"per_record": [*study.per_record], "shared": [*study.shared]}
+    model = config.model.with_spec(study.spec.explicit(posterior.datasets[0].actuator))
     true = {p.name: truth.get(p.name, truth.get(p.plain)) for p in parameters}
     sampling = {"walkers": plan.walkers, "engine": posterior.engine}
     return config.model_copy(
         update={
             "record": records[ALONE] if isinstance(config.record, RecordConfig) else records,
-            "model": config.model.with_spec(study.spec.explicit(posterior.datasets[0].actuator)),
+            "model": model.model_copy(update=scopes),
             "sampling": config.sampling.model_copy(update=sampling),
             "parameters": {p.name: as_config(p, study.quantities) for p in parameters},
             "truth": {name: value for name, value in true.items() if value is not None},
