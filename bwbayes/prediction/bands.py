@@ -46,6 +46,41 @@ class LeadIn:
 
 
 @dataclass(frozen=True)
+class Correction:
+    """How much wider a 95% sensor band has to be to cover what it states, on drives alike.
+
+    Attributes
+    ----------
+    factor
+        The corrected band's width over the model's, about the mean; None where ``blocks`` are too
+        few to tell.
+    blocks
+        Independent blocks of held-out readings on which it rests.
+    block_s
+        Length of a block, s: the residual is correlated for a shorter time.
+    needed_s
+        Length of held-out readings that would do, s; None where there are enough.
+    """
+
+    factor: float | None
+    blocks: int
+    block_s: float
+    needed_s: float | None = None
+
+    def __str__(self) -> str:
+        held_out = f"{self.blocks} independent blocks of {self.block_s:.2g} s"
+        if self.factor is None:
+            return (
+                f"the band cannot be corrected from this record: its held-out readings are "
+                f"{held_out}; hold out {self.needed_s:.2g} s of a drive like this one"
+            )
+        return (
+            f"corrected 95% sensor band: {self.factor:.2g} times as wide, for drives like this "
+            f"one, from {held_out}"
+        )
+
+
+@dataclass(frozen=True)
 class Bands:
     """Pointwise bands along one stretch of samples.
 
@@ -88,6 +123,16 @@ class Bands:
     common_sd: float = 0.0
     separate: bool = False
     model_error_sd: float | None = None
+    correction: Correction | None = None
+
+    @property
+    def corrected(self) -> tuple[FloatArray, FloatArray] | None:
+        """Lower and upper edge (samples,) of the corrected 95% sensor band, um; None without."""
+        if self.correction is None or self.correction.factor is None:
+            return None
+        factor, edges = self.correction.factor, (self.lower, self.upper)
+        lower, upper = (self.mean + factor * (edge["sensor", 95] - self.mean) for edge in edges)
+        return lower, upper
 
     @property
     def without_rivals(self) -> Bands:
@@ -189,3 +234,6 @@ class Bands:
             for level in LEVELS:
                 yield f"{kind}_lower_{level}_um", self.lower[kind, level][rows]
                 yield f"{kind}_upper_{level}_um", self.upper[kind, level][rows]
+        if self.corrected is not None:
+            for side, edge in zip(("lower", "upper"), self.corrected, strict=True):
+                yield f"corrected_{side}_95_um", edge[rows]

@@ -91,16 +91,18 @@ def write_bands(
 ) -> None:
     """Write bands as CSV; of several sets, a first column ``set`` names each.
 
-    Every column has seven digits of its range, however far from zero it lies. ``watch`` is called
-    with the share that is done.
+    What some of the sets do not have is nan there. Every column has seven digits of its range,
+    however far from zero it lies. ``watch`` is called with the share that is done.
     """
     more = counted(sum(predicted.time.size for predicted in bands), watch)
     with draft_of(path) as draft, draft.open("w", encoding="utf-8") as file:
-        for number, predicted in enumerate(bands):
-            names, columns = zip(*predicted.columns(), strict=True)
-            if number == 0:
-                headings = [*["set"] * (len(bands) > 1), *map(quantities.heading, names)]
-                file.write(",".join(headings) + "\n")
+        tables = [dict(predicted.columns()) for predicted in bands]
+        names = [*dict.fromkeys(name for table in tables for name in table)]
+        headings = [*["set"] * (len(bands) > 1), *map(quantities.heading, names)]
+        file.write(",".join(headings) + "\n")
+        for predicted, table in zip(bands, tables, strict=True):
+            missing = np.full(table["time_s"].size, np.nan)
+            columns = [table.get(name, missing) for name in names]
             prefix = f"{predicted.name}," if len(bands) > 1 else ""
             formats = []
             for name, column in zip(names, columns, strict=True):

@@ -8,7 +8,7 @@ bands, no scores.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -124,12 +124,16 @@ class Result:
 
     @property
     def validation_numbers(self) -> dict[str, dict[str, Any]]:
-        """Scores and verdict of all bands that have readings, by name."""
-        return {
+        """Scores, verdict and correction of all bands that have readings, by name."""
+        numbers = {
             name: scores.numbers
             | (self.validation[name].summary if name in self.validation else {})
             for name, scores in self.scores.items()
         }
+        for bands in self.predictions:
+            if bands.correction is not None:
+                numbers[bands.name]["correction"] = asdict(bands.correction)
+        return numbers
 
     @cached_property
     def estimates(self) -> dict[str, dict[str, Any]]:

@@ -193,6 +193,7 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         validation = [
             tables.scores_table(scores, result.validation, titles, records),
             *tables.rivals_table(ordered),
+            *tables.correction_texts(ordered),
             Section(
                 "Other scores",
                 [

@@ -18,7 +18,7 @@ from bwbayes.prediction.bands import LEVELS, Bands
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
-from bwbayes.report.report import UNKNOWN, Table, TableColumn
+from bwbayes.report.report import UNKNOWN, Table, TableColumn, Text
 from bwbayes.report.result import Result
 from bwbayes.report.words import (
     coverage_text,
@@ -218,6 +218,12 @@ def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
     )
     table = Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")
     return [table] * bool(rows)
+
+
+def correction_texts(predictions: Iterable[Bands]) -> list[Text]:
+    """Return a line for each of the bands that failed: how wide it has to be, if that is known."""
+    corrected = [(bands.name, bands.correction) for bands in predictions]
+    return [Text(f"{name}: {c}", on="both") for name, c in corrected if c is not None]
 
 
 def other_scores_table(

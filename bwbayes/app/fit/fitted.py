@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from bwbayes.diagnosis.residual_analysis import Explanation
     from bwbayes.diagnosis.rivals import Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
-    from bwbayes.prediction.bands import Bands
+    from bwbayes.prediction.bands import Bands, Correction
     from bwbayes.prediction.loops import Loops
     from bwbayes.prediction.scores import Scores
     from bwbayes.prediction.steps import StepResponse
@@ -269,10 +269,14 @@ class Run(Shown):
 
     @RunStage
     def predictions(self, watch: Watch) -> tuple[Bands, ...]:
-        """Return the bands of all that was held out, and of the training windows."""
-        from bwbayes.app.running.predictions import predictions
+        """Return the bands of all that was held out, and of the training windows.
 
-        return predictions(self.problem, self.flat_draws, self.widening_rivals, watch)
+        Those of held-out readings that fail validation have their correction.
+        """
+        from bwbayes.app.running.predictions import correct_failed, predictions
+
+        bands = predictions(self.problem, self.flat_draws, self.widening_rivals, watch)
+        return correct_failed(self.problem, bands, self.background)
 
     @RunStage
     def scores(self, watch: Watch) -> dict[str, Scores]:
@@ -579,6 +583,12 @@ class Run(Shown):
             ).said_in(self.quantities)
             for bands in self.predictions
         }
+
+    @property
+    def corrections(self) -> dict[str, Correction]:
+        """How much wider bands that failed validation have to be, by the bands' name."""
+        corrections = ((bands.name, bands.correction) for bands in self.predictions)
+        return {name: correction for name, correction in corrections if correction is not None}
 
     @property
     def residuals(self) -> xarray.DataArray:

@@ -110,6 +110,7 @@ def predict(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
     problem, watching, hints = fit.problem, partial(watch, "predictions"), list[str]()
+    held_out = fit.predictions if fit.standing.passed is False else ()
     of = of or next(iter(problem.records))
     if of not in problem.records:
         hint = suggestion(of, problem.records)
@@ -124,7 +125,7 @@ def predict(
             )
         if after:
             prediction = predict_after(
-                problem, fit.flat_draws, voltage, name, of, fit.widening_rivals, watching
+                problem, fit.flat_draws, voltage, name, of, fit.widening_rivals, watching, held_out
             )
             return replace(prediction, run_validation=fit.standing)
         record = Record(voltage, None, interval=interval, origin=f"{signal} signal")
@@ -155,7 +156,13 @@ def predict(
     )
     other = Validation((), record, start, window, of)
     prediction = predict_another(
-        problem, fit.flat_draws, other, name or "prediction", fit.widening_rivals, watching
+        problem,
+        fit.flat_draws,
+        other,
+        name or "prediction",
+        fit.widening_rivals,
+        watching,
+        held_out,
     )
     is_said = any("--from-rest" in remark for remark in prediction.remarks)
     if record.displacement is None and not (from_rest or after or is_said):

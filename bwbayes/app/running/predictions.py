@@ -35,7 +35,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
 
 # The fields that Prediction inherits are read where it stands.
-from bwbayes.prediction.bands import Bands, Kind, LeadIn  # noqa: F401
+from bwbayes.prediction.bands import Bands, Correction, Kind, LeadIn  # noqa: F401
+from bwbayes.prediction.correction import correct
 from bwbayes.prediction.prediction import (
     continued,
     forecast,
@@ -58,7 +59,7 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
-from bwbayes.report.tables import rivals_table, scores_table
+from bwbayes.report.tables import correction_texts, rivals_table, scores_table
 from bwbayes.watching import Watch, part, unwatched
 
 type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]
@@ -139,6 +140,7 @@ class Prediction(Product, Bands):
             "remarks": list(self.remarks),
             "model_error_sd_um": self.model_error_sd,
             "lead_in": None if self.lead_in is None else asdict(self.lead_in),
+            "correction": None if self.correction is None else asdict(self.correction),
             "scores": None if self.scores is None else self.scores.numbers,
             **held,
         }
@@ -153,6 +155,7 @@ class Prediction(Product, Bands):
         if self.scores is not None and self.validation is not None:
             blocks.append(scores_table({name: self.scores}, {name: self.validation}, {name: name}))
         blocks += rivals_table([self])
+        blocks += correction_texts([self])
         if self.passed:
             blocks.append(Text(f"{name}: validation passed for drives like this one", on="both"))
         of_run = standing_banner(self.run_validation) if self.run_validation else []
@@ -214,13 +217,14 @@ def predict_another(
     name: str,
     rivals: RivalsOf,
     watch: Watch = unwatched,
+    held_out: Iterable[Bands] = (),
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
     ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
     which a thousand are used. The ``other`` record may have any sampling interval; ``name`` is that
     of the bands, and ``rivals`` returns those of a training record. ``watch`` is called with the
-    share that is done.
+    share that is done. The correction of a drive like it is that of the run's ``held_out`` bands.
 
     Raises InputError: a lead-in or window that does not fit into the record.
     """
@@ -240,7 +244,40 @@ def predict_another(
     held = _held_lead_in_remark(problem, other, bands)
     notes = (noise, from_rest_note, held, *_notes(bands, beyond))
     remarks = tuple(note for note in notes if note)
+    if verdict is None or not verdict.passed:
+        bands = replace(bands, correction=_of_drives_alike(problem, held_out, beyond))
     return Prediction(**vars(bands), scores=scores, validation=verdict, remarks=remarks)
+
+
+def correct_failed(
+    problem: Problem, bands: Iterable[Bands], background: ValidationContext
+) -> tuple[Bands, ...]:
+    """Return bands, those of held-out readings that fail validation with their correction."""
+    bands = tuple(bands)
+    held_out = [predicted for predicted in bands if not predicted.training]
+    validation = validate_predictions(problem, held_out, background, {})
+    failed = {name for name, verdict in validation.items() if verdict.passed is False}
+    return tuple(
+        replace(predicted, correction=correct(predicted)) if predicted.name in failed else predicted
+        for predicted in bands
+    )
+
+
+def _of_drives_alike(
+    problem: Problem, held_out: Iterable[Bands], beyond: Iterable[Finding]
+) -> Correction | None:
+    """Return the widest correction of held-out bands whose drive leaves training in the same ways.
+
+    None if there is none, or they cannot be corrected.
+    """
+    ways = {finding.kind for finding in beyond}
+    alike = [
+        (bands.correction.factor, bands.correction)
+        for bands in held_out
+        if bands.correction is not None and bands.correction.factor is not None
+        if {finding.kind for finding in problem.extrapolations.get(bands.name, ())} == ways
+    ]
+    return max(alike, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
 def _notes(bands: Bands, beyond: Iterable[Finding]) -> tuple[str, ...]:
@@ -331,6 +368,7 @@ def predict_after(
     of: str,
     rivals: RivalsOf,
     watch: Watch = unwatched,
+    held_out: Iterable[Bands] = (),
 ) -> Prediction:
     """Predict what follows on a training record whose last sample goes on into a planned voltage.
 
@@ -357,6 +395,7 @@ def predict_after(
         error = disagreement(alone, own_draws, study, fitted_rivals, follow, rng)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
+    bands = replace(bands, correction=_of_drives_alike(problem, held_out, beyond))
     return Prediction(**vars(bands), remarks=_notes(bands, beyond))
 
 

@@ -170,6 +170,10 @@ def _glyphs(source: models.ColumnDataSource, about: str) -> Iterator[tuple[str, 
             for edge in (lower, upper):
                 look: style.Look = {"line_color": style.Color.EDGE, "line_dash": "dashed"}
                 yield name, models.Line(x="time", y=edge, **look)
+    for edge in (f"lower_corrected{about}", f"upper_corrected{about}"):
+        if edge in source.data:
+            line = models.Line(x="time", y=edge, line_color=style.Color.CORRECTED)
+            yield style.CORRECTED, line
     yield "mean", models.Line(x="time", y=f"mean{about}", line_color=style.Color.MEAN)
     if f"measured{about}" in source.data:
         yield "measured", _dots("time", f"measured{about}", size=3.5, alpha=0.6)
@@ -217,6 +221,8 @@ def _columns(bands: Bands, *, residuals: bool) -> dict[str, FloatArray]:
     for kind in style.BAND_COLORS:
         series[f"lower_{kind}"] = bands.lower[kind, 95]
         series[f"upper_{kind}"] = bands.upper[kind, 95]
+    if bands.corrected is not None:
+        series["lower_corrected"], series["upper_corrected"] = bands.corrected
     columns = {"time": bands.time, "voltage": bands.voltage} | series
     if residuals:
         columns |= {f"{name}_residual": values - bands.mean for name, values in series.items()}

@@ -60,6 +60,7 @@ class Color:
     CHANCE = "#dddddd"  # what chance does
     ZOOM = "#CC79A7"
     EDGE = "#12344D"  # of the sensor band
+    CORRECTED = "#009E73"
 
 
 # From the widest band, drawn first, to the narrowest.
@@ -73,6 +74,7 @@ BAND_NAMES: Mapping[Kind, str] = {
     "displacement": "95% displacement",
     "parameter": "95% parameters alone",
 }
+CORRECTED = "95% sensor reading, corrected"
 
 
 def plain(text: str) -> str:
@@ -207,6 +209,8 @@ def draw_ribbons(
         edge: Look = {"ec": Color.EDGE, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
         drawn = envelope(bands.time, bands.lower[kind, 95] - about, bands.upper[kind, 95] - about)
         panel.fill_between(*drawn, fc=BAND_COLORS[kind], label=BAND_NAMES[kind], **edge)
+    for edge_um in bands.corrected or ():
+        panel.plot(*zigzag(bands.time, edge_um - about), color=Color.CORRECTED, label=CORRECTED)
 
 
 def share_legend(figure: Figure, ncols: int = 8, band: str = "") -> None:
