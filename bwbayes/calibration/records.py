@@ -17,6 +17,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
+from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
@@ -39,7 +40,8 @@ class Simulated(NamedTuple):
         generator: np.random.Generator,
     ) -> Self:
         """Add the noise of ``parameters`` (1, parameters); missing readings stay missing."""
-        discrepancy, sensor = noise.draw(parameters, model.size, generator)
+        speed = np.abs(rate(record.inputs.voltage, record.interval))
+        discrepancy, sensor = noise.draw(parameters, model.size, generator, speed)
         truth = model + discrepancy
         reading = truth + sensor
         if record.displacement is not None:

@@ -21,7 +21,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import root
-from bwbayes.model.reversals import monotone_stretches, time_between_turns, turning_points
+from bwbayes.model.reversals import monotone_stretches, rate, time_between_turns, turning_points
 
 # Probability of a false alarm, of a residual that does not follow the drive; and the correlation,
 # or the part of its variance beyond the sensor's noise, from which on it matters.
@@ -108,7 +108,9 @@ def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator
     step = int(np.gcd.reduce(np.diff(rows)))
     places = (rows - rows[0]) // step
     noise = record.noise.at(step * record.actuator.interval)
-    discrepancy, sensor = noise.draw_all(parameters, int(places[-1]) + 1, rng)
+    at = rows[0] + step * np.arange(int(places[-1]) + 1)
+    speed = np.abs(rate(record.voltage, record.actuator.interval))[at]
+    discrepancy, sensor = noise.draw_all(parameters, at.size, rng, speed)
     like = compare(missed[::stride], (discrepancy + sensor)[:, places], record.voltage, rows)
     typical = np.median(parameters, axis=0, keepdims=True)
     series = np.concatenate([[missed], drive_features(record.voltage)[:, readings.rows]])

@@ -19,6 +19,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.thinning import beginning
+from bwbayes.model.reversals import rate
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
 
@@ -128,13 +129,14 @@ def check_predictions(
     # Where readings are missing they are missing in all.
     neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
     work_out = partial(_statistics, dataset.voltage[rows], origin + away, sd, neighbors)
+    speed = np.abs(rate(dataset.voltage, dataset.actuator.interval))[: int(rows[-1]) + 1]
     statistics, noises = [], iter(noise[:, np.newaxis])
     for simulated in posterior.simulations(theta, rows, record):
         # A few at a time are looked at together.
         for batch in batches(len(simulated), rows.size, 1 << 18):
             readings = simulated[batch].copy()
             for i in range(len(readings)):
-                drawn = dataset.noise.draw(next(noises), int(rows[-1]) + 1, generator)
+                drawn = dataset.noise.draw(next(noises), speed.size, generator, speed)
                 readings[i] += np.sum(drawn, axis=0)[rows]
             statistics.append(work_out(readings))
             done += len(readings)

@@ -25,6 +25,7 @@ from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
+from bwbayes.model.reversals import rate
 from bwbayes.shown import brief
 
 
@@ -172,7 +173,7 @@ class Likelihood:
                 followed.mean[:, states:],
                 followed.covariance[:, states:, states:],
             )
-        if self.engine == "numpy":
+        if self.engine == "numpy" or self.noise.paced:
             nothing = np.empty((0, self.readings.rows.size))
             products = self.products_of_series(theta, nothing, displacement)
         else:
@@ -241,6 +242,15 @@ class Likelihood:
         if self.offset_sd:
             sd[:, 0] = self.offset_sd
         return sd
+
+    @cached_property
+    def speed(self) -> FloatArray:
+        """Speed of the voltage at the readings (readings,), V/s."""
+        return np.abs(rate(self.voltage, self.actuator.interval))[self.readings.rows]
+
+    def sensor(self, noise: FloatArray) -> FloatArray | None:
+        """Return variances (models, readings), um², of sensor noise that grows with the speed."""
+        return self.noise.sensor_variance(noise, self.speed) if self.noise.paced else None
 
     @property
     def spaced(self) -> Noise:
@@ -342,6 +352,8 @@ class Likelihood:
         """
         if self.noise.tailed and sensor is None:
             sensor = self.follow(noise, series[:, :1], np.empty((len(noise), 0))).sensor
+        if sensor is None:
+            sensor = self.sensor(noise)
         if self.engine == "numba" and self.noise.states:
             from bwbayes.inference import compiled  # noqa: PLC0415  # as for the products
 

@@ -1,5 +1,6 @@
-"""The noises: white, with a rough discrepancy, with a smooth one, with a sensor of heavy tails.
+"""The noises: white, with a rough or a smooth discrepancy, or with a sensor of another noise.
 
+A sensor's noise may have heavy tails, or grow with the voltage's speed.
 Or one's own by its import path. Each is a :class:`~bwbayes.inference.state_space.Noise` that says
 how its discrepancy goes on.
 """
@@ -85,6 +86,16 @@ SENSOR_TAIL = Declaration(
     pressed={"upper": "find out what spoils so many readings; a loose contact, a lost bit"},
 )
 
+SENSOR_SPEED = Declaration(
+    "sensor_speed",
+    "V/s",
+    "v_s",
+    "speed of the voltage at which the sensor's noise has twice its variance at rest",
+    # The mean speed of a triangle over the range; noise that does not grow lies far above it.
+    lambda context: lognormal(2 * context.ranges.voltage / context.ranges.time, 1.5),
+    floor=0.0,
+)
+
 # The integral over a time, by Gauss and Legendre, where the fast rate times it is below one.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -118,7 +129,7 @@ class WhiteNoise(Noise):
         skipped: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Divide by the sensor's sd."""
-        if self.tailed:
+        if self.tailed or self.paced:
             return super().whiten(theta, series, skipped)
         log_determinant: FloatArray = 2 * series.shape[2] * np.log(theta[:, 0])
         return series / theta[:, :1, np.newaxis], log_determinant
@@ -161,6 +172,30 @@ class StudentNoise(WhiteNoise):
     def inverse_df(self, theta: FloatArray) -> FloatArray:
         """Return 1/ν."""
         return theta[:, 1]
+
+
+@dataclass(frozen=True)
+class PacedNoise(WhiteNoise):
+    """Sensor noise that grows with the speed v of the voltage: variance s² (1 + (v / v_s)²).
+
+    As of readings whose times scatter, or of a sensor that is disturbed by the motion. Beside a
+    discrepancy it is ``"discrepancy + paced"``.
+    """
+
+    @property
+    def declarations(self) -> tuple[Declaration, ...]:
+        """The sensor's sd at rest, and the speed that doubles its variance."""
+        return (SENSOR_SD, SENSOR_SPEED)
+
+    @property
+    def paced(self) -> bool:
+        """It is."""
+        return True
+
+    def sensor_variance(self, theta: FloatArray, speed: FloatArray) -> FloatArray:
+        """Return s² (1 + (v / v_s)²)."""
+        grown = 1 + np.square(speed / theta[:, 1:2])
+        return np.asarray(theta[:, :1] ** 2 * grown)
 
 
 @dataclass(frozen=True)
@@ -317,6 +352,7 @@ NOISES: Mapping[str, Callable[..., Noise]] = {
     "discrepancy": DiscrepancyNoise,
     "smooth": SmoothNoise,
     "student": StudentNoise,
+    "paced": PacedNoise,
     "white": WhiteNoise,
 }
 

@@ -24,6 +24,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
+from bwbayes.model.reversals import rate
 
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0
@@ -114,7 +115,11 @@ def surprise(
     residual = readings.values - simulated
     noise = dataset.noise.at(dataset.actuator.interval * readings.stride)
     parameters = dataset.table.noise(theta)
-    (stationary,), sensor = noise.stationary(parameters), float(parameters[0, 0]) ** 2
+    speed = np.abs(rate(dataset.voltage, dataset.actuator.interval))[readings.rows]
+    (stationary,), (sensor,) = (
+        noise.stationary(parameters),
+        noise.sensor_variance(parameters, speed),
+    )
     observe = noise.observe
     if not observe @ stationary @ observe > 0:
         return np.asarray(residual / np.sqrt(sensor))
@@ -124,16 +129,16 @@ def surprise(
         forward[missing] = noise.transition(parameters, 1 + missing)[0]
         backward[missing] = np.linalg.solve(stationary, forward[missing] @ stationary).T
     turned = np.concatenate([[0.0], readings.skipped[:0:-1]])
-    noise_model = stationary, observe, sensor
-    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *noise_model)
-    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *noise_model)
+    of_states = stationary, observe
+    m_1, p_1 = _predicted(residual, readings.skipped, fitted, forward, *of_states, sensor)
+    after = _predicted(residual[::-1], turned, fitted[::-1], backward, *of_states, sensor[::-1])
     m_2, p_2 = after[0][::-1], after[1][::-1]
     inverse_1, inverse_2 = np.linalg.inv(p_1), np.linalg.inv(p_2)
     joined = np.linalg.inv(inverse_1 + inverse_2 - np.linalg.inv(stationary))
     pull = np.einsum("tij,tj->ti", inverse_1, m_1) + np.einsum("tij,tj->ti", inverse_2, m_2)
     projected = joined @ observe
     distance: FloatArray = residual - np.sum(projected * pull, axis=1)
-    return distance / np.sqrt(projected @ observe + sensor)
+    return np.asarray(distance / np.sqrt(projected @ observe + sensor))
 
 
 def _predicted(
@@ -143,7 +148,7 @@ def _predicted(
     steps: Mapping[float, FloatArray],
     stationary: FloatArray,
     observe: FloatArray,
-    sensor: float,
+    sensor: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Predict the discrepancy's states at each reading from known ones before.
 
@@ -165,7 +170,7 @@ def _predicted(
         means[t], covariances[t] = mean, stationary - covariance_now
         if is_fitted:
             shared = covariances[t] @ observe
-            gain = shared / (shared @ observe + sensor)
+            gain = shared / (shared @ observe + sensor[t])
             mean = mean + gain * (reading - observe @ mean)
             covariance_now = covariance_now + np.outer(gain, shared)
     return means, covariances

@@ -86,6 +86,18 @@ class Noise(ABC):
         """Return 1/ν (models,), ν the sensor noise's degrees of freedom; 0 if it is normal."""
         return np.zeros(len(theta))
 
+    @property
+    def paced(self) -> bool:
+        """Whether the sensor's noise grows with the voltage's speed; by default it does not."""
+        return False
+
+    def sensor_variance(self, theta: FloatArray, speed: FloatArray) -> FloatArray:
+        """Return the variance of the sensor's noise, um², (models, samples).
+
+        Where the voltage moves at ``speed`` (samples,), V/s. By default s² wherever it is.
+        """
+        return np.repeat(theta[:, :1] ** 2, speed.size, axis=1)
+
     @abstractmethod
     def stationary(self, theta: FloatArray) -> FloatArray:
         """Return P, the covariance of the states at any time, (models, states, states)."""
@@ -162,8 +174,11 @@ class Noise(ABC):
     def __add__(self, other: Noise) -> Noise:
         """Return the noise with both discrepancies, and one sensor."""
         terms = [t for n in (self, other) for t in (n.terms if isinstance(n, SumNoise) else (n,))]
-        if sum(term.tailed for term in terms) > 1:
-            raise InputError("noise: two terms with heavy tails, but one sensor; leave one out")
+        if sum(term.tailed or term.paced for term in terms) > 1:
+            raise InputError(
+                "noise: two terms with heavy tails or noise that grows with the speed, but one "
+                "sensor; leave one out"
+            )
         return SumNoise(self.interval, tuple(term.at(self.interval) for term in terms))
 
     def log_density(self, theta: FloatArray, residual: FloatArray) -> FloatArray:
@@ -268,14 +283,25 @@ class Noise(ABC):
         return density
 
     def draw(
-        self, theta: FloatArray, samples: int, generator: np.random.Generator
+        self,
+        theta: FloatArray,
+        samples: int,
+        generator: np.random.Generator,
+        speed: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Draw the discrepancy and the sensor's noise, (samples,), um, at one θ (1, parameters)."""
-        (discrepancy,), (sensor,) = self.draw_all(theta, samples, generator)
+        """Draw the discrepancy and the sensor's noise, (samples,), um, at one θ (1, parameters).
+
+        ``speed`` (samples,), V/s, is that of the voltage, by default at rest.
+        """
+        (discrepancy,), (sensor,) = self.draw_all(theta, samples, generator, speed)
         return discrepancy, sensor
 
     def draw_all(
-        self, theta: FloatArray, samples: int, generator: np.random.Generator
+        self,
+        theta: FloatArray,
+        samples: int,
+        generator: np.random.Generator,
+        speed: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Draw the same at each θ (models, parameters), (models, samples), as one by one."""
         transitions = self.transition(theta)
@@ -285,7 +311,7 @@ class Noise(ABC):
         if self.states == 1:
             for model, (a,) in enumerate(transitions[:, 0]):
                 states[model, :, 0] = scipy.signal.lfilter((1.0,), (1.0, -a), states[model, :, 0])
-            return states @ self.observe, self.sensor_noise(theta, scores[:, -1])
+            return states @ self.observe, self.sensor_noise(theta, scores[:, -1], speed)
         for model, matrix in enumerate(transitions):
             # F = U T U* with T triangular: from the last one on, each is a recursion by itself.
             triangle, basis = scipy.linalg.schur(matrix, output="complex")
@@ -295,12 +321,19 @@ class Noise(ABC):
                 taps = (1.0, -triangle[row, row])
                 parts[:, row] = scipy.signal.lfilter((1.0,), taps, parts[:, row])
             states[model] = (parts @ basis.T).real
-        return states @ self.observe, self.sensor_noise(theta, scores[:, -1])
+        return states @ self.observe, self.sensor_noise(theta, scores[:, -1], speed)
 
-    def sensor_noise(self, theta: FloatArray, scores: FloatArray) -> FloatArray:
-        """Turn standard normal scores (models, samples) into the sensor's noise, um."""
+    def sensor_noise(
+        self, theta: FloatArray, scores: FloatArray, speed: FloatArray | None = None
+    ) -> FloatArray:
+        """Turn standard normal scores (models, samples) into the sensor's noise, um.
+
+        ``speed`` (samples,), V/s, is that of the voltage, by default at rest.
+        """
         if self.tailed:
             scores = heavy_tails.quantiles(self.inverse_df(theta), scores)
+        if speed is not None and self.paced:
+            return np.sqrt(self.sensor_variance(theta, speed)) * scores
         return theta[:, :1] * scores
 
 
@@ -344,6 +377,18 @@ class SumNoise(Noise):
             if term.tailed
         ]
         return degrees[0] if degrees else np.zeros(len(theta))
+
+    @property
+    def paced(self) -> bool:
+        """Whether a term's sensor noise grows with the speed."""
+        return any(term.paced for term in self.terms)
+
+    def sensor_variance(self, theta: FloatArray, speed: FloatArray) -> FloatArray:
+        """Return that of the term whose noise grows, if any."""
+        for term, columns_of_term in self._split(theta):
+            if term.paced:
+                return term.sensor_variance(columns_of_term, speed)
+        return super().sensor_variance(theta, speed)
 
     @property
     def observe(self) -> FloatArray:

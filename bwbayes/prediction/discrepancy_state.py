@@ -67,7 +67,8 @@ def filter_discrepancy(
     # Some draws at a time: what is kept of all readings of all would not fit into memory.
     for rows in watched(np.array_split(np.arange(len(theta)), -(-len(theta) // 50)), watch):
         residual = (readings.values - simulated[rows])[:, np.newaxis]
-        filtered = noise.filter(parameters[rows], residual, readings.skipped)
+        sensor = likelihood.sensor(parameters[rows])
+        filtered = noise.filter(parameters[rows], residual, readings.skipped, sensor)
         mean.append(filtered.mean[:, 0])
         covariance.append(filtered.covariance)
     gained = noise.stationary(parameters) - np.concatenate(covariance)

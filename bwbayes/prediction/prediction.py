@@ -24,6 +24,7 @@ from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
 from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
+from bwbayes.model.reversals import rate
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.initial_state import (
@@ -245,6 +246,7 @@ def _bands(
         tails = TailScales(scales, *scale_mixture(inverse_df))
     variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
     variances.append(np.full((1, 1), model_error_sd**2))
+    speed = np.abs(rate(record.inputs.voltage, record.interval))
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(theta))
@@ -266,6 +268,9 @@ def _bands(
             if begin <= first:
                 continue
             inside = simulated[:, first - begin :]
+            if noise.paced:
+                variances = [*variances]
+                variances[2] = noise.sensor_variance(parameters, speed[first:end])
             work = executor.submit(
                 _summarized, start, variances, scores, tails, record, first, inside
             )
@@ -307,9 +312,9 @@ def _summarized(
 ) -> dict[str, Floating]:
     """Mean, band edges, and the judgment of the readings, each (samples,).
 
-    ``variances`` (draws, 1), um², of offset, discrepancy, sensor and the model's error are added to
-    the draws with ``scores`` (scores, draws), the same along the whole record, and the sensor's
-    with its tails.
+    ``variances`` (draws, 1 or samples), um², of offset, discrepancy, sensor and the model's error
+    are added to the draws with ``scores`` (scores, draws), the same along the whole record, and the
+    sensor's with its tails.
     """
     samples, unknown = simulated.shape[1], np.ones(1)
     expected = simulated

@@ -23,8 +23,16 @@ from bwbayes.inference.outliers import surprise
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
+from bwbayes.model.actuator import Actuator
+from bwbayes.model.reversals import rate
 from bwbayes.prediction.discrepancy_state import filter_discrepancy
-from tests.inference.problems import INTERVAL, short_posterior
+from tests.inference.problems import (
+    INTERVAL,
+    decaying_sine,
+    posterior_of,
+    ring_bender,
+    short_posterior,
+)
 
 QUALITIES = st.one_of(st.floats(0.02, 5.0), st.sampled_from([0.5, 0.5 + 1e-9, 0.5 - 1e-9]))
 
@@ -230,3 +238,32 @@ def test_the_size_on_new_readings_is_that_of_the_residuals() -> None:
         if noise == "smooth":
             kernel[:, 1] = np.sqrt(np.mean(residual**2) - 1e-6)
         np.testing.assert_allclose(sized, kernel, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["paced", "discrepancy + paced"])
+def test_noise_that_grows_with_the_speed_is_that_of_a_dense_matrix(kind: str) -> None:
+    """In both engines, with gaps; draws have its variance."""
+    actuator, voltage = Actuator("none", "first", INTERVAL), decaying_sine(120)
+    displacement = ring_bender(actuator, "discrepancy", voltage, 1)
+    windows = slice(5, 60), slice(80, 120)
+    posterior = posterior_of(voltage, displacement, actuator, kind, {}, training=windows)
+    record, free = posterior.single_record, posterior.prior.draw(np.random.default_rng(7), 1)
+    free[0, posterior.names.index("sensor_speed")] = 150.0
+    theta = posterior.prior.theta(free)
+    rows, sensor = record.readings.rows, theta[0, posterior.table.names.index("sensor_sd")]
+    speed = np.abs(rate(record.voltage, INTERVAL))
+    covariance = np.diag(sensor**2 * (1 + (speed[rows] / 150.0) ** 2))
+    if kind != "paced":
+        sd, time = (
+            theta[0, posterior.table.names.index(f"discrepancy_{name}")] for name in ("sd", "time")
+        )
+        apart = INTERVAL * np.abs(np.subtract.outer(rows, rows))
+        covariance += sd**2 * np.exp(-apart / time)
+    residual = record.readings.values - posterior.simulate(theta, rows)[0]
+    expected = scipy.stats.multivariate_normal.logpdf(residual, np.zeros(rows.size), covariance)
+    for engine in ("numpy", "numba"):
+        density = replace(posterior, engine=engine).likelihood.log_density(theta)[0]
+        np.testing.assert_allclose(density, expected, rtol=1e-9)
+    rng, steady = np.random.default_rng(3), np.full(20_000, 200.0)
+    drawn = record.noise.draw(record.table.noise(theta), 20_000, rng, steady)[1]
+    assert np.std(drawn) == pytest.approx(sensor * np.hypot(1, 200 / 150), rel=0.03)
