@@ -21,6 +21,7 @@ from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis, S
 from bwbayes.diagnosis.series_patterns import strongest_line
 from bwbayes.inference import map_estimate
 from bwbayes.inference.study import Stated
+from bwbayes.model.declaration import normal
 from bwbayes.model.registry import STAGES
 from bwbayes.model.stages.additions import Oscillation
 from bwbayes.model.stages.reversed_sign import ReversedSign
@@ -66,8 +67,7 @@ class Defect:
         words = partial(self.words, scene)
         for sighting in self.sightings(scene):
             for found in scene.changed(self.kind, words, (self.stage,), sighting, flags):
-                # No model has mains, whose phase is not known in the next record.
-                yield replace(found, spec=None) if self.noise else found
+                yield replace(found, spec=None) if sighting.named_only else found
 
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
         """Yield from where to fit the stage."""
@@ -115,13 +115,20 @@ class _Step(Defect):
 
 class _Oscillation(Defect):
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
-        """Yield the innovations' strongest frequency that the drive has not."""
+        """Yield the innovations' strongest frequency that the drive has not, to its resolution.
+
+        No model has one that swells with the drive, which may be the actuator's own.
+        """
         rows = scene.posterior.single_record.readings.rows
         line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
         if line is not None:
-            cost = float(np.log(rows.size / 2))
-            stated = {"oscillation_frequency": Stated(fixed=line.frequency)}
-            yield Sighting(stated, cost=cost, note=line.source)
+            resolution = normal(line.frequency, 1 / (np.sqrt(12) * scene.duration))
+            yield Sighting(
+                {"oscillation_frequency": Stated(resolution)},
+                cost=float(np.log(rows.size / 2)),
+                note=line.source,
+                named_only=not line.is_steady,
+            )
 
 
 class _Sign(Defect):

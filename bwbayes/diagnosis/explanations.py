@@ -32,6 +32,7 @@ ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
 CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     LONG_DELAY.explanations,
     *(defect.explanations for defect in SLOW),
+    model.exponent,
     model.nonlinearity,
     model.creep,
     model.dynamics,
@@ -92,7 +93,8 @@ def explain(
         watch((number + 1) / len(kinds))
     ranked = _ranked(best.values())
     # A long record was looked at in parts: what leads has to lead on all of it.
-    for explanation in better_models(ranked):
+    noises = [explanation for explanation in ranked if explanation.noise]
+    for explanation in (*better_models(ranked), *likely_causes(noises)):
         best[explanation.kind] = scene.confirmed(explanation)
     watch(1.0)
     return _ranked(best.values())

@@ -5,7 +5,7 @@ Another model has its own evidence; noise may have heavy tails, or be more where
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,12 @@ from bwbayes.inference.outliers import LIMIT, MOST
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
+from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import HYSTERESIS
+
+# An exponent that is not 1: in nearly all published fits it lies below 5.
+EXPONENT = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
+EXPONENT_STARTS = ({"exponent": -1.0}, {"exponent": 1.0})
 
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -57,6 +62,18 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
     starts = [{"stiffness": z, "damping": z / 2 - 1} for z in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0)]
     sighting = Sighting(stated, starts)
     yield from scene.changed("second-order dynamics", "", ("second-order",), sighting)
+
+
+def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
+    """Try another smoothness of the hysteresis's transition, where that is fixed at 1."""
+    fixed = {parameter.name: parameter.fixed for parameter in scene.posterior.prior.parameters}
+    if fixed.get("exponent") == 1.0:
+        sighting = Sighting({"exponent": Stated(EXPONENT)}, EXPONENT_STARTS)
+        yield from scene.changed("free exponent", _exponent_words, sighting=sighting)
+
+
+def _exponent_words(values: Mapping[str, float]) -> tuple[str, str]:
+    return f"transition of exponent {values['exponent']:.2g} instead of 1", ""
 
 
 def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
@@ -141,7 +158,8 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
     # Not where they are few and far off: tails that hold those would be too heavy for the others.
     before, tailed = scene.study.spec, scene.posterior.single_record.noise.tailed
-    if scene.alone and not tailed and nats > isolated_nats(white):
+    paced = scene.posterior.single_record.noise.paced
+    if scene.alone and not (tailed or paced) and nats > isolated_nats(white):
         spec = replace(before, noise=f"{before.noise} + student")
         fix = lines(before, spec)
     yield Explanation(
@@ -213,5 +231,9 @@ def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
         text += "'s speed" if kind == "speed" else "'s distance from its center"
         rmse = scene.without[0], scene.fit.rmse
         fix = "train on a record driven as the plans are: the bands' width is the mean one"
-        nats = float(nats - scene.lead)
-        yield Explanation(f"noise by {kind}", text, fix, nats=nats, rmse=rmse, noise=True)
+        spec, noise = None, scene.posterior.single_record.noise
+        if kind == "speed" and slope > 0 and scene.alone and not (noise.tailed or noise.paced):
+            spec = replace(scene.study.spec, noise=f"{scene.study.spec.noise} + paced")
+            fix = lines(scene.study.spec, spec)
+        found = Explanation(f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse)
+        yield replace(found, noise=True, spec=spec)

@@ -45,7 +45,8 @@ class Sighting(NamedTuple):
 
     ``stated`` is said of its new parameters. They start at ``starts``, normal scores by name, and
     the others at ``places`` (places, free), by default where the fit is. The choice costs ``cost``
-    nats; ``note`` is added to what is said.
+    nats; ``note`` is added to what is said. It is ``named_only`` where a run's model is not to
+    have it, whatever it is worth.
     """
 
     stated: Mapping[str, Stated] = {}
@@ -53,6 +54,7 @@ class Sighting(NamedTuple):
     places: FloatArray | None = None
     cost: float = 0.0
     note: str = ""
+    named_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -304,9 +306,9 @@ class ResidualAnalysis:
         white, log_determinant = self.posterior.likelihood.whiten(
             parameters, residual[np.newaxis, np.newaxis]
         )
-        sensor = float(record.noise.marginal_sd(parameters)[1][0])
+        sensor = record.noise.sensor_variance(parameters, self.posterior.likelihood.speed)
         now = -0.5 * (float(np.sum(white**2)) + float(log_determinant[0]))
-        return float(-residual.size * (np.log(sensor) + 0.5) - now)
+        return float(-0.5 * (np.sum(np.log(sensor)) + residual.size) - now)
 
     @property
     def lead(self) -> float:
@@ -393,7 +395,8 @@ class ResidualAnalysis:
             text, advice = words(dict(zip(posterior.table.names, theta, strict=True)))
         fix = lines(self.study.spec, spec)
         if stated:
-            fix += f", with what is known of {', '.join(stated)} in [parameters]"
+            known = f"what is known of {', '.join(stated)} in [parameters]"
+            fix = f"state {known}" if spec == self.study.spec else f"{fix}, with {known}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
         yield self.explained(

@@ -87,10 +87,14 @@ def lasting_jumps(
 
 
 class Line(NamedTuple):
-    """A line of a spectrum: its frequency, Hz, and a source of that frequency in words, or none."""
+    """A line of a spectrum: its frequency, Hz, and a source of that frequency in words, or none.
+
+    It ``is_steady`` if it goes on where the drive rests, instead of swelling with it.
+    """
 
     frequency: float
     source: str
+    is_steady: bool = False
 
 
 def strongest_line(
@@ -110,14 +114,26 @@ def strongest_line(
     strongest = scipy.ndimage.maximum_filter1d(power[0], 5 * main + 1)
     lines = (power[0] == strongest) & (np.arange(frequency.size) >= 3 * main)
     best = float(frequency[int(np.argmax(lines * power[0]))])
+    if not best:
+        return None
+    # Lines of a size of their own, and in proportion to the drive's swing, by the nats of each.
+    span = round(1 / (interval * max(frequency[main], frequency[1])))
+    swing = scipy.ndimage.maximum_filter1d(values[1], span)
+    swing = (swing - scipy.ndimage.minimum_filter1d(values[1], span))[rows]
+    turned = white * np.exp(2j * np.pi * best * interval * rows)
+    steady, swelling = (
+        abs(size @ turned) ** 2 / max(size @ size, np.finfo(float).tiny)
+        for size in (np.ones(rows.size), swing)
+    )
+    is_steady = bool(steady > swelling + np.log(20))
     # Mains are right to a fifth of a percent; half the width of a line under the window.
     width = max(2e-3 * best, 2 / (interval * max(samples - 1 - int(rows[0]), 1)))
     for mains in (50, 60):
         harmonic = round(best / mains)
         if 1 <= harmonic <= 10 and abs(best - harmonic * mains) <= width:
             times = "" if harmonic == 1 else f"{harmonic} times "
-            return Line(best, f" (mains: {times}{mains} Hz)")
-    return Line(best, "") if best else None
+            return Line(best, f" (mains: {times}{mains} Hz)", is_steady)
+    return Line(best, "", is_steady)
 
 
 class FrozenRun(NamedTuple):

@@ -120,13 +120,14 @@ class Study:
         """Return the study of another model.
 
         It keeps statements about parameters that the other model has too: a parameter of
-        another unit is another one, whatever its name. ``added`` is stated of others.
+        another unit is another one, whatever its name. ``added`` is stated of others, or instead.
         """
-        say = self.quantities.say
-        units = {d.name: say(d.unit) for d in declarations_of(spec, self.extent)}
+        say, known = self.quantities.say, {**self.stated, **(added or {})}
+        values = _values_of(known)
+        units = {d.name: say(d.unit_in(values)) for d in declarations_of(spec, self.extent)}
         stated = {
             name: said
-            for name, said in {**(added or {}), **self.stated}.items()
+            for name, said in known.items()
             if (plain := name.partition("[")[0]) in units and said.unit in (None, units[plain])
         }
         per_record, shared = (
@@ -257,12 +258,7 @@ class Study:
 
     def _values(self, record: str = "") -> dict[str, float | Distribution]:
         """Return what is stated of parameters, also of a record's own: values, and priors."""
-        values: dict[str, float | Distribution] = {}
-        for name, said in self.stated.items():
-            value = said.fixed if said.prior is None else said.prior
-            if value is not None:
-                values[name.removesuffix(f"[{record}]")] = value
-        return values
+        return _values_of(self.stated, record)
 
     def _said_of(self, column: Column) -> Stated:
         """Return what is stated of a column of θ: of it alone, or of all records' together."""
@@ -282,6 +278,16 @@ class Study:
                     "rest and some do not; remove it"
                 )
         return Stated()
+
+
+def _values_of(stated: Mapping[str, Stated], record: str = "") -> dict[str, float | Distribution]:
+    """Return the values and priors among statements, also of a record's own parameters."""
+    values: dict[str, float | Distribution] = {}
+    for name, said in stated.items():
+        value = said.fixed if said.prior is None else said.prior
+        if value is not None:
+            values[name.removesuffix(f"[{record}]")] = value
+    return values
 
 
 # The name of a record that is fitted alone.

@@ -36,6 +36,7 @@ from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.model.stages.reversed_sign import ReversedSign
 from bwbayes.model.stages.saturation import Saturation
 from bwbayes.model.stages.sensor_curve import SensorCurve
+from bwbayes.model.stages.series_plays import SeriesPlays
 from bwbayes.model.stages.slew_limit import SlewLimit
 
 HYSTERESIS: Mapping[str, Callable[..., Operator]] = {
@@ -78,6 +79,7 @@ STAGES: Mapping[str, Callable[..., Stage]] = {
         Heating,
         MovingGain,
         Backlash,
+        SeriesPlays,
         SensorLag,
         SensorCurve,
         ReversedSign,

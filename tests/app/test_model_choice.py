@@ -94,7 +94,8 @@ def test_nothing_is_added_to_a_right_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["drift", "step", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)]
+    "kind",
+    ["drift", "step", "mains", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)],
 )
 def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_of_the_next(
     kind: str, tmp_path: Path
@@ -106,7 +107,8 @@ def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_o
         if plant_kind == kind:
             chosen = search_stages(problem)
             problem, point = chosen.problem, chosen.point
-            assert problem.config.model.stages == [kind.replace(" ", "-")]
+            stage = "oscillation" if kind == "mains" else kind.replace(" ", "-")
+            assert problem.config.model.stages == [stage]
         else:
             point = pointfit.fit(problem.posterior, np.random.default_rng(1))
         posterior, rng = problem.posterior, np.random.default_rng(2)
@@ -120,6 +122,33 @@ def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_o
         found[plant_kind] = np.mean(bands.covers("sensor", 95, following.displacement)[-400:])
     assert min(found.values()) > 0.85
     assert widths[0] < 1.3 * widths[1]
+
+
+def test_noise_that_grows_with_the_speed_is_as_wide_where_the_next_drive_is_fast(
+    tmp_path: Path,
+) -> None:
+    """The faster half as the slower one, to 3.6 sds of luck; a level band covers too much of it."""
+    problem = resolve_config(config_of("noise by speed", tmp_path), tmp_path)
+    chosen = search_stages(problem)
+    assert chosen.problem.study.spec.noise == "discrepancy + paced"
+    following = plant("noise by speed", (8, 1), 8.0)
+    assert following.displacement is not None
+    fast = np.abs(np.gradient(following.voltage))
+    fast = (fast > np.median(fast))[-800:]
+    shares = []
+    level = pointfit.fit(problem.posterior, np.random.default_rng(1))
+    for made, point in ((chosen.problem, chosen.point), (problem, level)):
+        posterior, rng = made.posterior, np.random.default_rng(2)
+        draws, density = posterior.prior.constrain(
+            rng.multivariate_normal(point.mode, point.covariance, 200)
+        )
+        start = InitialConditions(from_rest=True)
+        bands = predict_record(posterior, draws[np.isfinite(density)], following, start, rng)
+        inside = bands.covers("sensor", 95, following.displacement)[-800:]
+        shares.append((np.mean(inside[fast]), np.mean(inside[~fast])))
+    assert min(shares[0]) > 0.88
+    assert max(shares[0]) < 0.99
+    assert shares[1][1] > 0.99
 
 
 @pytest.mark.parametrize(

@@ -83,15 +83,22 @@ def drive(rng: np.random.Generator, seconds: float) -> FloatArray:
     return voltage
 
 
-def hysteresis(part: Plant, voltage: FloatArray) -> FloatArray:
-    """Integrate h' = alpha u' - beta |u'| h - gamma u' |h| by Heun's rule; return d u - h, um."""
-    h, values = 0.0, np.empty(voltage.size)
+def hysteresis(part: Plant, voltage: FloatArray, exponent: float = 1.0) -> FloatArray:
+    """Integrate h' = alpha u' - (beta |u'| h + gamma u' |h|) (|h|/top)^(n-1) by Heun's rule.
+
+    Returns d u - h, um; ``top`` is the largest |h| of n = 1.
+    """
+    h, values, top = 0.0, np.empty(voltage.size), part.alpha / (part.beta + part.gamma)
+
+    def moved(step: float, h: float) -> float:
+        bent = (abs(h) / top) ** (exponent - 1)
+        turned = part.beta * abs(step) * h * bent
+        return part.alpha * step - turned - part.gamma * step * abs(h) * bent
+
     values[0] = 0.0
     for number, step in enumerate(np.diff(voltage).tolist(), 1):
-        first = part.alpha * step - part.beta * abs(step) * h - part.gamma * step * abs(h)
-        there = h + first
-        second = part.alpha * step - part.beta * abs(step) * there - part.gamma * step * abs(there)
-        h += (first + second) / 2
+        first = moved(step, h)
+        h += (first + moved(step, h + first)) / 2
         values[number] = h
     return part.d * voltage - values
 
@@ -162,6 +169,8 @@ def moved_by(
     ``size`` is in parts of the range; a gain that moves is steady after ``warming`` fine steps.
     """
     driven = (plays if kind == "operator" else hysteresis)(part, voltage)
+    if kind == "free exponent":
+        driven = hysteresis(part, voltage, 2.5)
     size *= float(np.ptp(driven))
     scaled = voltage / np.max(np.abs(voltage))
     match kind:
@@ -179,6 +188,9 @@ def moved_by(
     match kind:
         case "backlash":
             return play(moved, abs(size) / 2)
+        case "series plays":
+            radii = np.ptp(moved) * np.array([0.03, 0.07, 0.16, 0.25, 0.4])
+            return moved - np.sum([0.016 * (moved - play(moved, r)) for r in radii], axis=0)
         case "moving gain":
             along = np.minimum(np.arange(moved.size) / warming, 1.0)
             return moved * (1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.1) * along)

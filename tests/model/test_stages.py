@@ -58,6 +58,11 @@ VALUES = {
     "saturation_reach": 200.0,
     "backlash": 0.8,
     "backlash_start": 0.3,
+    "series_loss": 0.08,
+    "series_radius": 12.0,
+    "series_shape": 1.5,
+    "series_half": 50.0,
+    "series_start": 0.4,
     "sensor_lag": 1e-3,
     "sensor_lag_speed": 200.0,
     "sensor_quadratic": 0.02,
@@ -140,6 +145,19 @@ def _with_backlash(x: FloatArray) -> list[float]:
     return y[1:]
 
 
+def _with_series_plays(x: FloatArray) -> list[float]:
+    """Let thirty plays in the middle of their gaps follow, one after the other."""
+    half, k, result = VALUES["series_half"], VALUES["series_shape"], x.copy()
+    radii = [half * 1.5 * (j + 0.5) / 30 for j in range(30)]
+    weights = [r ** (k - 1) * np.exp(-k * r / VALUES["series_radius"]) for r in radii]
+    for radius, weight in zip(radii, weights, strict=True):
+        play = float(x[0])
+        for sample, value in enumerate(x.tolist()):
+            play = min(max(play, value - radius), value + radius)
+            result[sample] -= VALUES["series_loss"] * weight / sum(weights) * (value - play)
+    return [float(value) for value in result]
+
+
 def _with_slew_limit(x: FloatArray) -> list[float]:
     y, most = [float(x[0])], VALUES["slew_limit"] * INTERVAL
     for value in x.tolist():
@@ -168,6 +186,7 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     of_name = {
         "delay": np.interp(samples - v["delay"] / INTERVAL, samples, x),
         "backlash": _with_backlash(x),
+        "series-plays": _with_series_plays(x),
         "slew-limit": _with_slew_limit(x),
         "saturation": middle + reach * np.tanh((x - middle) / reach),
         "temperature": x * (1 + v["temperature_gain"] * warmer),

@@ -218,7 +218,7 @@ class Problem:
             noted = [*(record.remarks or []), *remarks]
             changes["record"] = record.model_copy(update={"remarks": noted})
         config = self.config.model_copy(update=changes)
-        if spec != self.study.spec:
+        if spec != self.study.spec or stated:
             return _problem(config, self.study.with_model(spec, stated), self.validations)
         same = copy(self)  # with all that is known of it
         object.__setattr__(same, "config", config)

@@ -86,11 +86,12 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
-    always compared; any other has nothing to gain where the innovations are white already. The
-    evidence of several records is the sum of what each has alone. ``watch`` is called with the
+    always compared; any other has nothing to gain where the innovations are white already. A sensor
+    whose noise has heavy tails or grows stays one beside each. The evidence of several records is the sum of what each has alone. ``watch`` is called with the
     share that is done.
     """
     default, posterior = "discrepancy", problem.posterior
+    sensor = problem.study.spec.noise.split(" + ")[1:]
     rough = {
         name: climb(
             posterior.for_record(name), posterior.select_draws(point.optima, name), watch=of_record
@@ -101,11 +102,12 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     # Innovations less likely than this by chance may be explained by another noise.
     chances = [innovations(fit.posterior, fit.free).octaves()[2] for fit in rough.values()]
     p, colored = min(1.0, len(chances) * min(chances)), 0.05
-    # That outliers spoil a record is an explanation, which has its own evidence.
-    candidates = {*evidence, "student"}
+    # That outliers spoil a record, or speed does, is an explanation, which has its own evidence.
+    candidates = {*evidence, "student", "paced"}
     others = [n for n in NOISES if n not in candidates and (n == "white" or p < colored)]
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
-        other = problem.study.with_model(replace(problem.study.spec, noise=noise)).posterior
+        spec = replace(problem.study.spec, noise=_beside(noise, sensor))
+        other = problem.study.with_model(spec).posterior
         # What only the other noise has starts at its prior's median.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
@@ -134,7 +136,13 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     if p >= colored:
         against.append(f"innovations are white, p = {p:.2g}")
     why = ", ".join(against) or "with no other does the model follow the readings"
-    return best, f"noise: {best} ({why})"
+    chosen = _beside(best, sensor)
+    return chosen, f"noise: {chosen} ({why})"
+
+
+def _beside(noise: str, sensor: Sequence[str]) -> str:
+    """Return a noise beside what is known of the sensor's, which is white by itself."""
+    return " + ".join([*sensor] if noise == "white" and sensor else [noise, *sensor])
 
 
 class ChosenModel(NamedTuple):
@@ -161,7 +169,8 @@ def choose_model(problem: Problem, watch: WatchSteps = unwatched) -> ChosenModel
         return searched
     problem, point = searched.problem, searched.point
     noise, why = chosen_noise(problem, point, partial(watch, "noise model"))
-    chosen, explanations = problem.with_noise(noise), searched.explanations
+    spec, explanations = replace(problem.study.spec, noise=noise), searched.explanations
+    chosen = problem.with_model(spec, noise=noise)
     if chosen.posterior is not problem.posterior:
         point, explanations = (
             _fit_point(chosen, partial(watch, f"MAP estimate, {noise} noise")),
