@@ -87,8 +87,8 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
     always compared; any other has nothing to gain where the innovations are white already. A sensor
-    whose noise has heavy tails or grows stays one beside each. The evidence of several records is the sum of what each has alone. ``watch`` is called with the
-    share that is done.
+    whose noise has heavy tails or grows stays one beside each. The evidence of several records is
+    the sum of what each has alone. ``watch`` is called with the share that is done.
     """
     default, posterior = "discrepancy", problem.posterior
     sensor = problem.study.spec.noise.split(" + ")[1:]
