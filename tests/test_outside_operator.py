@@ -33,6 +33,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
 from bwbayes.model.elementwise import select
 from bwbayes.model.inverse import inverse
+from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Operator, Span
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
@@ -255,7 +256,7 @@ def test_an_operator_with_a_step_is_read_backwards_and_exported(tmp_path: Path) 
     displacement = actuator.displacement(theta, voltage, from_rest=True)
     back = inverse(actuator, theta, displacement, from_rest=True)
     np.testing.assert_allclose(back, np.broadcast_to(voltage, back.shape), atol=1e-8)
-    made_for = exported("bent", actuator, theta[0], Span(-100.0, 100.0))
+    made_for = exported("bent", actuator, theta[0], Limits(-100.0, 100.0))
     assert f"{HERE}:Bent" == made_for.numbers()["parts"]["hysteresis"]
     compiled = Compiled(made_for, tmp_path, needs("cc"))
     got = compiled.run("forward", voltage[0], voltage)

@@ -225,7 +225,7 @@ def compensate(
         )
     straight = plan.played(linear, part(watch, 0.5, 1.0))
     return Compensation(
-        reference, command, played, straight, hold, between, from_rest, limit, tuple(notes)
+        reference, command, played, straight, hold, between, from_rest, limits, limit, tuple(notes)
     )
 
 

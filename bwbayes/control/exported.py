@@ -35,7 +35,7 @@ from bwbayes.control.sampled import (
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operator import Span
+from bwbayes.model.limits import Limits
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.quantities import DEFAULT
 from bwbayes.report.outputs import refuse_existing, write_summary
@@ -57,7 +57,7 @@ class Exported(Product):
     model
         The one model, a sample at a time.
     limits
-        The voltages that its inverse may give, V.
+        The voltages that its inverse may give, V, and how fast.
     sds
         Standard deviations of its parameters, by name, if they are known.
     without_inverse
@@ -71,7 +71,7 @@ class Exported(Product):
 
     name: str
     model: SampledModel
-    limits: Span
+    limits: Limits
     sds: Mapping[str, float]
     without_inverse: str | None
     standing: ValidationSummary = field(default_factory=ValidationSummary)
@@ -84,6 +84,7 @@ class Exported(Product):
     def report(self) -> Report:
         """Return the parts, for a page: the files are all there is to see on a screen."""
         facts = [(name, str(value)) for name, value in self.numbers()["parts"].items()]
+        facts += [("limits of the inverse", str(self.limits))]
         return Report(title=self.name, blocks=[Facts(facts)])
 
     def save(
@@ -126,7 +127,7 @@ class Exported(Product):
             "validation": self.standing.numbers,
             "interval_s": actuator.interval,
             "hold": actuator.hold,
-            "limits_V": list(self.limits),
+            **self.limits.numbers,
             "inverse": self.without_inverse is None,
             "without_inverse": self.without_inverse,
             "parts": {
@@ -217,7 +218,9 @@ class Exported(Product):
             tables={name: [*map(to_c_number, x.ravel())] for name, x in tables.items()},
             remembered=remembered,
             functions=c_functions(functions, shapes, "actuator_", {"move": type(step).move}),
-            close=resolution(self.limits),
+            close=resolution(self.limits.span),
+            limits=str(self.limits),
+            step=self.limits.rate * actuator.interval,
             inputs=[*map(self._stage_in_c, model.inputs[0])],
             outputs=[*map(self._stage_in_c, model.outputs[0])],
         )
@@ -262,7 +265,7 @@ def exported(
     name: str,
     actuator: Actuator,
     theta: FloatArray,
-    limits: Span,
+    limits: Limits,
     sds: Mapping[str, float] | None = None,
 ) -> Exported:
     """Return a model with parameters θ (parameters,) that is ready for a controller.
@@ -273,17 +276,14 @@ def exported(
     Raises
     ------
     InputError
-        A hysteresis that has no step of bounded time, or limits that are not two
-        voltages, the lower one first.
+        A hysteresis that has no step of bounded time, or voltages without a limit.
     """
-    if not (np.isfinite(limits).all() and limits.low < limits.high):
-        raise InputError(
-            f"limits: {limits.low:g} to {limits.high:g} V; give two voltages, the lower one first"
-        )
+    if not np.isfinite(limits.span).all():
+        raise InputError(f"limits: {limits.low:g} to {limits.high:g} V; give two voltages")
     model = SampledModel.of(actuator, np.atleast_2d(theta))
     without_inverse = None
     try:
-        require_inverse(model, limits)
+        require_inverse(model, limits.span)
     except InputError as error:
         without_inverse = str(error)
     return Exported(name, model, limits, sds or {}, without_inverse)

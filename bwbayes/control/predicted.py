@@ -18,6 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.record.io.grid import clock
@@ -107,9 +108,9 @@ class Compensation(Product):
     ``voltage`` (samples,), V, is the command for the ``asked`` reference, um, which it follows as
     ``smoothed``; ``reference`` is what was asked for; ``command`` says which of the two voltages
     was taken; ``compensated`` is that command, ``linear`` the one without compensation. ``limit``
-    is that of the error, um, if there is one; ``hold`` what the command does between samples, and
-    ``between`` how far the displacement leaves straight lines there, um. ``standing`` is how the
-    validation of the run came out that all of this builds on.
+    is that of the error, um, if there is one; ``limits`` are the amplifier's; ``hold`` is what the
+    command does between samples, and ``between`` how far the displacement leaves straight lines
+    there, um. ``standing`` is how the validation of the run came out that all of this builds on.
     """
 
     NAME: ClassVar[str] = "compensation"
@@ -121,6 +122,7 @@ class Compensation(Product):
     hold: Hold
     between: float
     from_rest: bool
+    limits: Limits
     limit: float | None = None
     remarks: tuple[str, ...] = ()
     standing: ValidationSummary = field(default_factory=ValidationSummary)
@@ -139,6 +141,11 @@ class Compensation(Product):
     def voltage(self) -> FloatArray:
         """The command, (samples,), V."""
         return self.compensated.voltage
+
+    @property
+    def fastest(self) -> float:
+        """The fastest change of the command from one sample to the next, V/s."""
+        return float(np.max(np.abs(np.diff(self.voltage)), initial=0.0)) / self.reference.interval
 
     @property
     def limit_kept(self) -> bool | None:
@@ -198,6 +205,8 @@ class Compensation(Product):
             "hold": HOLD_NAMES[self.hold],
             "between_samples_um": self.between,
             "command": self.command,
+            **self.limits.numbers,
+            "fastest_V_per_s": self.fastest,
             "limit_um": self.limit,
             "limit_kept": self.limit_kept,
             "compensated": self.compensated.numbers(self.limit),
@@ -346,6 +355,7 @@ class Compensation(Product):
         pairs = {
             "Reference": f"{extent}, {target.size} samples every {interval:g} s",
             "Command": commands[self.command],
+            "Amplifier": f"{self.limits}; the command changes by up to {self.fastest:.4g} V/s",
             "Voltage between samples": holds[self.hold],
             "Displacement between samples": f"{between} samples, just before the voltage changes",
             "Start": f"{start} at zero volts{'' if self.from_rest else ', after any drive'}",

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from bwbayes.model.operator import Span
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,28 @@ class Limits:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError(f"limits: {name} {value:g}; must be positive")
+
+    @property
+    def span(self) -> Span:
+        """Lowest and highest voltage, V."""
+        return Span(self.low, self.high)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """The limits as files have them; None where there is none."""
+        return {
+            "limits_V": [self.low, self.high],
+            "slew_V_per_s": self.slew if math.isfinite(self.slew) else None,
+            "current_A": self.current,
+            "capacitance_F": self.capacitance,
+        }
+
+    def __str__(self) -> str:
+        speed = f"up to {self.rate:.4g} V/s" if math.isfinite(self.rate) else "at any speed"
+        current = ""
+        if self.current is not None:
+            current = f", {self.current:.4g} A into {self.capacitance:.4g} F"
+        return f"{self.low:.4g} to {self.high:.4g} V, {speed}{current}"
 
     @property
     def rate(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,3 +66,18 @@ def test_options_that_make_no_sense_are_one_line(
     with pytest.raises(InputError, match=line):
         fit.export(tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("verb", ["compensate", "export", "track"])
+def test_voltages_beyond_those_fitted_have_to_be_allowed(verb: str, fit: bw.Run) -> None:
+    """The record went from -100 to 100 V."""
+    shape = ["sine"] if verb == "compensate" else []
+    options = {"amplitude": 5.0, "frequency": 1.0} if shape else {}
+    options |= {"frequencies": (1.0,), "draws": 2} if verb == "track" else {}
+    job = partial(getattr(fit, verb), *shape, **options)
+    with pytest.raises(InputError, match=r"-150 to 150 V goes beyond .*--beyond-training"):
+        job(voltage=(-150.0, 150.0))
+    made = job(voltage=(-150.0, 150.0), beyond_training=True)
+    numbers = made.summary if verb == "compensate" else made.numbers()
+    limits = numbers["reference"] if verb == "track" else numbers
+    assert limits["limits_V"] == [-150.0, 150.0]

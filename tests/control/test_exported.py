@@ -14,8 +14,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.sampled import SampledModel
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
-from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS
 from tests.control import cases
 from tests.control.compiled import Compiled
@@ -25,9 +25,11 @@ every_actuator = pytest.mark.parametrize("name", cases.ACTUATORS)
 every_hold = pytest.mark.parametrize("hold", cases.HOLDS)
 
 
-def of(name: str, hold: Hold, limits: Span = cases.SPAN) -> Exported:
+def of(name: str, hold: Hold, limits: Limits | None = None) -> Exported:
     actuator = cases.actuator(name, hold)
-    return exported(name, actuator, cases.theta(actuator, 1, name)[0], limits)
+    return exported(
+        name, actuator, cases.theta(actuator, 1, name)[0], limits or Limits(*cases.SPAN)
+    )
 
 
 def simulated(system: Any, drive: FloatArray) -> FloatArray:
@@ -54,9 +56,30 @@ def test_the_c_file_is_the_simulation(name: str, hold: Hold, tmp_path: Path) -> 
     np.testing.assert_allclose(command, voltage[: command.size], rtol=0, atol=1e-8)
 
 
+def test_the_inverse_moves_as_fast_as_its_amplifier_can(tmp_path: Path) -> None:
+    """By its current over the capacitance at most, and as without a limit where that suffices."""
+    limits = Limits(*cases.SPAN, slew=1e6, current=2e-3, capacitance=1e-5)
+    made, free = (of("bouc-wen, second-order", "zero", each) for each in (limits, None))
+    most = 200 * made.model.actuator.interval  # V: 2 mA into 10 uF for a sample
+    (tmp_path / "free").mkdir()
+    limited = Compiled(made, tmp_path, needs("cc"))
+    unlimited = Compiled(free, tmp_path / "free", needs("cc"))
+    slow, fast = 5 * np.sin(np.linspace(0, 6, 2000)), np.repeat([5.0, -5.0], 100)
+    command = unlimited.run("inverse", 0.0, slow)
+    assert np.max(np.abs(np.diff(command, prepend=0.0))) < most
+    np.testing.assert_array_equal(limited.run("inverse", 0.0, slow), command)
+    steps = np.abs(np.diff(limited.run("inverse", 0.0, fast), prepend=0.0))
+    assert np.max(steps) == pytest.approx(most, rel=1e-9)
+    assert np.max(np.abs(np.diff(unlimited.run("inverse", 0.0, fast)))) > most
+    assert "up to 200 V/s, 0.002 A into 1e-05 F" in made.c_code()
+    assert "It has no limit of slew or current" in free.c_code()
+    keys = ("slew_V_per_s", "current_A", "capacitance_F")
+    assert [made.numbers()[key] for key in keys] == [1e6, 2e-3, 1e-5]
+
+
 def test_the_inverse_keeps_to_its_limits(tmp_path: Path) -> None:
     compiled = Compiled(
-        of("bouc-wen, second-order", "zero", Span(-40.0, 50.0)), tmp_path, needs("cc")
+        of("bouc-wen, second-order", "zero", Limits(-40.0, 50.0)), tmp_path, needs("cc")
     )
     reference = np.repeat([1e3, -1e3, np.inf, 5.0], 40)
     command = compiled.run("inverse", 0.0, reference)
@@ -109,7 +132,7 @@ def test_a_model_without_an_inverse_says_why_in_its_file(tmp_path: Path) -> None
     actuator = Actuator("none")
     theta = cases.theta(actuator)[0]
     theta[actuator.parameters.index("d")] = 0.4
-    made = exported("turns */ back", actuator, theta, cases.SPAN)
+    made = exported("turns */ back", actuator, theta, Limits(*cases.SPAN))
     code = made.c_code()
     assert "There is no inverse:\n * inverse: the model_s slope may be as low as" in code
     assert "actuator_inverse" not in code

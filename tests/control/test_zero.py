@@ -10,7 +10,7 @@ import pytest
 
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.jobs.control import export
-from bwbayes.app.jobs.fit_methods import limits_of
+from bwbayes.app.jobs.fit_methods import amplifier_limits
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.control.compensation import compensate
 from bwbayes.control.references import Reference, build_reference
@@ -55,7 +55,7 @@ def test_a_reference_means_the_same_for_a_command_a_loop_and_c(tmp_path: Path) -
     same = compensated(of, asked, at_zero, from_rest=True)
     np.testing.assert_allclose(same.voltage, command, atol=1e-9)
 
-    model = export(fit_of(of, flat), tmp_path, voltage=(-100.0, 100.0))
+    model = export(fit_of(of, flat), tmp_path, voltage=(-100.0, 100.0), beyond_training=True)
     state, stepped = model.model.begin(np.zeros(1)), []
     reference = np.asarray(asked.displacement)[1:]
     for target in reference:
@@ -131,4 +131,4 @@ def test_an_amplifier_without_zero_volts_is_refused_and_is_not_the_default() -> 
     voltage = 60 + 40 * np.sin(4 * np.pi * TIME)
     record = Record(voltage, 0.5 * voltage + np.sin(TIME), interval=INTERVAL)
     config, records = config_of(record, {})
-    assert limits_of(resolve_config(config, Path(), records), None, 0.0) == (0.0, 100.0)
+    assert amplifier_limits(resolve_config(config, Path(), records), None).span == (0.0, 100.0)

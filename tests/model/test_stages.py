@@ -31,6 +31,7 @@ from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.inverse import inverse
+from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator, Span
@@ -317,7 +318,7 @@ def test_a_controller_and_its_c_file_do_the_same(
     size = np.ptp(expected)
     sampled = np.array(moved) + model.zero[0]
     np.testing.assert_allclose(sampled, expected, rtol=0, atol=1e-11 * size)
-    compiled = Compiled(exported("chain", made, row[0], SPAN), tmp_path, needs("cc"))
+    compiled = Compiled(exported("chain", made, row[0], Limits(*SPAN)), tmp_path, needs("cc"))
     in_c = compiled.run("forward", voltage[0], voltage)
     np.testing.assert_allclose(in_c, moved, rtol=0, atol=1e-11 * size)
 
@@ -328,7 +329,7 @@ def test_a_controller_s_inverse_undoes_a_stage(name: str, hold: Hold, tmp_path: 
     made, voltage = actuator(name, hold=hold), drive()
     voltage[0] = 0.0
     row = theta(made, 1)
-    compiled = Compiled(exported("chain", made, row[0], SPAN), tmp_path, needs("cc"))
+    compiled = Compiled(exported("chain", made, row[0], Limits(*SPAN)), tmp_path, needs("cc"))
     displacement = compiled.run("forward", voltage[0], voltage)
     command = compiled.run("inverse", voltage[0], displacement[int(hold == "zero") :])
     again = compiled.run("forward", voltage[0], command)
@@ -426,7 +427,9 @@ def test_a_stage_without_undo_is_refused_in_one_line_where_a_command_is_asked_fo
     models = theta(made, 1)
     with pytest.raises(InputError, match="inverse: no command undoes the stage saturation; leave"):
         inverse(made, models, made.displacement(models, drive(50)))
-    assert "no command undoes" in str(exported("one way", made, models[0], SPAN).without_inverse)
+    assert "no command undoes" in str(
+        exported("one way", made, models[0], Limits(*SPAN)).without_inverse
+    )
 
 
 class Aging(Temperature):

@@ -10,7 +10,6 @@ test stand, and its mean is the model that a controller has.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -21,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.jobs.fit_methods import limits_of
+from bwbayes.app.jobs.fit_methods import amplifier_limits
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator
 from bwbayes.control.compensation import compensate as compensated
@@ -32,10 +31,9 @@ from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.control.tracking import Tracking
 from bwbayes.control.tracking import track as tracked
-from bwbayes.diagnosis.extrapolation import beyond_training
+from bwbayes.diagnosis import extrapolation
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.limits import Limits
 from bwbayes.model.linear import Hold, parse_hold
 from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.io.columns import Naming
@@ -62,6 +60,7 @@ def compensate(
     slew: float | None = None,
     current: float | None = None,
     capacitance: float | None = None,
+    beyond_training: bool = False,
     nearest: bool = False,
     reading: Mapping[str, Any] | None = None,
     watch: WatchSteps = unwatched,
@@ -114,6 +113,8 @@ def compensate(
         Its largest current, A; with the capacitance.
     capacitance
         The actuator's capacitance, F.
+    beyond_training
+        Allows voltages beyond those that were fitted, where nothing is known of the error.
     nearest
         If limits are exceeded, return the nearest feasible command.
     reading
@@ -127,7 +128,7 @@ def compensate(
     NotConvergedError
         The sampling has not converged.
     InputError
-        A reference that cannot be used or reached.
+        A reference that cannot be used or reached, or voltages beyond those fitted.
 
     Warns
     -----
@@ -141,8 +142,9 @@ def compensate(
         bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
     problem, seed = fit.problem, fit.problem.config.seed
-    span = limits_of(problem, voltage, 0.0)
-    limits = Limits(span.low, span.high, math.inf if slew is None else slew, current, capacitance)
+    limits = amplifier_limits(
+        problem, voltage, slew, current, capacitance, beyond_training=beyond_training
+    )
     shape = {"amplitude": amplitude, "frequency": frequency, "middle": middle, "periods": periods}
     options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
     options = {name: value for name, value in options.items() if value is not None}
@@ -166,7 +168,7 @@ def compensate(
         from_rest=from_rest,
         watch=partial(watch, "predicted error"),
     )
-    extrapolations = beyond_training(alone.posterior, compensation.record.inputs)
+    extrapolations = extrapolation.beyond_training(alone.posterior, compensation.record.inputs)
     remarks = [*compensation.remarks, *(finding.note for finding in extrapolations)]
     if not from_rest:
         # A voltage that exists from some states need not exist from rest.
@@ -251,6 +253,10 @@ def export(
     folder: str | Path | None = None,
     *,
     voltage: tuple[float, float] | None = None,
+    slew: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
+    beyond_training: bool = False,
     rate: float | None = None,
     hold: str = "zoh",
     overwrite: bool = False,
@@ -271,6 +277,14 @@ def export(
         Where the files go, ``model.json`` and ``actuator.c``; by default nothing is written.
     voltage
         Lowest and highest voltage of the inverse, V; default: what was fitted, and 0 V.
+    slew
+        Fastest change of the inverse's voltage, V/s.
+    current
+        The amplifier's largest current, A, which limits that change; with the capacitance.
+    capacitance
+        The actuator's capacitance, F.
+    beyond_training
+        Allows voltages beyond those that were fitted, where nothing is known of the error.
     rate
         The controller's samples a second; default: the record's.
     hold
@@ -287,8 +301,8 @@ def export(
     NotConvergedError
         The sampling has not converged.
     InputError
-        A hysteresis that has no step of bounded time, options that make no sense, or files that
-        exist or cannot be written.
+        A hysteresis that has no step of bounded time, voltages beyond those fitted, options that
+        make no sense, or files that exist or cannot be written.
 
     Examples
     --------
@@ -303,8 +317,12 @@ def export(
     actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
     name = problem.config.name or problem.record.origin
-    model = exported(name, actuator, theta.mean(axis=0), limits_of(problem, voltage, 0.0), sds)
-    model = replace(model, standing=fit.standing)
+    limits = amplifier_limits(
+        problem, voltage, slew, current, capacitance, beyond_training=beyond_training
+    )
+    model = replace(
+        exported(name, actuator, theta.mean(axis=0), limits, sds), standing=fit.standing
+    )
     if folder is not None:
         model.save(folder, overwrite=overwrite, watch=partial(watch, "files"))
     return model
@@ -327,6 +345,7 @@ def track(
     frequencies: tuple[float, ...] | None = None,
     amplitude: float | None = None,
     voltage: tuple[float, float] | None = None,
+    beyond_training: bool = False,
     rate: float = 1000.0,
     delay: int = 1,
     gain_margin: float = 2.0,
@@ -352,6 +371,8 @@ def track(
         Amplitude of the references, um; default: 80% of the mean model's reach.
     voltage
         Lowest and highest voltage of the amplifier, V; default: what was fitted, and 0 V.
+    beyond_training
+        Allows voltages beyond those that were fitted, where nothing is known of the error.
     rate
         Samples a second.
     delay
@@ -370,7 +391,8 @@ def track(
     NotConvergedError
         The sampling has not converged.
     InputError
-        A model that cannot be stepped or inverted, or options that make no sense.
+        A model that cannot be stepped or inverted, voltages beyond those fitted, or options that
+        make no sense.
 
     Examples
     --------
@@ -392,7 +414,7 @@ def track(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
         LoopNoise(dataset.noise, parameters),
-        Stand(limits_of(problem, voltage, 0.0), delay),
+        Stand(amplifier_limits(problem, voltage, beyond_training=beyond_training).span, delay),
         generator(seed, "track"),
         robustness=Robustness(gain_margin, phase_margin),
         frequencies=frequencies or None,

@@ -20,7 +20,7 @@ from bwbayes.app.config.config import read_toml
 from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.jobs.fit_methods import limits_of
+from bwbayes.app.jobs.fit_methods import fitted_voltages
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
@@ -115,7 +115,7 @@ def design(
     # turns most.
     records = problem.records
     record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
-    low, high = voltage or limits_of(problem, None)
+    low, high = voltage or fitted_voltages(problem)
     if slew is None:
         slew = _fastest(records[record]) if validate else np.inf
     amplifier = Limits(low, high, slew, current, capacitance)

@@ -5,6 +5,7 @@ Python warns of the remarks that the command line prints.
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import tempfile
@@ -22,6 +23,7 @@ from rich.console import Console
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
+from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.report.report import Shown
 
@@ -58,16 +60,39 @@ def fit_method[**P, R](
     return method
 
 
-def limits_of(problem: Problem, limits: tuple[float, float] | None, *also: float) -> Span:
-    """Return the voltages that may be used: those given, or all that were fitted and ``also``, V.
-
-    Raises InputError: they are not two voltages, the lower one first.
-    """
+def fitted_voltages(problem: Problem) -> Span:
+    """Return the lowest and the highest voltage that were fitted, V."""
     fitted = [edge for record in problem.records.values() for edge in record.range_voltage]
-    low, high = limits or (min(*fitted, *also), max(*fitted, *also))
+    return Span(min(fitted), max(fitted))
+
+
+def amplifier_limits(
+    problem: Problem,
+    voltage: tuple[float, float] | None,
+    slew: float | None = None,
+    current: float | None = None,
+    capacitance: float | None = None,
+    *,
+    beyond_training: bool = False,
+) -> Limits:
+    """Return an amplifier's limits; its voltages are by default those fitted, and 0 V.
+
+    Raises InputError: they are not two voltages, the lower one first; they go beyond those fitted
+    and 0 V, which has to be allowed; a limit that is not positive, a current without a capacitance.
+    """
+    fitted = fitted_voltages(problem)
+    trained = Span(min(fitted.low, 0.0), max(fitted.high, 0.0))
+    low, high = voltage or trained
     if not (np.isfinite([low, high]).all() and low < high):
         raise InputError(f"voltage: {low:g} to {high:g} V; give two voltages, the lower one first")
-    return Span(low, high)
+    slack = 0.02 * (trained.high - trained.low)  # a sensor's noise, as in beyond_training
+    if not beyond_training and (low < trained.low - slack or high > trained.high + slack):
+        raise InputError(
+            f"voltage: {low:g} to {high:g} V goes beyond the {trained.low:g} to {trained.high:g} V "
+            "that were fitted, where nothing is known of the error; give voltages within these, or "
+            "allow it with beyond_training (--beyond-training)"
+        )
+    return Limits(low, high, math.inf if slew is None else slew, current, capacitance)
 
 
 class Scratch:
