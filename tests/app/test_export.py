@@ -68,6 +68,7 @@ def test_options_that_make_no_sense_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 @pytest.mark.parametrize("verb", ["compensate", "export", "track"])
 def test_voltages_beyond_those_fitted_have_to_be_allowed(verb: str, fit: bw.Run) -> None:
     """The record went from -100 to 100 V."""
