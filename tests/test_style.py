@@ -1,4 +1,7 @@
-"""The rules that tools can check: lint, format, types, and which room may import which."""
+"""The rules that tools can check: lint, format, types, and which room may import which.
+
+Types of the package are checked each time, those of the tests, which take as long, by ``-m slow``.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
     [
         ["ruff", "check", "."],
         ["ruff", "format", "--check", "."],
-        ["mypy"],
+        ["mypy", "bwbayes"],
+        pytest.param(["mypy"], marks=pytest.mark.slow),
         ["lint-imports", "--no-cache"],
     ],
-    ids=["lint", "format", "types", "imports"],
+    ids=["lint", "format", "types", "all types", "imports"],
 )
 def test_the_tools_find_nothing(command: list[str]) -> None:
     tool = Path(sys.executable).with_name(command[0])
