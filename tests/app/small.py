@@ -50,6 +50,16 @@ from_rest = true
 """
 
 
+# The command line in a process of its own, which explains no misfit.
+UNEXPLAINED = """
+import pytest
+from bwbayes.app.commands.cli import main
+from tests.app import small
+small.without_explanations(pytest.MonkeyPatch())
+main()
+"""
+
+
 def config(*changes: tuple[str, str], text: str = TEXT) -> Config:
     """Return the small config, or another one, with parts of its text replaced."""
     for old, new in changes:
@@ -92,7 +102,7 @@ def command(*arguments: str | Path) -> list[str]:
 def finished(factory: pytest.TempPathFactory) -> Path:
     """Return the folder of the small run, made once by its command for all test processes.
 
-    It is for reading; copy it to change it.
+    Its misfit is not explained. It is for reading; copy it to change it.
     """
     shared = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -105,7 +115,7 @@ def finished(factory: pytest.TempPathFactory) -> Path:
             where.mkdir()
             (where / "small.toml").write_text(TEXT)
             done = subprocess.run(
-                command("run", "small.toml", "--workers", "1", "--quiet"),
+                [sys.executable, "-c", UNEXPLAINED, "run", "small.toml", "--workers=1", "--quiet"],
                 cwd=where,
                 capture_output=True,
                 text=True,

@@ -22,6 +22,7 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record
 from bwbayes.sampling.storage import ChainFile
+from tests.app import small
 from tests.app.conftest import Type
 from tests.app.steps import Steps
 
@@ -65,7 +66,8 @@ def measured(alpha: float = 0.36) -> Record:
 @pytest.fixture(scope="module")
 def fits() -> tuple[Run, Run]:
     """Return fits of Bouc-Wen and of a straight line, whose bands do not hold."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
         warnings.simplefilter("ignore", InputWarning)
         bouc_wen, linear = (
             bw.fit(measured(), hysteresis=name, name=name, progress=False, workers=1, **KEYS)
@@ -162,6 +164,7 @@ def test_a_wrong_command_is_one_line(bwbayes: Type, arguments: list[str], text: 
     bwbayes("compare", *arguments).assert_refused(text)
 
 
+@pytest.mark.usefixtures("_without_explanations")
 @pytest.mark.parametrize("noise", ["white", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_config_is_run_with_each_model_and_gone_on_with(
     bwbayes: Type, tmp_path: Path, noise: str

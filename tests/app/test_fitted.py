@@ -68,7 +68,8 @@ def fit(record: Record, keys: dict[str, Any]) -> Run:
     """Return a fit of the small run's arrays."""
     arrays = record.voltage, record.displacement
     made = bw.Record.from_arrays(*arrays, interval=record.interval, voltage_is="command")
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
         warnings.simplefilter("error")
         return bw.fit(replace(made, origin=record.origin, truth=record.truth), **keys)
 
@@ -264,6 +265,7 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
         assert "95%" not in text
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     record: Record,
     keys: dict[str, Any],
@@ -352,6 +354,7 @@ def test_a_key_that_is_wrong_is_one_line(record: Record, wrong: dict[str, Any], 
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_a_config_is_fitted_as_the_command_does(run: Path, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(small.TEXT)
     bw.fit(tmp_path / "small.toml", folder=tmp_path / "a", progress=False)

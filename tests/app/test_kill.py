@@ -1,8 +1,8 @@
 """A run may be killed at any moment: it goes on to the same bits, and leaves no process behind.
 
 The commands run in processes from a fork server, which has all imported already. What they do is
-what a person's do, but for the pictures, which are spared. The slow test of random kills makes 200
-of them, or as many as the environment variable KILLS says.
+what a person's do, but for pictures and explanations, which are spared. The slow test of random
+kills makes 200 of them, or as many as the environment variable KILLS says.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def follow(where: Path, arguments: list[str], last_step: str) -> None:
             os.dup2(file.fileno(), number)
     patched = pytest.MonkeyPatch()
     small.without_pictures(patched)
+    small.without_explanations(patched)
     if last_step:
         patched.setattr(run_module, last_step, die)
     sys.argv = ["bwbayes", *arguments]

@@ -26,7 +26,9 @@ def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]
     """Return a run that used up its budget, and the exit status of its command."""
     path = tmp_path_factory.mktemp("short") / "small"
     made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
-    return made, finish(made.path, workers=1, quiet=True)
+    with pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
+        return made, finish(made.path, workers=1, quiet=True)
 
 
 def test_run_without_convergence_speaks_of_no_interval(
