@@ -17,12 +17,16 @@ import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.arrays import FloatArray
+from bwbayes.comparison.designed import RivalDesign, RivalScore
+from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.study import every_declaration
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.limits import Limits
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io.stated import conversion
+from bwbayes.report.report import Picture
 
 MAGNET = Quantities.of("H (A/m)", "B (T)")
 SPRING = Quantities.of("displacement (mm)", "force (kN)")
@@ -236,3 +240,21 @@ def test_a_loop_without_time_is_rate_independent_and_says_so() -> None:
         assert bool(timed) == (interval is not None)
         said = any("rate independent" in remark for remark in problem.remarks)
         assert said == (interval is None)
+
+
+def test_a_design_by_rivals_is_said_in_the_runs_quantities() -> None:
+    """Banners, remarks, table and numbers; none of its texts has a V or um left."""
+    waves = {name: 40 * np.sin(np.arange(200) / 9) for name in ("slow", "fast")}
+    scores = [
+        RivalScore("slow", 0.2, 0.01, difference_um=0.3, sd_um=0.02, told_apart=0.9),
+        RivalScore("fast", np.nan, np.nan, refused="changes by 400 V/s, faster than 200 V/s"),
+    ]
+    limits = Limits(-50.0, 50.0, 200.0)
+    design = RivalDesign("run", None, None, limits, waves, 0.01, ValidationSummary(), scores)
+    design.said_in(MAGNET)
+    report = design.full_report().said()
+    blocks = [block for block in report.blocks if not isinstance(block, Picture)]
+    texts = str((report.banners, report.numbers, blocks))
+    assert "differ from the model by 0.3 T" in texts
+    assert texts.count("400 A/m/s") == 3
+    assert not re.search(r"(?<![\w'])(um|V)\b|_um|[Vv]oltage", texts)

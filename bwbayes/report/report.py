@@ -250,7 +250,7 @@ def _said(part: Any, quantities: Quantities) -> Any:
     if isinstance(part, list | tuple):
         return [_said(item, quantities) for item in part]
     if isinstance(part, Mapping):
-        return {quantities.heading(key): item for key, item in part.items()}
+        return {quantities.heading(key): _said(item, quantities) for key, item in part.items()}
     if not is_dataclass(part) or isinstance(part, type):
         return part
     kept = ("name", "kind", "on")
