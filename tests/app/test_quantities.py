@@ -79,15 +79,22 @@ LOOPS = {
 OWN = re.compile(r"\b([vV]oltages?|[dD]isplacements?|um|µm|V|volts?|piezo\w*)\b(?![=_])")
 
 
-@pytest.mark.usefixtures("_without_pictures")
+@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 @pytest.mark.filterwarnings("ignore::bwbayes.errors.InputWarning")  # that a start is smoothed
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("magnet", "muscle") else pytest.mark.slow)
+        for name in LOOPS
+    ],
+)
 def test_a_loop_of_any_quantities_is_run_by_one_line_in_its_own_units(
     name: str, bwbayes: Type
 ) -> None:
     """Parameters within 4 SDs of the truth (a chance of 2e-4 to fail); commands to 2% of the range.
 
-    Files are in other units than the run, which is told apart by their names alone.
+    Files are in other units than the run, which is told apart by their names alone. One without a
+    time and one with it are in the default suite, all with ``-m slow``.
     """
     loop, quantities = LOOPS[name], Quantities.of(LOOPS[name].input, LOOPS[name].output)
     loop.write(Path("loop.csv"))
