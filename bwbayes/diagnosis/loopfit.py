@@ -45,6 +45,8 @@ class LoopFit:
     start : float, um
         How far off the displacement starts in all: the decay, and what another state of the plays
         would change.
+    decay_left : float
+        Part of the sum of squares without the decay that is left with it.
     decay_share : float
         Part of the decay's variance that loops, creep and a trend do not imitate; with little
         of it neither `decay` nor `start` means anything.
@@ -72,6 +74,7 @@ class LoopFit:
     decay: float
     decay_time: float
     start: float
+    decay_left: float
     decay_share: float
     trend: float
     trend_share: float
@@ -148,6 +151,7 @@ def fit_loop(record: Record) -> LoopFit:
         float(times[which]),
         float(design[0, 4 + WIDTHS.size :] @ coefficients[4 + WIDTHS.size :])
         + coefficients[-2] / 2,
+        _decay_left(residual, float(coefficients[-1]), among),
         _distinct(among),
         float(drift[-1] - drift[0]),
         trend_share,
@@ -304,6 +308,12 @@ def _with_creep(
         which,
         _inverse(_products(design, design)) @ _products(design, columns[:, -1:])[:, 0],
     )
+
+
+def _decay_left(residual: FloatArray, decay: float, among: FloatArray) -> float:
+    """Return the part of the sum of squares without a decay, the last column, that is left."""
+    left = float(residual @ residual)
+    return left / max(left + decay**2 / max(float(_inverse(among)[-1, -1]), 1e-300), 1e-300)
 
 
 def _products(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -391,9 +391,9 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
             return
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
-    # A drive before the record leaves a decay too, of at most lag times velocity.
+    # A drive before the record leaves a decay too, as fast as the lag, of lag times velocity.
     velocity = float(np.quantile(steps, 0.99)) / record.interval
-    lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag)
+    lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag) * (time < 10 * loop.lag)
     # Another hysteretic state at the start, which steps of the voltage do not show, is less sure.
     moving, driven = np.count_nonzero(steps) > steps.size / 2, 2 * loop.driven_decay
     outside = abs(loop.start) > max(20 * spread, 0.24 * extent, driven)
@@ -403,9 +403,8 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
         time > LONG_DECAY * record.duration
     ):
         return
-    elif abs(loop.start) < abs(size) / 2:
-        # Another state at the start takes it back: it mends loops that no play follows, as those of
-        # an amplifier at its limits.
+    elif loop.decay_left > 0.1:
+        # It mends loops that no play follows, as those of an amplifier at its limits.
         return
     begin = float(record.time[first])
     # Until no more is to be seen of it than of the rest, or a thousandth of the range.
