@@ -70,7 +70,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
     folder = RunFolder.create(path, resolve_config(parse(TEXT, "joint.toml"), path.parent))
-    resume(folder, small.quiet(), workers=1)
+    with pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
+        resume(folder, small.quiet(), workers=1)
     return folder
 
 

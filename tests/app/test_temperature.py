@@ -26,6 +26,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.io.hdf5 import record_arrays
+from tests.app import small
 
 INTERVAL, PER_KELVIN, REFERENCE = 0.02, 0.002, 22.0
 SLOW = np.arange(700) * INTERVAL
@@ -60,7 +61,8 @@ TRAINED = measured(15.0, 30.0, 1)
 @pytest.fixture(scope="module")
 def fit() -> Any:
     keys = {"stages": ["temperature"], "from_rest": True, "ess": 400, "progress": False}
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught, pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
         warnings.simplefilter("always")
         found = bw.fit(TRAINED, dynamics="none", **keys)  # type: ignore[arg-type]
     said = " ".join(str(w.message) for w in caught)
@@ -115,6 +117,7 @@ def test_what_does_not_know_the_temperature_refuses_in_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_a_model_that_does_not_see_the_temperature_needs_none() -> None:
     """Although the record brings it: of a forecast, and of a command."""
     keys = {"stages": [], "noise": "white", "from_rest": True, "ess": 200, "progress": False}
