@@ -193,6 +193,8 @@ VERBS = (
     ),
     Verb("bwbayes.app.jobs.control:export"),
     Verb("bwbayes.app.jobs.control:track", flags={"frequencies": "frequency"}),
+    Verb("bwbayes.app.jobs.certificate:budget"),
+    Verb("bwbayes.app.jobs.certificate:certificate"),
 )
 
 PAIR = "--voltage FILE and --displacement FILE"

@@ -42,6 +42,7 @@ from bwbayes.prediction.initial_state import (
     estimate_initial_states,
 )
 from bwbayes.prediction.prediction import predict_record
+from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.record import Record
 from bwbayes.watching import Watch, part, unwatched
 
@@ -56,6 +57,7 @@ class _Plan:
     start: InitialConditions
     hold: Hold
     seed: int
+    instruments: Instruments
 
     @property
     def references(self) -> FloatArray:
@@ -68,7 +70,8 @@ class _Plan:
 
     def record(self, voltage: FloatArray) -> Record:
         """Return a command as a record."""
-        return planned(voltage, self.reference, self.hold, self.reference.name)
+        record = planned(voltage, self.reference, self.hold, self.reference.name)
+        return replace(record, instruments=self.instruments)
 
     def initial_states(self, voltage: FloatArray) -> InitialStates:
         """Return the initial states of all draws."""
@@ -108,7 +111,11 @@ class _Plan:
         theta = self.posterior.noise_of_new(theta)
         noise, rng = self.posterior.single_record.noise.at(self.reference.interval), self.rng()
         rms, largest, squares = np.empty((3, len(theta), 2))
-        for rows, displacement in self.displacements(voltage):
+        # The reference is in true um, whatever the sensor would read.
+        extent = self.posterior.single_record.extent
+        true = self.instruments.displacements(len(theta), extent, self.rng())
+        for rows, read in self.displacements(voltage):
+            displacement = true(rows, read)
             errors = displacement[:, np.newaxis] - self.references
             squares[rows] = np.mean(errors**2, axis=2)
             errors += noise.draw_all(theta[rows], voltage.size, rng)[0][:, np.newaxis]
@@ -132,6 +139,7 @@ def compensate(
     limits: Limits | None = None,
     nearest: bool = False,
     limit: float | None = None,
+    instruments: Instruments = EXACT,
     watch: Watch = unwatched,
 ) -> Compensation:
     """Return the command for a reference, and what is promised of it.
@@ -157,6 +165,8 @@ def compensate(
         zero volts until it stood still, in a state of its hysteresis that nothing tells.
     limit
         Limit of the tracking error, um.
+    instruments
+        How well the scales of those are known that read the record that was fitted.
     watch
         Called with the share that is done.
 
@@ -181,7 +191,13 @@ def compensate(
     reference = reference.from_zero()
     seed = int(generator.integers(2**62))
     plan = _Plan(
-        posterior, draws, reference, InitialConditions(from_rest, False, settled=True), hold, seed
+        posterior,
+        draws,
+        reference,
+        InitialConditions(from_rest, False, settled=True),
+        hold,
+        seed,
+        instruments,
     )
     requested, target = plan.references
     record = posterior.single_record

@@ -89,7 +89,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
     residual = bands.measured[rows] - mean
     parameter_variance, slow, total_variance = (
-        float(np.mean(bands.sd(kind)[rows] ** 2)) for kind in KINDS
+        float(np.mean(bands.read_sd(kind)[rows] ** 2)) for kind in KINDS
     )
     # No band is narrower than the resolution of floating-point numbers.
     largest = float(np.max(np.abs([bands.measured[rows], mean])))

@@ -61,7 +61,7 @@ class StandardizedResiduals:
         assert bands.measured is not None
 
         rows = bands.scored(bands.measured)
-        parameter_sd, slow, sensor = (bands.sd(kind)[rows] for kind in KINDS)
+        parameter_sd, slow, sensor = (bands.read_sd(kind)[rows] for kind in KINDS)
         # No band is narrower than a floating-point number's resolution.
         largest = float(np.max(np.abs([bands.measured[rows], bands.mean[rows]])))
         sensor = np.maximum(sensor, max(np.spacing(largest), 1e-150))
@@ -211,7 +211,7 @@ class StandardizedResiduals:
         Such a band covers nearly anything that the drive of training does.
         """
         total, displacement = (
-            float(np.mean(self.bands.sd(kind)[self.scored] ** 2))
+            float(np.mean(self.bands.read_sd(kind)[self.scored] ** 2))
             for kind in ("sensor", "displacement")
         )
         ratio = np.sqrt(total / max(total - displacement, 1e-9 * total))

@@ -24,6 +24,9 @@ KINDS: tuple[Kind, ...] = ("parameter", "displacement", "sensor")
 # Probabilities of the bands, percent.
 LEVELS = (50, 90, 95)
 
+# Width of the 90% interval of a normal distribution in sds.
+WIDTH_90 = float(2 * scipy.special.ndtri(0.95))
+
 
 def title_of(name: str, *, training: bool, separate: bool) -> str:
     """Return the name of bands, and what they are of."""
@@ -98,7 +101,8 @@ class Bands:
     it is another record than any that was fitted. The voltage is the path that drives the model.
     ``model_error_sd`` is what displacement and sensor bands have in them of how much more other
     models differ on this drive than in training, um; None of a drive like those of training, and
-    where the model's error does not follow the drive.
+    where the model's error does not follow the drive. Where the sensor's scale is unsure,
+    ``read_sds`` are the sds, um, that the parameter and displacement bands have without that.
     """
 
     __repr__ = brief
@@ -124,6 +128,7 @@ class Bands:
     separate: bool = False
     model_error_sd: float | None = None
     correction: Correction | None = None
+    read_sds: dict[Kind, FloatArray] | None = None
 
     @property
     def corrected(self) -> tuple[FloatArray, FloatArray] | None:
@@ -142,7 +147,10 @@ class Bands:
         """
         if not self.model_error_sd:
             return self
-        lower, upper = dict(self.lower), dict(self.upper)
+        lower, upper, read_sds = dict(self.lower), dict(self.upper), self.read_sds
+        if read_sds is not None:
+            left = np.maximum(read_sds["displacement"] ** 2 - self.model_error_sd**2, 0.0)
+            read_sds = {**read_sds, "displacement": np.sqrt(left)}
         for kind in KINDS[1:]:
             sd = self.sd(kind)
             left = np.sqrt(np.maximum(1 - (self.model_error_sd / sd) ** 2, 0.0))
@@ -157,6 +165,7 @@ class Bands:
             crps=None,
             log_score=None,
             model_error_sd=None,
+            read_sds=read_sds,
         )
 
     def width(self, level: int = 95) -> float:
@@ -187,7 +196,11 @@ class Bands:
     def sd(self, kind: Kind) -> FloatArray:
         """Sd (samples,) of a normal distribution whose 90% band is as wide, um."""
         width: FloatArray = self.upper[kind, 90] - self.lower[kind, 90]
-        return width / float(2 * scipy.special.ndtri(0.95))
+        return width / WIDTH_90
+
+    def read_sd(self, kind: Kind) -> FloatArray:
+        """Sd (samples,) of a band in the sensor's readings, whatever its scale is, um."""
+        return (self.read_sds or {}).get(kind, self.sd(kind))
 
     def scored(self, values: FloatArray | None) -> BoolArray:
         """Tell which samples count: those after a lead-in where values (samples,) are known."""
@@ -217,6 +230,8 @@ class Bands:
             changes[name] = getattr(self, name)[whole]
         for name in ("lower", "upper"):
             changes[name] = {band: edge[whole] for band, edge in getattr(self, name).items()}
+        if self.read_sds is not None:
+            changes["read_sds"] = {kind: sd[whole] for kind, sd in self.read_sds.items()}
         inside = inside[whole]
         return replace(self, **changes, inside=None if inside.all() else inside)
 

@@ -136,6 +136,12 @@ class InitialStates:
     discrepancy: DiscrepancyState | None = None
     rows: IntArray | slice = slice(None)
 
+    @property
+    def mean_offset(self) -> float:
+        """The mean of the sensor's offset, um."""
+        column = self.histories.likelihoods[0].actuator.parameters.index("offset")
+        return float(np.mean(self.model[:, column]))
+
     def displacement(self, inputs: Inputs) -> FloatArray:
         """Displacement (draws, samples) along inputs, um."""
         return next(self.pieces(inputs, inputs.samples))

@@ -18,6 +18,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
+from bwbayes.record.instruments import Scales
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 
@@ -104,10 +105,14 @@ class Loop:
     closed: bool
 
     @classmethod
-    def of(cls, traced: TracedLoop) -> Loop:
-        """Measure the loops of all draws."""
-        estimates = {n: None if v is None else Estimate.of(v) for n, v in measures(traced).items()}
-        branches = Curve.of(traced.rising), Curve.of(traced.falling)
+    def of(cls, traced: TracedLoop, scales: Scales) -> Loop:
+        """Measure the loops of all draws, in true um and V."""
+        estimates = {
+            name: None if values is None else Estimate.of(values * scales.factor(MEASURES[name][1]))
+            for name, values in measures(traced).items()
+        }
+        um = scales.factor("um")[:, np.newaxis]
+        branches = Curve.of(um * traced.rising), Curve.of(um * traced.falling)
         return cls(traced.voltage, *branches, estimates, traced.closed)
 
     @property
@@ -155,15 +160,40 @@ class Loops:
         }
 
 
-def measure_loops(posterior: Posterior, draws: FloatArray, watch: Watch = unwatched) -> Loops:
+def measure_loops(
+    posterior: Posterior,
+    draws: FloatArray,
+    watch: Watch = unwatched,
+    scales: Scales | None = None,
+) -> Loops:
     """Measure the loops of every draw (draws, free), in the range of the records' voltages.
 
-    ``watch`` is called with the share that is done.
+    These are as the monitor reads them; ``scales`` of the draws turn what is measured into true um
+    and V, by default ones. ``watch`` is called with the share that is done.
 
     Raises
     ------
     InputError
         A voltage that does not change.
+    """
+    scales = scales or Scales.exact(len(draws))
+    actuator, column, low, high = driven(posterior, draws)
+    quarter = (high - low) / 4
+    major, minor = (
+        Loop.of(steady_loop(actuator, column, *edges), scales)
+        for edges in watched([(low, high), (low + quarter, high - quarter)], part(watch, 0.0, 0.9))
+    )
+    voltage, curve = initial_curve(actuator, column, low, high)
+    watch(1.0)
+    initial = Curve.of(scales.factor("um")[:, np.newaxis] * curve)
+    return Loops(major, minor, voltage, initial)
+
+
+def driven(posterior: Posterior, draws: FloatArray) -> tuple[Actuator, Values, float, float]:
+    """Return what loops are measured of: actuator, its parameters by name, the voltage's range.
+
+    ``draws`` are (draws, free); of several records the actuator is that of the first, and the
+    range, V, that of all.
     """
     _, single, record_draws = next(posterior.each(draws))
     dataset = single.single_record
@@ -171,14 +201,7 @@ def measure_loops(posterior: Posterior, draws: FloatArray, watch: Watch = unwatc
     column = dataset.table.columns(single.prior.theta(record_draws))
     low = min(float(np.min(record.voltage)) for record in posterior.datasets)
     high = max(float(np.max(record.voltage)) for record in posterior.datasets)
-    quarter = (high - low) / 4
-    major, minor = (
-        Loop.of(steady_loop(actuator, column, *edges))
-        for edges in watched([(low, high), (low + quarter, high - quarter)], part(watch, 0.0, 0.9))
-    )
-    voltage, curve = initial_curve(actuator, column, low, high)
-    watch(1.0)
-    return Loops(major, minor, voltage, Curve.of(curve))
+    return actuator, column, low, high
 
 
 def steady_loop(

@@ -26,7 +26,7 @@ from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.reversals import rate
 from bwbayes.prediction import mixture
-from bwbayes.prediction.bands import KINDS, LEVELS, Bands
+from bwbayes.prediction.bands import KINDS, LEVELS, WIDTH_90, Bands, Kind
 from bwbayes.prediction.initial_state import (
     InitialConditions,
     InitialStates,
@@ -34,6 +34,7 @@ from bwbayes.prediction.initial_state import (
     estimate_initial_states,
     training_initial_states,
 )
+from bwbayes.record.instruments import EXACT
 from bwbayes.record.record import Record, Window
 from bwbayes.watching import Watch, counted, part, unwatched
 
@@ -58,6 +59,28 @@ class TailScales(NamedTuple):
     scales: FloatArray
     values: FloatArray
     logs: FloatArray
+
+
+class SensorScale(NamedTuple):
+    """What turns readings into displacements, and is unsure: see :mod:`bwbayes.record.instruments`.
+
+    ``scale`` (draws,) acts on what lies beyond the sensor's ``zero``, um, which says nothing of
+    the actuator; ``curve_sd`` is the sd of the sensor's curve, um.
+    """
+
+    scale: FloatArray
+    zero: float
+    curve_sd: float
+
+    def true(
+        self, means: Floating, variance: FloatArray, mean: FloatArray, kind: Kind
+    ) -> tuple[Floating, FloatArray]:
+        """Return the displacements of draws (samples, draws) about a mean, and their variances."""
+        scale = self.scale.astype(np.float32)
+        moved = (mean - self.zero).astype(np.float32)[:, np.newaxis]
+        curve = self.curve_sd if kind == "displacement" else 0.0
+        scaled = variance * self.scale[:, np.newaxis] ** 2 + curve**2
+        return scale * means + (scale - 1) * moved, scaled
 
 
 def thin_draws(draws: FloatArray, generator: np.random.Generator, count: int = DRAWS) -> FloatArray:
@@ -215,6 +238,7 @@ def predict_record(
         predicted_window,
         predicting,
         model_error_sd or 0.0,
+        zero=0.0 if start.settled else None,
     )
     return replace(
         bands,
@@ -234,8 +258,12 @@ def _bands(
     window: slice,
     watch: Watch = unwatched,
     model_error_sd: float = 0.0,
+    zero: float | None = None,
 ) -> Bands:
-    """Walk through a record from every draw's start, and summarize the mixture over a window."""
+    """Walk through a record from every draw's start, and summarize the mixture over a window.
+
+    The sensor's scale acts on what lies beyond its ``zero``, um, by default the mean offset.
+    """
     # The same for all predictions: bands differ by what is predicted, not by chance.
     scores = mixture.stratified_scores(len(theta), np.random.default_rng(len(theta)))
     noise, parameters = posterior.single_record.noise, posterior.noise_of_new(theta)
@@ -247,6 +275,11 @@ def _bands(
     variances = [sd[:, np.newaxis] ** 2 for sd in (start.offset_sd, *sds)]
     variances.append(np.full((1, 1), model_error_sd**2))
     speed = np.abs(rate(record.inputs.voltage, record.interval))
+    sensor = None
+    if record.instruments != EXACT:
+        drawn = record.instruments.scales(len(theta), np.random.default_rng([len(theta), 1]))
+        curve = record.instruments.linearity_sd(posterior.single_record.extent)
+        sensor = SensorScale(drawn.sensor, start.mean_offset if zero is None else zero, curve)
     samples = window.stop - window.start
     joined: defaultdict[str, FloatArray] = defaultdict(lambda: np.empty(samples))
     totals = np.zeros(len(theta))
@@ -272,7 +305,7 @@ def _bands(
                 variances = [*variances]
                 variances[2] = noise.sensor_variance(parameters, speed[first:end])
             work = executor.submit(
-                _summarized, start, variances, scores, tails, record, first, inside
+                _summarized, start, variances, scores, tails, sensor, record, first, inside
             )
             pending.append((first - window.start, work))
             totals += inside.sum(axis=1)
@@ -298,6 +331,7 @@ def _bands(
         interval=record.interval,
         time_offset=record.time_offset,
         common_sd=float(np.sqrt(common)),
+        read_sds=None if sensor is None else {k: joined[f"{k} read sd"] for k in KINDS[:2]},
     )
 
 
@@ -306,6 +340,7 @@ def _summarized(
     variances: Sequence[FloatArray],
     scores: FloatArray,
     tails: TailScales | None,
+    sensor: SensorScale | None,
     record: Record,
     first: int,
     simulated: FloatArray,
@@ -339,7 +374,13 @@ def _summarized(
     for kind, added in zip(KINDS, (offset, slow * unknown + error, white), strict=True):
         means = apart if kind == "parameter" else away
         rest, variance = variance, variance + added
-        sds = np.sqrt(variance).astype(np.float32).T
+        variance_in_um = variance
+        if sensor is not None and kind != "sensor":
+            read = mixture.ranked_values(means, np.sqrt(variance).astype(np.float32).T, scores)
+            width = mixture.quantile(read, 0.95) - mixture.quantile(read, 0.05)
+            summarized[f"{kind} read sd"] = width / WIDTH_90
+            means, variance_in_um = sensor.true(means, variance, mean, kind)
+        sds = np.sqrt(variance_in_um).astype(np.float32).T
         heavy = tails if kind == "sensor" else None
         if heavy is not None:
             sds = np.sqrt(rest.T[:, np.newaxis] + white.T * heavy.scales).astype(np.float32)

@@ -18,6 +18,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
 from bwbayes.prediction.loops import Curve, Estimate, first_passage
+from bwbayes.record.instruments import Scales
 from bwbayes.record.record import Record
 from bwbayes.shown import brief
 
@@ -81,14 +82,22 @@ def step_of(record: Record) -> Step | None:
 
 
 def measure_steps(
-    posterior: Posterior, draws: FloatArray, records: Mapping[str, Record]
+    posterior: Posterior,
+    draws: FloatArray,
+    records: Mapping[str, Record],
+    scales: Scales | None = None,
 ) -> dict[str, StepResponse]:
-    """Measure the step responses of those records, by name, whose voltage is a step from zero."""
+    """Measure the step responses of those records, by name, whose voltage is a step from zero.
+
+    ``scales`` are as of :func:`measure_step`.
+    """
     steps = {name: step_of(record) for name, record in records.items()}
-    return {n: measure_step(posterior, draws, step) for n, step in steps.items() if step}
+    return {n: measure_step(posterior, draws, step, scales) for n, step in steps.items() if step}
 
 
-def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepResponse:
+def measure_step(
+    posterior: Posterior, draws: FloatArray, step: Step, scales: Scales | None = None
+) -> StepResponse:
     """Measure the response to a step.
 
     With x(t) the displacement since the step, x_d(t) that without creep, x_∞ where x_d settles, and
@@ -105,8 +114,10 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
         100 (c(T) − c(0.1 s)) / (x_∞ + c(0.1 s)) / log₁₀(T / 0.1 s), with T the end of the step;
         None without creep, or if T is less than a second.
 
-    ``draws`` (draws, free) are parameters in their own units.
+    ``draws`` (draws, free) are parameters in their own units; their ``scales`` turn readings into
+    true um, by default ones.
     """
+    um = (scales or Scales.exact(len(draws))).factor("um")
     _, single, record_draws = next(posterior.each(draws))
     dataset = single.single_record
     column = dataset.table.columns(single.prior.theta(record_draws))
@@ -117,7 +128,7 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
     time = np.geomspace(first, held, round(60 * np.log10(held / first)) + 1)
     settled, without, creep = _responses(actuator, column, step.height, time)
     estimates: dict[str, Estimate | None] = dict.fromkeys(STEP_MEASURES)
-    estimates["level_um"] = Estimate.of(settled)
+    estimates["level_um"] = Estimate.of(um * settled)
     if actuator.filter.parameters:
         share = without / settled[:, np.newaxis]
         begin, end = (np.exp(first_passage(np.log(time), share, part)) for part in (0.1, 0.9))
@@ -131,8 +142,10 @@ def measure_step(posterior: Posterior, draws: FloatArray, step: Step) -> StepRes
         decades = np.log10(held / CREEP_FROM)
         percent = 100 * grown[:, -1] / (settled + before) / decades
         estimates["creep_percent"] = Estimate.of(percent)
-        crept = Curve.of(np.where(time < CREEP_FROM, np.nan, grown))
-    return StepResponse(step, time, Curve.of(without + creep), crept, estimates)
+        crept = Curve.of(np.where(time < CREEP_FROM, np.nan, um[:, np.newaxis] * grown))
+    return StepResponse(
+        step, time, Curve.of(um[:, np.newaxis] * (without + creep)), crept, estimates
+    )
 
 
 def _responses(

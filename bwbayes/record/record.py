@@ -22,6 +22,7 @@ from bwbayes.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from bwbayes.errors import InputError, one_line
 from bwbayes.model.inputs import Inputs, VoltageIs, require_voltage_is
 from bwbayes.quantities import DISPLACEMENT, VOLTAGE
+from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.io.columns import Naming, select
 from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.grid import clock
@@ -62,6 +63,8 @@ class Record(Inputs):
     time_offset : float, s
         What a clock adds to the record's times, which count from about its first sample: the time
         stamp of time zero.
+    instruments : Instruments
+        How well the scales of sensor and voltage monitor are known.
 
     Raises
     ------
@@ -83,6 +86,7 @@ class Record(Inputs):
     origin: str = ""
     truth: FloatArray | None = None
     time_offset: float = 0.0
+    instruments: Instruments = EXACT
 
     def __post_init__(self) -> None:
         samples = np.size(self.voltage)
@@ -130,7 +134,8 @@ class Record(Inputs):
             Times of the samples, in place of interval and start; dates and durations too.
         units : dict
             Units by quantity, where they are others: ``{"displacement": "nm", "time": "ms"}``;
-            ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1.
+            ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1, and
+            ``"0.35 +- 0.004 um"`` or ``"um +- 1.2 %"`` one with its standard uncertainty.
         covariates : dict of arrays as these
             What else was measured and a model may see: ``{"temperature_degC": temperature}``.
         input, output : str
@@ -305,14 +310,19 @@ class Record(Inputs):
             digest.update(values.astype("<f8").tobytes())
         return digest.hexdigest()
 
-    def like(self, other: Inputs) -> Record:
-        """Return the record as one of another one's quantities, whose units its numbers are in.
+    def like(self, other: Record) -> Record:
+        """Return the record as one of another one's quantities, in its units, by its instruments.
 
         Raises
         ------
         InputError
-            It states other quantities.
+            It states other quantities, or other uncertainties of its instruments.
         """
+        if self.instruments not in (EXACT, other.instruments):
+            raise InputError(
+                f"{self.origin}: states other uncertainties of its units than {other.origin}; a "
+                "fit's records are read by the same instruments: state the same, or none"
+            )
         own, theirs = self.quantities, other.quantities
         stated = (own.input, own.output) != (theirs.input, theirs.output)
         if stated and not own.are_default:
@@ -320,7 +330,7 @@ class Record(Inputs):
                 f"{self.origin}: is of {own.input} and {own.output}, not of {theirs.input} and "
                 f"{theirs.output}; state these as its input and output"
             )
-        return replace(self, quantities=theirs)
+        return replace(self, quantities=theirs, instruments=other.instruments)
 
     def window_slice(self, start: float, stop: float) -> slice:
         """Return the slice of the samples with start <= time < stop.

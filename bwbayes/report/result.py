@@ -25,6 +25,7 @@ from bwbayes.diagnosis.validation import BandValidation, ValidationSummary
 from bwbayes.errors import Renamed
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.budget import Budget
 from bwbayes.prediction.loops import Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import StepResponse
@@ -45,8 +46,8 @@ class Result:
         All parameters, fixed ones included.
     draws, log_density
         (steps, ensembles, walkers, free), parameters in their own units; (steps, ensembles,
-        walkers), nats. Where a voltage has noise, the draws are the chain's made wider, and the
-        density is that of the chain's own.
+        walkers), nats. Where a voltage has noise, or the instruments' scales are unsure, the draws
+        are the chain's made wider, and the density is that of the chain's own.
     moves
         How often each kind of move was proposed to a walker for these draws, and accepted.
     predictions, scores, validation
@@ -58,6 +59,8 @@ class Result:
         it better, the best first; where it lies among replicated records.
     loops, step_responses
         The loops of the actuator, measured, and its responses to the predicted steps by name.
+    uncertainty_budgets
+        Which source has which share of what is not known of the main quantities.
     information_gain
         Information gained from the data: prior against posterior.
     facts
@@ -85,6 +88,7 @@ class Result:
     drive_locks: Mapping[str, DriveLock] = field(default_factory=dict)
     loops: Loops | None = None
     step_responses: Mapping[str, StepResponse] = field(default_factory=dict)
+    uncertainty_budgets: tuple[Budget, ...] = ()
     consistency: Mapping[str, Consistency] = field(default_factory=dict)
     explanations: Mapping[str, tuple[Explanation, ...]] = field(default_factory=dict)
     information_gain: InformationGain | None = None
@@ -165,8 +169,9 @@ def summary(result: Result) -> dict[str, object]:
     """Return a run's numbers as ``summary.json`` holds them.
 
     ``parameters``, ``validation``, ``innovations``, ``loops``, ``step_responses``,
-    ``identifiability``, ``model_error``, ``replicated`` and ``explanations`` are None unless the
-    sampling has converged; ``agreement`` is there for several records alone.
+    ``uncertainty_budget``, ``identifiability``, ``model_error``, ``replicated`` and
+    ``explanations`` are None unless the sampling has converged; ``agreement`` is there for several
+    records alone.
     """
     outcome, check = result.outcome, result.outcome.check
     numbers: dict[str, object] = {
@@ -186,7 +191,8 @@ def summary(result: Result) -> dict[str, object]:
     if not outcome.converged:
         sections = (
             *("parameters", "validation", "validated_drives", "innovations", "loops"),
-            *("step_responses", "identifiability", "model_error", "replicated", "explanations"),
+            *("step_responses", "uncertainty_budget", "identifiability", "model_error"),
+            *("replicated", "explanations"),
         )
         return numbers | dict.fromkeys(sections)
     innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
@@ -204,6 +210,7 @@ def summary(result: Result) -> dict[str, object]:
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,
         "step_responses": {name: step.numbers for name, step in result.step_responses.items()},
+        "uncertainty_budget": [budget.numbers for budget in result.uncertainty_budgets],
         "identifiability": None if gain is None else gain.numbers,
         "model_error": {name: lock.numbers for name, lock in result.drive_locks.items()},
         "replicated": {n: checks.numbers for n, checks in result.posterior_checks.items()} or None,

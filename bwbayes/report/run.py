@@ -211,6 +211,9 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         terms = [pair for pair in LOOP_TERMS.items() if any(r.startswith(pair[0]) for r in rows)]
         loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
         blocks.append(Section("Loops", loops, folded=False))
+    if result.uncertainty_budgets:
+        budget: list[Block] = [tables.budget_table(result.uncertainty_budgets)]
+        blocks.append(Section("Uncertainty budget", budget, folded=False))
     if result.step_responses:
         steps: list[Block] = [tables.steps_table(result.step_responses), pictures["steps"]]
         blocks.append(Section("Step responses", steps, folded=False))

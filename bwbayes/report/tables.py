@@ -15,10 +15,11 @@ from bwbayes.diagnosis.predictive_checks import STATISTICS
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.budget import TYPES, Budget
 from bwbayes.prediction.loops import MEASURES, Estimate, Loops
 from bwbayes.prediction.scores import Scores
 from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
-from bwbayes.report.report import UNKNOWN, Table, TableColumn, Text
+from bwbayes.report.report import UNKNOWN, Table, TableColumn, Target, Text
 from bwbayes.report.result import Result
 from bwbayes.report.words import (
     coverage_text,
@@ -248,6 +249,33 @@ def other_scores_table(
         ]
     columns = ["Quantity", *(titles[name] for name in scores)]
     return Table("scores", "Other scores", columns, rows, records=records)
+
+
+def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
+    """Return the share of each source in the variance of some quantities, a column for each."""
+    rows = [
+        [
+            source,
+            kind,
+            *(f"{100 * b.shares[source]:.1f}%" if source in b.shares else "0" for b in budgets),
+        ]
+        for source, kind in TYPES.items()
+        if any(source in budget.shares for budget in budgets)
+    ]
+    for words, value in (("Mean", "mean"), ("Standard uncertainty", "sd")):
+        values = [f"{digits(getattr(b, value), b.sd)} {unit_text(b.unit)}" for b in budgets]
+        rows.append([words, "", *values])
+    intervals = [f"{digits(b.lower, b.sd)} to {digits(b.upper, b.sd)}" for b in budgets]
+    rows.append(["95% interval", "", *intervals])
+    records = [
+        {"quantity": b.name, "source": s, "share": v} for b in budgets for s, v in b.shares.items()
+    ]
+    note = (
+        "Shares of the variance, which add up. A: from the readings; B: from what else is known. "
+        "Voltages are as the monitor reads them, a displacement is beyond the sensor's zero."
+    )
+    columns = ["Source", "Type", *(budget.name for budget in budgets)]
+    return Table("budget", "Uncertainty budget", columns, rows, records=records, note=note, on=on)
 
 
 def loops_table(loops: Loops) -> Table:

@@ -81,6 +81,8 @@ def test_line_on_the_screen_says_what_to_do(
         "design RUN --parameter d",
         "export RUN",
         "track RUN",
+        "budget RUN",
+        "certificate RUN",
     ],
 )
 def test_whatever_builds_on_it_is_refused_with_its_status(

@@ -207,7 +207,7 @@ def _config_or_proposal(
     config = proposal.config
     tables = {key: reading[key] for key in ("columns", "units", "covariates")}
     init = f"bwbayes init {shlex.quote(str(path))}"
-    options = ("table", "displacement_file", "input", "output")
+    options = ("table", "displacement_file", "input", "output", "linearity")
     for key in options:
         option = key.removesuffix("_file")
         init += "" if reading[key] is None else f" --{option} {shlex.quote(str(reading[key]))}"

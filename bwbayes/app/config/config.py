@@ -19,6 +19,7 @@ from pydantic import Discriminator, Field, Tag, ValidationError, field_validator
 from bwbayes.app.config import MAX_SEED
 from bwbayes.app.config.keys import ConfigTable, key, one_line
 from bwbayes.app.config.settings import (
+    CertificateConfig,
     ModelConfig,
     Name,
     ParameterConfig,
@@ -72,6 +73,8 @@ class Config(ConfigTable):
     """How to sample, and when to stop."""
     validation: dict[Name, ValidationConfig] = key({}, called="holdout test")
     """Data to predict and judge, under a NAME of your choice."""
+    certificate: CertificateConfig = key(CertificateConfig())
+    """What a certificate says of the measurement."""
     truth: dict[str, float] = key({}, unit="the parameter's", example="{ d = 0.7, alpha = 0.3575 }")
     """True parameters of a simulated record, to be shown beside the estimates."""
 

@@ -47,9 +47,9 @@ def config_of(
         record_2, ... Keys of [record] beside count for all that do not say otherwise.
     keys
         Keys of a config's [record], [model] and [sampling], and ``name``, ``seed``, ``parameters``,
-        ``validation`` and ``truth``. A validation is a pair (start, stop) in s, which is a window
-        of the training record; another record or its file; or a table of the keys of
-        [validation.NAME], in which ``record`` may be a record.
+        ``validation``, ``truth`` and ``certificate``. A validation is a pair (start, stop) in s,
+        which is a window of the training record; another record or its file; or a table of the keys
+        of [validation.NAME], in which ``record`` may be a record.
     where
         Name of the call, for errors.
 
@@ -60,7 +60,7 @@ def config_of(
     homes |= dict.fromkeys(RecordConfig.model_fields.keys() - {"file", "signal"}, "record")
     # Where two tables have a key of the same name, the model's counts.
     homes |= dict.fromkeys(ModelConfig.model_fields, "model")
-    homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth"), "")
+    homes |= dict.fromkeys(("name", "seed", "parameters", "validation", "truth", "certificate"), "")
     for key, value in keys.items():
         if key not in homes:
             example = next((name for name, table in homes.items() if table == key), None)

@@ -180,9 +180,10 @@ def _source(path: Path, where: Path, naming: Naming, record: Record) -> str:
         source += f"\ndisplacement_file = {relative(naming.displacement_file)}"
     for key, quantity in ("input", naming.input), ("output", naming.output):
         source += "" if quantity is None else f"\n{key} = {_quoted(quantity)}"
+    source += "" if naming.linearity is None else f"\nlinearity = {_quoted(naming.linearity)}"
     roles = {"voltage": "input", "displacement": "output"}
     names = {} if record.quantities.are_default else roles
-    tables = {"columns": naming.columns, "units": naming.units}
+    tables = {"columns": naming.columns, "units": naming.stated_units}
     tables["covariates"] = naming.covariate_columns
     for key, table in tables.items():
         if table:

@@ -93,7 +93,8 @@ class _Source(ConfigTable):
     """
     units: dict[str, str] | None = key(None, example='{ displacement = "nm" }')
     """Units by quantity, where the file does not state them; "0.35 um" is a sensor's sensitivity,
-    that of 1 in the column, and a minus turns the sign.
+    that of 1 in the column, and a minus turns the sign; "0.35 +- 0.004 um" or "um +- 1.2 %" is one
+    with its standard uncertainty.
     """
     fs: Positive | None = key(None, unit="Hz", example="1e3")
     """The file's sampling rate, in place of a time column."""
@@ -111,6 +112,8 @@ class _Source(ConfigTable):
     """What drives, where it is no voltage in V: its name, and the unit of all numbers."""
     output: str | None = key(None, example='"B (T)"')
     """What is measured, where it is no displacement in um."""
+    linearity: str | None = key(None, example='"0.1 %"')
+    """The sensor's largest departure from a straight line, of the range."""
     missing: list[float] | None = key(None, unit="um", example="[-20.0, 20.0]", called="na clipped")
     """Displacements that are no readings, as a sensor's limits where it is clipped; of a record
     that is predicted by default those of the training record.
@@ -121,7 +124,7 @@ class _Source(ConfigTable):
         from bwbayes.record.io.columns import Naming  # noqa: PLC0415  # --help need not wait for scipy
 
         keys = ("columns", "units", "fs", "displacement_file", "covariates", "input", "output")
-        Naming.stated(**{key: getattr(self, key) for key in keys})
+        Naming.stated(**{key: getattr(self, key) for key in (*keys, "linearity")})
         return self
 
 
@@ -295,6 +298,21 @@ class ParameterConfig(ConfigTable):
         if self.prior is not None and not isinstance(self.prior.get("distribution"), str):
             raise ValueError('prior needs a name: distribution = "normal", for instance')
         return self
+
+
+class CertificateConfig(ConfigTable):
+    """What a certificate says of the measurement, as it was."""
+
+    number: str | None = key(None, example='"2026-114"')
+    """The certificate's number."""
+    laboratory: str | None = key(None, example='"Precision Lab, room 3"')
+    """Who measured."""
+    object: str | None = key(None, example='"stack P-885.51, serial 0917"', called="specimen")
+    """What was measured."""
+    conditions: str | None = key(None, example='"(23.0 +- 0.2) degC, unloaded, after 30 min"')
+    """Under which conditions."""
+    instruments: Texts = key([], example='["capacitive sensor CS1, calibrated 2026-03-02"]')
+    """With which instruments."""
 
 
 class SamplingConfig(ConfigTable):

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
+    from bwbayes.app.jobs.certificate import budget as budget_fit
+    from bwbayes.app.jobs.certificate import certificate as certificate_fit
     from bwbayes.app.jobs.control import compensate as compensate_fit
     from bwbayes.app.jobs.control import export as export_fit
     from bwbayes.app.jobs.control import track as track_fit
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from bwbayes.diagnosis.rivals import Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
     from bwbayes.prediction.bands import Bands, Correction
+    from bwbayes.prediction.budget import Budget
     from bwbayes.prediction.loops import Loops
     from bwbayes.prediction.scores import Scores
     from bwbayes.prediction.steps import StepResponse
@@ -197,7 +200,7 @@ class Run(Shown):
 
     @cached_property
     def flat_draws(self) -> FloatArray:
-        """All draws, (draws, free), parameters in their own units."""
+        """All draws, (draws, free), parameters in their own units, as the readings have them."""
         return self._draws.reshape(-1, self._draws.shape[-1])
 
     @cached_property
@@ -229,7 +232,7 @@ class Run(Shown):
             name=problem.config.name or "run",
             outcome=self.outcome,
             parameters=problem.parameters,
-            draws=self._draws,
+            draws=problem.true_draws(self._draws),
             log_density=log_densities(chain),
             moves=chain.moves("sampling"),
             facts=problem.facts | facts,
@@ -265,7 +268,8 @@ class Run(Shown):
         records = self.problem.others
         if len(self.problem.records) > 1:
             records = {**self.problem.records, **records}
-        return measure_steps(self.problem.posterior, self.subset, records)
+        scales = self.problem.scales(len(self.subset))
+        return measure_steps(self.problem.posterior, self.subset, records, scales)
 
     @RunStage
     def predictions(self, watch: Watch) -> tuple[Bands, ...]:
@@ -313,7 +317,15 @@ class Run(Shown):
         """Return the major and a minor loop and the initial curve."""
         from bwbayes.prediction.loops import measure_loops
 
-        return measure_loops(self.problem.posterior, self.subset, watch)
+        scales = self.problem.scales(len(self.subset))
+        return measure_loops(self.problem.posterior, self.subset, watch, scales)
+
+    @RunStage
+    def uncertainty_budgets(self, _: Watch) -> tuple[Budget, ...]:
+        """Return which source has which share of what is not known of the main quantities."""
+        from bwbayes.app.running.budgeting import run_budgets
+
+        return run_budgets(self.problem, self.subset[::2], self.predictions)
 
     @RunStage
     def drive_locks(self, _: Watch) -> dict[str, DriveLock]:
@@ -390,7 +402,7 @@ class Run(Shown):
 
         prior, sampled = self.problem.posterior.prior, self.sampled
         source = self._check_source
-        return information_gain(prior, sampled.draws, sampled.log_density, source, watch)
+        return information_gain(prior, self._draws, sampled.log_density, source, watch)
 
     @RunStage
     def posterior_checks(self, watch: Watch) -> dict[str, PredictiveChecks]:
@@ -625,6 +637,8 @@ class Run(Shown):
         design = fit_method(design_fit)
         export = fit_method(export_fit)
         track = fit_method(track_fit)
+        budget = fit_method(budget_fit)
+        certificate = fit_method(certificate_fit)
 
     def compare(self, *others: Run, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.

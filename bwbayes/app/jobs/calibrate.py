@@ -34,6 +34,7 @@ from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, replicate
 from bwbayes.errors import InputError
+from bwbayes.record.instruments import EXACT
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.outputs import save
 
@@ -78,7 +79,7 @@ def experiment(problem: Problem) -> CalibrationSetup:
         if (held_out := problem.held_out(record))
     }
     others = {
-        name: OtherRecord(v.record, v.start, v.judged, v.of)
+        name: OtherRecord(replace(v.record, instruments=EXACT), v.start, v.judged, v.of)
         for name, v in problem.validations.items()
         if v.record is not None
     }

@@ -160,6 +160,7 @@ def compensate(
         limits=limits,
         nearest=nearest,
         limit=limit,
+        instruments=problem.record.instruments,
     )
     draws, source = thin_draws(alone.draws, generator(seed, "draws")), f"compensate {desired.name}"
     compensation = command_from(

@@ -18,6 +18,9 @@ from bwbayes.record.io.formats import read_source
 from bwbayes.record.io.recognition import series_named
 from bwbayes.record.io.series import Source
 
+# What a file of the same columns is read by, too.
+KEPT = ("units", "fs", "voltage_is", "input", "output", "linearity")
+
 
 def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     """Return what to note of how a record's file, relative to ``folder``, was read, if anything.
@@ -26,7 +29,7 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     """
     stated = {
         key: getattr(source, key)
-        for key in ("columns", "units", "fs", "voltage_is", "covariates", "input", "output")
+        for key in (*KEPT, "columns", "covariates")
         if getattr(source, key) is not None
     }
     if not stated or source.file is None:
@@ -63,8 +66,7 @@ def column_options_from(
     if not names <= {*noted.get("all_columns", ())}:
         return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
-    stored = ("units", "fs", "voltage_is", "input", "output")
-    options = {key: noted[key] for key in noted if key in stored}
+    options = {key: noted[key] for key in noted if key in KEPT}
     further = Naming(covariates=noted.get("covariates", ())).covariate_columns
     options["covariates"] = {name: column for name, column in further.items() if column in names}
     return options | as_stated | {"columns": columns}

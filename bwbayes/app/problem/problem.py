@@ -16,6 +16,8 @@ from functools import cached_property
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.problem.column_options import record_naming
@@ -33,7 +35,7 @@ from bwbayes.app.problem.records import (
     windows_of,
     without_clock,
 )
-from bwbayes.arrays import IntArray
+from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import isolated_outliers
@@ -46,6 +48,7 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import Quantities
 from bwbayes.record import Record
+from bwbayes.record.instruments import EXACT, Scales
 from bwbayes.sampling.plan import (
     SamplingPlan,
     best_ahead,
@@ -160,6 +163,7 @@ class Problem:
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.for_record(name).single_record.training
             )
+        facts |= self.record.instruments.facts
         drive = str(Drive.of(self.posterior))
         model, noise = str(self.study.spec), self.config.model.noise
         return facts | {"drive": drive, "model": model, "noise": noise}
@@ -189,6 +193,24 @@ class Problem:
                 finding for finding in beyond if not (is_window and finding.kind == "reversals")
             ]
         return beyond_by_name
+
+    def scales(self, draws: int) -> Scales:
+        """Return the scales of the instruments for so many draws."""
+        return self.record.instruments.scales(draws, generator(self.config.seed, "instruments"))
+
+    def true_draws(self, read: FloatArray) -> FloatArray:
+        """Return draws (..., free), as the readings have them, in true um and V."""
+        if self.record.instruments == EXACT:
+            return read
+        flat, names = read.reshape(-1, read.shape[-1]), self.posterior.names
+        scales, parameters = self.scales(len(flat)), {p.name: p for p in self.parameters}
+        exponent: float | FloatArray | None = 1.0
+        if "exponent" in parameters:
+            exponent = parameters["exponent"].fixed
+        if exponent is None:
+            exponent = flat[:, names.index("exponent")]
+        factors = [scales.factor(parameters[name].unit, exponent) for name in names]
+        return (flat * np.stack(factors, axis=1)).reshape(read.shape)
 
     def with_noise(self, chosen: str) -> Problem:
         """Return the problem of a run whose noise, ``auto``, came to this one.
@@ -389,7 +411,7 @@ def _explicit(config: Config, study: Study, plan: SamplingPlan) -> Config:
         for name, source in config.records.items()
     }
     naming = ("columns", "units", "fs", "table", "displacement_file", "covariates")
-    as_read = dict.fromkeys(("signal", "voltage_is", *naming))
+    as_read = dict.fromkeys(("signal", "voltage_is", "linearity", *naming))
     validation = {
         name: v.model_copy(update={"file": f"records/{name}.h5", **as_read}) if v.another else v
         for name, v in config.validation.items()

@@ -130,6 +130,11 @@ def without_clock(config: Config, records: Mapping[str, Record]) -> tuple[Config
                 f"{place_of(name)}: is of {of.input} and {of.output} along {of.clock}, the first "
                 "record of others; give records of the same quantities"
             )
+        if record.instruments != first.instruments:
+            raise InputError(
+                f"{place_of(name)}: states other uncertainties of its units than the first record; "
+                "records are fitted together by the same instruments: state the same of all"
+            )
     if first.quantities.has_clock:
         return config, []
     model, stages = config.model, config.model.stages
@@ -254,21 +259,23 @@ def _read(
     source: RecordConfig | ValidationConfig, folder: Path, in_memory: Record | None, table: str
 ) -> Record:
     """Return the record that is in memory, or else read the source's file."""
+    naming = Naming.stated(
+        columns=source.columns,
+        units=source.units,
+        fs=source.fs,
+        table=source.table,
+        displacement_file=source.displacement_file and folder / source.displacement_file,
+        covariates=source.covariates,
+        input=source.input,
+        output=source.output,
+        linearity=source.linearity,
+    )
     if in_memory is not None:
         record = replace(in_memory, voltage_is=source.voltage_is or in_memory.voltage_is)
+        record = replace(record, instruments=record.instruments.updated(naming.instruments))
         return record.without_values(source.missing or ())
     assert source.file is not None
     try:
-        naming = Naming.stated(
-            columns=source.columns,
-            units=source.units,
-            fs=source.fs,
-            table=source.table,
-            displacement_file=source.displacement_file and folder / source.displacement_file,
-            covariates=source.covariates,
-            input=source.input,
-            output=source.output,
-        )
         record = read_named(folder / source.file, naming, source.voltage_is)
     except ColumnsError as error:
         raise error.within(table) from None

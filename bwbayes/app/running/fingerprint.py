@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bwbayes.app.config.config import dump
+from bwbayes.app.config.settings import CertificateConfig
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
@@ -106,7 +107,8 @@ def _shown(value: object) -> str:
 def state_of(problem: Problem, chain: ChainFile) -> str:
     """Return a digest of all that a result depends on."""
     depends = (
-        dump(problem.config),
+        # What a certificate says of the measurement may be written afterwards.
+        dump(problem.config.model_copy(update={"certificate": CertificateConfig()})),
         problem.digests,
         versions(problem.posterior.engine),
         chain.attributes(),

@@ -382,7 +382,7 @@ def predict_after(
     subset = thin_draws(flat, generator(seed, "draws"))
     planned = Record(voltage, None, interval=record.interval)
     source = generator(seed, f"forecast {planned.sha256}")
-    alone, own_draws = _reaching(problem, subset, of, longer, beyond)
+    alone, own_draws = reaching(problem, subset, of, longer, beyond)
 
     error, fitted_rivals = None, _rivals(rivals, of, beyond, part(watch, 0.0, 0.5))
     if fitted_rivals is not None:
@@ -446,7 +446,7 @@ def _of_another(
     """Return the bands of a record that was not fitted, from the draws of one that was."""
     record = other.record
     assert record is not None
-    alone, own_draws = _reaching(problem, draws, other.of, record, beyond)
+    alone, own_draws = reaching(problem, draws, other.of, record, beyond)
     error, fitted_rivals = None, _rivals(rivals, other.of, beyond, part(watch, 0.0, 0.5))
     if fitted_rivals is not None:
         rng = generator(problem.config.seed, f"rivals {record.sha256}")
@@ -470,7 +470,7 @@ def _rivals(
     return rivals(of, watch) if beyond else None
 
 
-def _reaching(
+def reaching(
     problem: Problem, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
 ) -> tuple[Posterior, FloatArray]:
     """Return posterior and draws of a training record, to predict another record.

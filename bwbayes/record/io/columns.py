@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.quantities import DEFAULT, DISPLACEMENT, TIME, VOLTAGE, Quantities
+from bwbayes.record.instruments import EXACT, Instruments, part_of_range, split_uncertainty
 from bwbayes.record.io.own_times import with_own_times
 from bwbayes.record.io.questions import columns_error
 from bwbayes.record.io.recognition import (
@@ -49,7 +50,8 @@ class Naming:
     units
         The unit of a quantity, where the file does not state it or states another. A number before
         it is what 1 in the column stands for, as the sensor's sensitivity: ``"0.35 um"`` for volts
-        of 0.35 um each. A minus turns the sign: ``"-um"`` is a displacement counted backwards.
+        of 0.35 um each. A minus turns the sign: ``"-um"`` is a displacement counted backwards. The
+        uncertainty of a scale, ``"0.35 +- 0.004 um"``, goes to the instruments.
     fs
         The sampling rate, Hz, in place of a time column.
     table
@@ -60,6 +62,10 @@ class Naming:
         The columns of covariates by their names; or columns that are called as these are.
     input, output
         What the voltage and the displacement are, where they are others, as ``"H (A/m)"``.
+    linearity
+        The sensor's largest departure from a straight line: ``"0.1 %"`` of the range.
+    instruments
+        How well the instruments are known, as units and linearity say.
 
     Raises
     ------
@@ -76,6 +82,8 @@ class Naming:
     covariates: Mapping[str, str] | Sequence[str] = ()
     input: str | None = None
     output: str | None = None
+    linearity: str | None = None
+    instruments: Instruments = EXACT
 
     def __post_init__(self) -> None:
         if wrong := {*QUANTITIES, "truth", ""} & self.covariate_columns.keys():
@@ -85,6 +93,7 @@ class Naming:
                 if quantity not in QUANTITIES:
                     allowed = self.quantities.say(", ".join(QUANTITIES))
                     raise InputError(f"{key}: no quantity {quantity!r}; write {allowed}")
+        self._split_units()
         self._require_units()
         for quantity, column in self.columns.items():
             if not isinstance(column, str) and (
@@ -104,6 +113,33 @@ class Naming:
             raise InputError(f"fs: {self.fs:g} Hz is no sampling rate; give a number above 0")
         if self.fs is not None and "time" in self.columns:
             raise InputError("fs: takes the place of the time column; give one of the two")
+
+    def _split_units(self) -> None:
+        """Take the uncertainties out of the units, to the instruments."""
+        units, known = dict(self.units), dict[str, float]()
+        names = {"displacement": "sensor_scale", "voltage": "amplifier_gain"}
+        for quantity, text in units.items():
+            units[quantity], uncertainty = split_uncertainty(text, f"units: {quantity}")
+            if uncertainty is not None:
+                if quantity not in names:
+                    raise InputError(f"units: {quantity}: has no uncertainty; give its unit alone")
+                known[names[quantity]] = uncertainty
+        if self.linearity is not None:
+            known["linearity"] = part_of_range(self.linearity, "linearity")
+        object.__setattr__(self, "units", units)
+        object.__setattr__(self, "instruments", replace(self.instruments, **known))
+
+    @property
+    def stated_units(self) -> dict[str, str]:
+        """The units with their uncertainties, as a user states them."""
+        uncertain = {
+            "displacement": self.instruments.sensor_scale,
+            "voltage": self.instruments.amplifier_gain,
+        }
+        return {
+            quantity: f"{unit} +- {100 * sd:.6g} %" if (sd := uncertain.get(quantity)) else unit
+            for quantity, unit in self.units.items()
+        }
 
     def _require_units(self) -> None:
         """Refuse a unit that its quantity cannot have."""

@@ -18,10 +18,11 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning, path_text
 from bwbayes.model.inputs import VoltageIs, require_voltage_is
+from bwbayes.record.instruments import Instruments
 from bwbayes.record.io.clocks import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
-from bwbayes.record.io.series import Clock
+from bwbayes.record.io.series import INSTRUMENT_NOTES, Clock
 from bwbayes.record.io.units import QUANTITIES
 
 _MINIMUM_SAMPLES = 10
@@ -89,9 +90,20 @@ def record_fields(
         "start": grid.start,
         "voltage_is": kind,
         "quantities": table.quantities,
+        "instruments": _instruments(table),
         "origin": table.notes.get("origin") or path_text(table.source.path.name),
         "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
     }
+
+
+def _instruments(table: ColumnTable) -> Instruments:
+    """Return what the file says of the instruments, with what is stated of them."""
+    texts = [table.notes.get(name) or "0" for name in INSTRUMENT_NOTES]
+    try:
+        noted = Instruments(*map(float, texts))
+    except ValueError as error:  # an InputError is one
+        raise table.error(f"{', '.join(INSTRUMENT_NOTES)}: {error}; correct them") from error
+    return noted.updated(table.naming.instruments)
 
 
 def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:

@@ -74,6 +74,7 @@ def read_record(
     covariates: Mapping[str, str] | Sequence[str] | None = None,
     input: str | None = None,
     output: str | None = None,
+    linearity: str | None = None,
 ) -> Record:
     """Read and check a record.
 
@@ -94,8 +95,9 @@ def read_record(
         the end of a path in the file: ``{"time": "t [ms]", "voltage": "U_mV", "displacement": 3}``.
     units : dict
         A column's unit, if the file does not state it: nm; -nm turns the sign; '0.35 um' is a
-        sensor's sensitivity. By quantity, ``{"displacement": "nm"}``; a sensitivity is that of 1 in
-        the column.
+        sensor's sensitivity, '0.35 +- 0.004 um' or '0.35 um +- 1.2 %' one with its standard
+        uncertainty. By quantity, ``{"displacement": "nm"}``; a sensitivity is that of 1 in the
+        column.
     fs : float
         Sampling rate, Hz, in place of a time column.
     table : int or str
@@ -110,6 +112,8 @@ def read_record(
         units may be given for "input" and "output", or by the quantities' own names.
     output : str
         What is measured, if not a displacement: 'B (T)'.
+    linearity : str
+        The sensor's largest departure from a straight line, of the range: '0.1 %'.
 
     Raises
     ------
@@ -131,6 +135,7 @@ def read_record(
         "input": input,
     }
     named |= {"displacement_file": displacement_file, "covariates": covariates, "output": output}
+    named |= {"linearity": linearity}
     naming = Naming.stated(**named)
     with naming.quantities.spoken():
         return read_named(Path(path), naming, voltage_is, need_displacement)

@@ -16,6 +16,7 @@ import struct
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import astuple
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -27,6 +28,7 @@ import numpy as np
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.quantities import DEFAULT, DISPLACEMENT, VOLTAGE
 from bwbayes.record.io.series import (
+    INSTRUMENT_NOTES,
     NOTES,
     RATES,
     Series,
@@ -113,6 +115,7 @@ def record_notes(record: Record) -> dict[str, str | float]:
         notes |= {"input_is": str(own.input), "output_is": str(own.output)}
     if not record.quantities.has_clock:
         del notes["interval_s"]
+    notes |= dict(zip(INSTRUMENT_NOTES, astuple(record.instruments), strict=True))
     return {name: value for name, value in notes.items() if value}
 
 

@@ -51,7 +51,7 @@ def columns_error(
     clocks = [s for s in candidates if s.size > 1 and rises(s)]
     timeless = "time" in missing and not clocks
     missing = [q for q in missing if not (q == "time" and timeless)]
-    columns, units = dict(naming.columns), dict(naming.units)
+    columns, units = dict(naming.columns), naming.stated_units
     proposed = {q: chosen[q] for q in unknown}  # those whose unit is open
     for quantity in missing:
         pool = clocks if quantity == "time" else sorted(candidates, key=rises)

@@ -21,10 +21,13 @@ from numpy.typing import NDArray
 from bwbayes.errors import InputError, InputWarning, one_line
 
 MAXIMUM_SAMPLES = 10**8
+# Of the instruments, in the order of their fields.
+INSTRUMENT_NOTES = ("sensor_scale_sd", "amplifier_gain_sd", "sensor_linearity")
 # What a file may say beside its numbers.
 NOTES = (
     *("voltage_is", "origin", "interval_s", "time_offset_s", "covariates"),
     *("input_is", "output_is"),
+    *INSTRUMENT_NOTES,
 )
 # What a number beside the series is called, in lower case, that is their rate, Hz, or the interval,
 # s: the power of it that is the rate.

@@ -1,0 +1,261 @@
+"""The uncertainty budget and the certificate of a run: ``fit.budget()``, ``fit.certificate()``.
+
+A certificate is a page to print: what was measured, under which conditions and with which
+instruments, as [certificate] in the config says; the model's equation, its quantities with coverage
+intervals, their budget, what was validated, and the limits of use. It is none where validation
+failed, and says so in the first line.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from importlib.metadata import version
+from typing import Any, ClassVar
+
+from bwbayes.app.fit.fitted import Run
+from bwbayes.diagnosis.validation import ValidationSummary
+from bwbayes.prediction.budget import Budget
+from bwbayes.prediction.loops import MEASURES
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Glossary,
+    Product,
+    Report,
+    Table,
+    Text,
+    standing_banner,
+)
+from bwbayes.report.run import drives_like
+from bwbayes.report.tables import budget_table
+from bwbayes.report.words import coverage_text, digits, error_text, unit_text
+from bwbayes.watching import WatchSteps, unwatched
+
+
+@dataclass(frozen=True)
+class UncertaintyBudget(Product):
+    """The budgets of a run's main quantities."""
+
+    NAME: ClassVar[str] = "budget"
+
+    budgets: tuple[Budget, ...]
+    standing: ValidationSummary = field(default_factory=ValidationSummary)
+
+    def report(self) -> Report:
+        """Return the table of the sources' shares."""
+        return Report(
+            title="Uncertainty budget",
+            banners=standing_banner(self.standing),
+            blocks=[budget_table(self.budgets, on="both")],
+            numbers={"uncertainty_budget": [budget.numbers for budget in self.budgets]},
+        )
+
+
+def budget(fit: Run, *, watch: WatchSteps = unwatched) -> UncertaintyBudget:
+    """Say which source has which share of what is not known of the main quantities.
+
+    These are d, the largest width of the loop and a predicted displacement; shares are of the
+    variance, and add up.
+
+    Parameters
+    ----------
+    fit
+        The fit to use.
+    watch
+        Called with the name of a step and the share of it that is done.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+
+    Examples
+    --------
+    bwbayes budget results/ring_bender
+    """
+    watch("budget", 0.0)
+    return UncertaintyBudget(fit.uncertainty_budgets, fit.standing)
+
+
+@dataclass(frozen=True)
+class Certificate(Product):
+    """What was found of an actuator, for those who have to rely on it.
+
+    ``stated`` is said of it by subject; ``equations`` are those of the model's parts; ``estimates``
+    have mean, standard uncertainty, coverage interval and expanded uncertainty of each quantity;
+    ``validated`` says on what, ``limits`` where it may be used; ``facts`` are software and hashes.
+    """
+
+    NAME: ClassVar[str] = "certificate"
+
+    name: str
+    stated: Mapping[str, str]
+    equations: Sequence[str]
+    estimates: Sequence[Mapping[str, Any]]
+    budgets: tuple[Budget, ...]
+    validated: Sequence[str]
+    limits: Sequence[str]
+    facts: Mapping[str, str]
+    standing: ValidationSummary
+
+    def report(self) -> Report:
+        """Return the page."""
+        banners = standing_banner(self.standing)
+        if self.standing.passed is False:
+            lines = self.standing.lines
+            banners = [Banner("bad", "VALIDATION FAILED: this is no certificate", items=lines)]
+        return Report(
+            title=f"Certificate: {self.name}",
+            banners=banners,
+            blocks=[
+                Facts([*self.stated.items()]),
+                self._table(),
+                budget_table(self.budgets),
+                Glossary(
+                    [
+                        *(("model", text) for text in self.equations),
+                        *(("validated", text) for text in self.validated),
+                        *(("limits of use", text) for text in self.limits),
+                        *self.facts.items(),
+                    ]
+                ),
+                Text("Issued by (name, date, signature): ________________________________"),
+            ],
+            numbers={
+                "name": self.name,
+                "stated": dict(self.stated),
+                "model": list(self.equations),
+                "quantities": [dict(estimate) for estimate in self.estimates],
+                "uncertainty_budget": [budget.numbers for budget in self.budgets],
+                "validation": {**self.standing.numbers, "of": list(self.validated)},
+                "limits_of_use": list(self.limits),
+                **self.facts,
+            },
+        )
+
+    def _table(self) -> Table:
+        """Return the quantities with their uncertainties."""
+        rows = []
+        for estimate in self.estimates:
+            keys = ("mean", "sd", "lower_95", "upper_95", "expanded_uncertainty")
+            mean, sd, low, high, expanded = (digits(estimate[key], estimate["sd"]) for key in keys)
+            factor = f"{estimate['coverage_factor']:.2f}"
+            unit = unit_text(estimate["unit"])
+            rows.append([estimate["name"], mean, sd, f"{low} to {high}", expanded, factor, unit])
+        note = (
+            "Propagation of distributions (JCGM 101): 95% coverage intervals are probabilistically "
+            "symmetric, 2.5% on each side; the expanded uncertainty U is half their length, k is U "
+            "over the standard uncertainty u. Voltages of loops are as the monitor reads them."
+        )
+        columns = ("Quantity", "Estimate", "u", "95% interval", "U", "k", "Unit")
+        return Table("quantities", "Quantities", columns, rows, note=note, on="both")
+
+
+def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
+    """Write one page to print on what was found of an actuator, with its uncertainties.
+
+    Object, conditions and instruments are those of [certificate] in the config. A run whose
+    validation failed gets a page that is stamped so.
+
+    Parameters
+    ----------
+    fit
+        The fit to use.
+    watch
+        Called with the name of a step and the share of it that is done.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+
+    Examples
+    --------
+    bwbayes certificate results/ring_bender
+    """
+    watch("certificate", 0.0)
+    result, problem, stated = fit.result, fit.problem, fit.problem.config.certificate
+    said = {
+        "certificate": stated.number,
+        "laboratory": stated.laboratory,
+        "object": stated.object or fit.name,
+        "conditions": stated.conditions,
+        "instruments": "; ".join(stated.instruments) or None,
+    }
+    facts = problem.facts
+    pairs = {subject: text or "not stated" for subject, text in said.items()}
+    instruments = problem.record.instruments.facts
+    for subject in ("sensor scale", "monitor scale"):
+        pairs[subject] = instruments.get(subject, "taken as exact: no uncertainty is stated")
+    if "sensor linearity" in instruments:
+        pairs["sensor linearity"] = instruments["sensor linearity"]
+    pairs |= {s: fact for s, fact in facts.items() if s.partition(" ")[0] in ("record", "fitted")}
+    validated = []
+    for name, verdict in result.validation.items():
+        scores = result.scores[name]
+        validated.append(
+            f"{verdict.where}: {verdict.status}; the 95% sensor band covers "
+            f"{coverage_text(scores, 'sensor', 95)} of its readings, NRMSE {error_text(scores)}"
+        )
+    limits = [
+        drives_like(facts)
+        if fit.standing.passed
+        else f"none to rely on: validation {fit.standing.status}",
+        "other temperatures, loads, mounts and later aging are not covered",
+    ]
+    software = {"software": f"bwbayes {version('bwbayes')}", "data, SHA-256": problem.sha256}
+    for path in (fit.folder.config, fit.folder.backend):
+        software[f"{path.name}, SHA-256"] = sha256(path.read_bytes()).hexdigest()
+    return Certificate(
+        stated.object or fit.name,
+        pairs,
+        _equations(fit),
+        _estimates(fit),
+        fit.uncertainty_budgets,
+        validated or ["nothing: no readings were held against the bands"],
+        limits,
+        software,
+        fit.standing,
+    )
+
+
+def _equations(fit: Run) -> list[str]:
+    """Return what the parts of the model say of themselves: their equations."""
+    actuator = fit.problem.posterior.datasets[0].actuator
+    parts = [actuator.hysteresis, actuator.nonlinearity, actuator.filter, actuator.creep]
+    said = []
+    for part in filter(None, [*parts, *actuator.stages]):
+        first, *lines = (
+            (inspect.getdoc(type(part)) or "").partition("\nParameters\n")[0].split("\n")
+        )
+        formulas = [line.strip().rstrip(",.") for line in lines if line.startswith("    ")]
+        said.append("; ".join([first.rstrip("."), *formulas]))
+    return [*said, f"noise: {fit.problem.config.model.noise}"]
+
+
+def _estimates(fit: Run) -> list[dict[str, Any]]:
+    """Return the actuator's free parameters, the major loop's measures, and the displacement."""
+    actuators = {p.name for p in fit.result.free if p.declared.scope == "actuator"}
+    physical = actuators & {*fit.problem.posterior.table.physical}
+    estimates = [
+        {"name": p.name, **fit.result.estimates[p.name]}
+        for p in fit.result.free
+        if p.name in physical
+    ]
+    assert fit.result.loops is not None
+    for name, measured in fit.result.loops.major.estimates.items():
+        if measured is not None:
+            words, unit = MEASURES[name]
+            estimates.append({"name": f"loop: {words.lower()}", "unit": unit, **measured.numbers})
+    last = fit.uncertainty_budgets[-1]
+    estimates.append({"name": last.name, **last.numbers})
+    for estimate in estimates:
+        half = (estimate["upper_95"] - estimate["lower_95"]) / 2
+        estimate["expanded_uncertainty"] = half
+        estimate["coverage_factor"] = half / estimate["sd"] if estimate["sd"] else 0.0
+    kept = [*("name", "unit", "mean", "sd", "lower_95", "upper_95")]
+    kept += ["expanded_uncertainty", "coverage_factor"]
+    return [{key: estimate[key] for key in kept} for estimate in estimates]

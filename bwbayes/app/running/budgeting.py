@@ -1,0 +1,103 @@
+"""Which quantities of a run get an uncertainty budget, and their values of each draw.
+
+These are the slope d (or the operator's first parameter), the largest width of the loop, and the
+displacement at the highest voltage of what is predicted: a record of its own, or else a held-out
+window, or else the training one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bwbayes.app.problem.problem import Problem
+from bwbayes.app.problem.records import generator
+from bwbayes.app.running.predictions import reaching
+from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Posterior
+from bwbayes.prediction import budget
+from bwbayes.prediction.bands import Bands
+from bwbayes.prediction.budget import Budget, Quantity, loop_width, uncertainty_budgets
+from bwbayes.prediction.initial_state import (
+    InitialStates,
+    estimate_initial_states,
+    training_initial_states,
+)
+
+# Samples that are simulated at once.
+PIECE = 400
+
+
+def run_budgets(
+    problem: Problem, draws: FloatArray, predictions: Sequence[Bands]
+) -> tuple[Budget, ...]:
+    """Return the budgets of a run from draws (draws, free) as the readings have them."""
+    posterior, instruments = problem.posterior, problem.record.instruments
+    shown = next((bands for bands in predictions if not bands.training), predictions[0])
+    name = next(
+        (name for name in ("d", *posterior.names) if _is_actuators(posterior, name)),
+        posterior.names[0],
+    )
+    unit = next(p.unit for p in problem.parameters if p.name == name)
+    quantities = [
+        Quantity(name, unit, draws[:, posterior.names.index(name)]),
+        loop_width(posterior, draws),
+        _displacement(problem, draws, shown),
+    ]
+    return uncertainty_budgets(
+        posterior, draws, quantities, instruments, problem.scales(len(draws))
+    )
+
+
+def _is_actuators(posterior: Posterior, name: str) -> bool:
+    """Tell whether a name is that of a free parameter of the actuator."""
+    free = {p.name: p for p in posterior.prior.parameters if p.fixed is None}
+    physical = name in free and name in posterior.table.physical
+    return physical and free[name].declared.scope == "actuator"
+
+
+def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Quantity:
+    """Return the displacement beyond the sensor's zero at the highest voltage of some bands."""
+    at = int(np.argmax(np.where(bands.scored(bands.mean), bands.voltage, -np.inf)))
+    added, validation = dict[str, float](), problem.validations.get(bands.name)
+    if validation is not None and validation.record is not None:
+        record, of = validation.record, validation.of
+        beyond = problem.extrapolations[bands.name]
+        rng = generator(problem.config.seed, f"budget {record.sha256}")
+
+        def begun(posterior: Posterior, own: FloatArray) -> InitialStates:
+            theta = posterior.prior.theta(own)
+            return estimate_initial_states(posterior, theta, record, validation.start, rng)
+
+        alone, own = problem.posterior.for_record(of), problem.posterior.select_draws(draws, of)
+        states = begun(alone, own)
+        reached = reaching(problem, draws, of, record, beyond)
+    else:
+        of = next(name for name in problem.records if bands.name in problem.windows(name))
+        record = problem.records[of]
+        alone, own = problem.posterior.for_record(of), problem.posterior.select_draws(draws, of)
+        rng = generator(problem.config.seed, f"budget {record.sha256}")
+        states = training_initial_states(alone, alone.prior.theta(own), rng)
+        reached = None
+    sample = int(np.argmin(np.abs(record.time - bands.time[at])))
+    inputs = record.inputs[: sample + 1]
+
+    def values(of: InitialStates) -> FloatArray:
+        last = np.empty(0)
+        for piece in of.pieces(inputs, PIECE):
+            last = piece[:, -1]
+        return last - of.mean_offset
+
+    displacement = values(states)
+    if reached is not None and reached[0] is not alone:
+        crept = begun(*reached)
+        creep = np.var(values(crept)) - np.var(displacement)
+        added[budget.CREEP] = max(float(creep), 0.0)
+    dataset = alone.single_record
+    slow, _ = dataset.noise.marginal_sd(alone.noise_of_new(alone.prior.theta(own)))
+    added[budget.MODEL] = float(np.mean(slow**2)) + (bands.model_error_sd or 0.0) ** 2
+    added[budget.STATE] = float(np.mean(states.offset_sd**2))
+    added[budget.CURVE] = problem.record.instruments.linearity_sd(dataset.extent) ** 2
+    name = f"displacement at {bands.voltage[at]:.3g} V ({bands.name}, {bands.time[at]:.4g} s)"
+    return Quantity(name, "um", displacement, added, budget.STATE, states.rows)

@@ -1,0 +1,159 @@
+"""Scales widen what they should, intervals cover with them, and budgets add up.
+
+Coverages are of 1,000 truths: a right one is off by more than 2 % once in 250 times.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bwbayes.arrays import FloatArray
+from bwbayes.calibration.replicates import replicate
+from bwbayes.prediction.bands import Bands, Kind
+from bwbayes.prediction.budget import (
+    AMPLIFIER,
+    CURVE,
+    MODEL,
+    NOISE,
+    PRIOR,
+    SENSOR,
+    Quantity,
+    uncertainty_budgets,
+)
+from bwbayes.prediction.prediction import predict_windows
+from bwbayes.record.instruments import EXACT, Instruments, Scales
+from bwbayes.record.record import Record
+from tests.calibration.test_replicates import small
+from tests.inference.linear import SAMPLES, Linear
+from tests.inference.problems import INTERVAL
+from tests.measured import keep
+
+UNSURE = Instruments(sensor_scale=0.01, linearity=0.002)
+UNITS = ("um/V", "um")
+
+
+@pytest.fixture(scope="module")
+def linear() -> Linear:
+    return Linear(("d", "offset"), "discrepancy")
+
+
+def bands_of(linear: Linear, draws: FloatArray, instruments: Instruments) -> Bands:
+    record = Record(
+        linear.posterior.single_record.voltage,
+        linear.readings,
+        interval=INTERVAL,
+        instruments=instruments,
+    )
+    windows = {"all": slice(0, SAMPLES)}
+    rng = np.random.default_rng(3)
+    return predict_windows(linear.posterior, draws, record, windows, rng)[0]
+
+
+def test_sensor_band_is_as_before_and_the_displacement_band_has_the_scale(linear: Linear) -> None:
+    draws = linear.exact.draw(1000, seed=2)
+    before, after = (bands_of(linear, draws, each) for each in (EXACT, UNSURE))
+    np.testing.assert_array_equal(before.mean, after.mean)
+    for level in (50, 90, 95):
+        np.testing.assert_array_equal(before.lower["sensor", level], after.lower["sensor", level])
+    moved = before.mean - np.mean(draws[:, 1])
+    extent = linear.posterior.single_record.extent
+    curves: dict[Kind, float] = {"parameter": 0.0, "displacement": 0.002 * extent / np.sqrt(3)}
+    for kind, curve in curves.items():
+        expected = np.sqrt(before.sd(kind) ** 2 + (0.01 * moved) ** 2 + curve**2)
+        np.testing.assert_allclose(expected, after.sd(kind), rtol=0.04)
+
+
+def covered(linear: Linear, instruments: Instruments, count: int) -> FloatArray:
+    """Return the shares of truths in 95% intervals: of d, offset and the displacement of a sample.
+
+    Truth, scale and readings are drawn; the posterior is that of the closed form.
+    """
+    rng = np.random.default_rng(5)
+    noise, rows = np.linalg.cholesky(linear.noise), linear.rows
+    weighted = np.linalg.solve(linear.noise[np.ix_(rows, rows)], linear.design[rows])
+    precision = linear.design[rows].T @ weighted + np.diag(linear.sd**-2.0)
+    covariance = np.linalg.inv(precision)
+    at = int(np.argmax(np.abs(linear.level)))
+    inside = np.empty((count, 3))
+    for number in range(count):
+        read = linear.mean + linear.sd * rng.standard_normal(2)
+        missed = linear.design @ (read - linear.mean) + noise @ rng.standard_normal(SAMPLES)
+        mean = linear.mean + covariance @ (weighted.T @ missed[rows])
+        draws = rng.multivariate_normal(mean, covariance, size=1000)
+        scale = 1 + UNSURE.sensor_scale * rng.standard_normal()
+        factor = instruments.scales(1000, rng).factor("um")[:, np.newaxis]
+        true = [*(scale * read), scale * (linear.level + linear.design @ (read - linear.mean))[at]]
+        path = linear.level[at] + (draws - linear.mean) @ linear.design[at]
+        found = factor * np.column_stack([draws, path])
+        low, high = np.quantile(found, [0.025, 0.975], axis=0)
+        inside[number] = (low <= true) & (true <= high)
+    shares: FloatArray = inside.mean(axis=0)
+    return shares
+
+
+def test_intervals_cover_truths_whose_scale_is_drawn(linear: Linear) -> None:
+    assert np.all(np.abs(covered(linear, UNSURE, 1000) - 0.95) < 0.02)
+
+
+def test_intervals_of_exact_instruments_do_not(linear: Linear) -> None:
+    d, _, displacement = covered(linear, EXACT, 300)
+    assert max(d, displacement) < 0.8
+
+
+@pytest.mark.slow
+def test_sampled_intervals_cover_truths_whose_scale_is_drawn() -> None:
+    """Of 1,000 records, simulated and sampled: right ones are outside once in 250 times."""
+    setup, instruments = small(), Instruments(sensor_scale=0.02, amplifier_gain=0.01)
+    units = {p.name: p.unit for p in setup.posterior.prior.parameters if p.fixed is None}
+    rng, inside = np.random.default_rng(6), list[FloatArray]()
+    for number in range(1000):
+        made = replicate(setup, 2, number)
+        if not made.entry["converged"]:
+            continue
+        drawn = Scales(1 + 0.02 * rng.standard_normal(1), 1 + 0.01 * rng.standard_normal(1))
+        scales = instruments.scales(len(made.draws), rng)
+        covers = []
+        for column, (name, unit) in enumerate(units.items()):
+            true = made.entry["truth"][name] * drawn.factor(unit)[0]
+            found = np.sort(made.draws[:, column] * scales.factor(unit))
+            # Of 199 draws these hold 190 of the 200 places that a truth may have.
+            covers.append(found[4] <= true <= found[194])
+        inside.append(np.array(covers))
+    assert len(inside) > 900
+    shares = np.mean(inside, axis=0)
+    cover = dict(zip(units, shares.tolist(), strict=True))
+    keep("uncertain scales", {"cover": cover, "records": len(inside)})
+    assert np.all((shares >= 0.93) & (shares <= 0.97)), cover
+
+
+def test_budget_is_that_of_the_closed_form(linear: Linear) -> None:
+    """The error of the posterior's mean has these parts of noise, discrepancy and prior."""
+    draws = linear.exact.draw(4000, seed=4)
+    instruments = Instruments(sensor_scale=0.01, amplifier_gain=0.005)
+    quantities = [Quantity("d", "um/V", draws[:, 0]), Quantity("offset", "um", draws[:, 1])]
+    scales = instruments.scales(4000, np.random.default_rng(1))
+    budgets = uncertainty_budgets(linear.posterior, draws, quantities, EXACT, scales)
+    rows, known = linear.rows, {p.name: p.fixed for p in linear.posterior.prior.parameters}
+    white = (known["sensor_sd"] or 0.0) ** 2 * np.eye(rows.size)
+    noise = linear.noise[np.ix_(rows, rows)]
+    # d alone is the actuator's: the offset belongs to the initial state.
+    column = linear.design[rows, :1]
+    weighted = np.linalg.solve(noise, column)
+    gain = 1 / (column.T @ weighted + linear.sd[0] ** -2.0)[0, 0]
+    parts = {
+        NOISE: (weighted.T @ white @ weighted)[0, 0] * gain**2,
+        MODEL: (weighted.T @ (noise - white) @ weighted)[0, 0] * gain**2,
+        PRIOR: gain**2 / linear.sd[0] ** 2,
+    }
+    variance = linear.exact.sd[0] ** 2
+    for source, part in parts.items():
+        assert part / variance == pytest.approx(budgets[0].shares[source], rel=0.02), source
+    for budget in budgets:
+        assert 1 == pytest.approx(sum(budget.shares.values()), rel=1e-12)
+    (of_d, _) = uncertainty_budgets(linear.posterior, draws, quantities, instruments, scales)
+    scaled = (of_d.mean * np.array([0.01, 0.005])) ** 2
+    assert of_d.sd == pytest.approx(np.sqrt(budgets[0].sd ** 2 + scaled.sum()), rel=1e-9)
+    assert scaled[0] / of_d.sd**2 == pytest.approx(of_d.shares[SENSOR], rel=1e-9)
+    assert scaled[1] / of_d.sd**2 == pytest.approx(of_d.shares[AMPLIFIER], rel=1e-9)
+    assert CURVE not in of_d.shares
