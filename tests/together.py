@@ -51,27 +51,15 @@ def nothing(draws: FloatArray) -> FloatArray:
     return draws
 
 
-def narrowed(draws: FloatArray) -> FloatArray:
-    """Make the sds of draws (draws, free) a fifth smaller."""
+def narrowed(draws: FloatArray, by: float = 0.2) -> FloatArray:
+    """Make the sds of draws (draws, free) smaller by a part."""
     middle = np.mean(draws, axis=0)
-    return middle + 0.8 * (draws - middle)
+    return middle + (1 - by) * (draws - middle)
 
 
-def narrowed_a_tenth(draws: FloatArray) -> FloatArray:
-    """Make the sds a tenth smaller."""
-    middle = np.mean(draws, axis=0)
-    return middle + 0.9 * (draws - middle)
-
-
-def widened(draws: FloatArray) -> FloatArray:
-    """Make the sds a quarter larger."""
-    middle = np.mean(draws, axis=0)
-    return middle + 1.25 * (draws - middle)
-
-
-def shifted(draws: FloatArray) -> FloatArray:
-    """Put a bias of 0.3 sd on every coordinate."""
-    return draws + 0.3 * np.std(draws, axis=0)
+def shifted(draws: FloatArray, sds: float = 0.3) -> FloatArray:
+    """Put a bias of so many sds on every coordinate."""
+    return draws + sds * np.std(draws, axis=0)
 
 
 def whitened_positions(result: Replicate, prior: JointPrior, plant: Plant) -> FloatArray:
