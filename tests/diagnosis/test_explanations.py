@@ -139,7 +139,12 @@ def test_an_explanation_is_worth_more_than_the_limit_where_it_is_true(
     assert bool(followed_causes([best])) is (kind in {"transient", "drift", "step", "outliers"})
 
 
-@pytest.mark.parametrize("late", [-0.2, -0.04, 0.1, 0.24])
+LATE = (-0.04, 0.24)
+
+
+@pytest.mark.parametrize(
+    "late", [-0.2, 0.1, *(pytest.param(s, marks=pytest.mark.slow) for s in LATE)]
+)
 def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     late: float, tmp_path: Path
 ) -> None:
@@ -167,8 +172,15 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     assert found.rmse[1] < found.rmse[0] / 2
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.0, 1.6])
-@pytest.mark.parametrize("name", ["d", "beta"])
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("d", 1.0),
+        ("beta", 0.5),
+        *(pytest.param("d", factor, marks=pytest.mark.slow) for factor in (0.5, 1.6)),
+        *(pytest.param("beta", factor, marks=pytest.mark.slow) for factor in (1.0, 1.6)),
+    ],
+)
 def test_a_prior_that_excludes_the_truth_is_the_cause_and_no_transient(
     name: str, factor: float, tmp_path: Path
 ) -> None:
@@ -211,7 +223,9 @@ def test_a_line_is_told_from_one_that_swells_with_the_drive(kind: str) -> None:
     assert wrong <= 4
 
 
-@pytest.mark.parametrize("time", [1.7, 2.0, 2.335, 3.9])
+@pytest.mark.parametrize(
+    "time", [2.335, *(pytest.param(time, marks=pytest.mark.slow) for time in (1.7, 2.0, 3.9))]
+)
 def test_a_step_among_readings_that_are_held_out_has_its_own_time(
     time: float, tmp_path: Path
 ) -> None:
@@ -315,7 +329,9 @@ def test_a_fit_has_not_followed_what_a_missing_part_explains_as_well() -> None:
     assert () == followed_causes([foreign(1.0)])
 
 
-@pytest.mark.parametrize("kind", ["good", "delay", "hold"])
+@pytest.mark.parametrize(
+    "kind", ["delay", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("good", "hold"))]
+)
 def test_a_thinned_record_has_the_evidence_of_as_many_readings(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
