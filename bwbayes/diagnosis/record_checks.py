@@ -31,12 +31,16 @@ from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
+# What a drive does not tell, and no fault of the readings.
+UNTOLD = ("no reversal", "one amplitude", "few readings", "no hysteresis")
+
 
 def inspect(record: Record) -> tuple[Finding, ...]:
     """Return what is wrong with a record, in the order in which to deal with it.
 
     Findings are "unlikely units", "no relation", "late voltage", "late displacement",
-    "reversed sign", "swapped columns", "few readings", "coarse sampling", "one amplitude",
+    "reversed sign", "swapped columns", "few readings", "coarse sampling", "no reversal",
+    "one amplitude",
     "held readings", "repeated samples", "clipping", "coarse resolution", "jump", "spikes",
     "switch-on transient", "drift", "no hysteresis" and "no noise". A planned voltage is looked at
     for its own sake alone.
@@ -119,6 +123,12 @@ def _plausibility(record: Record) -> Iterator[Finding]:
     if record.displacement is not None and record.readings < 100:
         text = f"{record.readings} readings, some ten for each parameter"
         yield _whole(record, "few readings", text, "record longer, or lower `decimate`")
+    ways = record.voltage, -record.voltage
+    if span and min(np.max(np.maximum.accumulate(way) - way) for way in ways) < 0.1 * span:
+        begin, end = record.voltage[[0, -1]]
+        text = f"the voltage goes one way, from {begin:.4g} to {end:.4g} V: no loop shows"
+        fix = "drive up and down, with an amplitude that varies; alpha, beta and gamma stay open"
+        yield _whole(record, "no reversal", text, fix)
     spacing = np.diff(turning_points(record.voltage, 0.1 * span))
     if spacing.size >= 3 and np.median(spacing) < 6:
         text = f"{2 * np.median(spacing):.3g} samples a period, too few to resolve the reversals"

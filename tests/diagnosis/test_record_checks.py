@@ -403,6 +403,26 @@ def test_creep_is_no_drift_and_a_drift_beside_it_is_found() -> None:
     assert sum(bool(findings_of("drift", record)) for record in drifting) >= 25
 
 
+@pytest.mark.parametrize("shape", ["step", "ramp", "falling ramp", "step back", "triangle"])
+def test_a_drive_that_goes_one_way_is_said_to_show_no_loop(shape: str) -> None:
+    """With noise on its voltage, too; one that comes back shows one."""
+    rng, along = np.random.default_rng(1), np.linspace(0, 1, 2000)
+    ramp = np.clip(1.4 * along - 0.2, 0, 1)
+    shapes = {
+        "step": along > 0.3,
+        "ramp": ramp,
+        "falling ramp": 1 - ramp,
+        "step back": (along > 0.3) & (along < 0.6),
+        "triangle": 1 - np.abs(2 * along - 1),
+    }
+    clean = 10 + 70 * shapes[shape].astype(np.float64)
+    readings = hysteresis(drawn(rng), clean) + 0.05 * rng.standard_normal(along.size)
+    voltage = clean + 0.05 * rng.standard_normal(along.size)
+    one_way = shape in ("step", "ramp", "falling ramp")
+    found = findings_of("no reversal", Record(voltage, readings, interval=1e-3))
+    assert bool(found) is one_way
+
+
 def test_a_planned_voltage_is_looked_at_too() -> None:
     steady = 5e4 * np.sin(np.arange(3000) / 30)
     kinds = [finding.kind for finding in inspect(Record(steady, None, interval=1e-3))]

@@ -38,7 +38,7 @@ from bwbayes.app.problem.records import (
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.record_checks import isolated_outliers
+from bwbayes.diagnosis.record_checks import UNTOLD, isolated_outliers
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import Parameter
@@ -88,9 +88,9 @@ class Problem:
         """
         no_matter: tuple[str, ...] = ()
         if len(self.records) > 1:
-            no_matter += ("one amplitude", "few readings", "no hysteresis")
+            no_matter += UNTOLD
         if self.config.model.hysteresis == "linear":
-            no_matter += ("one amplitude", "no hysteresis")
+            no_matter += tuple(kind for kind in UNTOLD if kind != "few readings")
         return {
             name: tuple(
                 finding

@@ -21,7 +21,7 @@ from bwbayes.app.config.config import ALONE, Config
 from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationConfig
 from bwbayes.app.problem.parameters import stand_of
 from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.record_checks import inspect
+from bwbayes.diagnosis.record_checks import UNTOLD, inspect
 from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
 from bwbayes.inference.study import place_of
 from bwbayes.model.registry import STAGES
@@ -416,7 +416,7 @@ def unlike(name: str, record: Record) -> Iterator[str]:
         fix = finding.fix
         if finding.kind == "switch-on transient":  # nothing here is fitted
             fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in ("one amplitude", "few readings", "no hysteresis"):
+        if finding.kind not in UNTOLD:
             yield f"{name}: {replace(finding, fix=fix)}"
 
 
