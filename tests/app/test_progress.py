@@ -156,9 +156,11 @@ def test_what_others_print_goes_where_it_belongs(
     assert "printed\n" == capsys.readouterr().out
 
 
-def test_of_many_calls_a_terminal_says_how_many_before_the_first_is_done() -> None:
+@pytest.mark.parametrize("terminal", [True, False])
+def test_of_many_calls_it_says_how_many_before_the_first_is_done(terminal: bool) -> None:
+    """A log, too."""
     screen = StringIO()
-    console = Console(force_terminal=True, width=100, file=screen)
+    console = Console(force_terminal=terminal, width=100, file=screen)
     options: dict[str, Any] = {
         "kind": "models judged",
         "done": 0,

@@ -167,8 +167,8 @@ def batch[T](
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
     short = dict(short)
-    with open_executor(count, executor=executor) as pool, ProgressLine(console) as line:
-        line.show(f"{kind} {done} of {total}   ETA unknown")
+    begin = f"{kind} {done} of {total}   ETA unknown"
+    with open_executor(count, executor=executor) as pool, ProgressLine(console, begin) as line:
         together = side_by_side(pool, workers, len(arguments))
         for fresh, result in enumerate(_as_done(pool, together, call, arguments), start=1):
             yield result
