@@ -16,8 +16,9 @@ from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running import fingerprint as fingerprint_module
-from bwbayes.app.running.fingerprint import require_own, version_remarks, versions
+from bwbayes.app.running.fingerprint import require_own, versions
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.remarks import version_remarks
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
 from bwbayes.sampling.storage import ChainFile

@@ -23,8 +23,9 @@ from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running import explaining
-from bwbayes.app.running.explaining import chosen_noise, lines, search_stages
+from bwbayes.app.running.explaining import chosen_noise, search_stages
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.running.remarks import lines
 from bwbayes.app.running.run import resume
 from bwbayes.diagnosis.explanations import explain, likely_causes
 from bwbayes.diagnosis.laplace import climb

@@ -28,7 +28,7 @@ from bwbayes.quantities import DEFAULT
 from bwbayes.report.report import Shown
 from bwbayes.sampling.chain import PHASES, draws, log_densities
 from bwbayes.sampling.storage import ChainFile
-from bwbayes.watching import Watch, WatchSteps, counted, parts, unwatched, watched
+from bwbayes.watching import Watch, WatchSteps, parts, unwatched, watched
 
 if TYPE_CHECKING:
     import xarray
@@ -419,41 +419,9 @@ class Run(Shown):
     @always
     def remarks(self, watch: Watch) -> tuple[str, ...]:
         """Return what to know of the record, the priors and the fit, one line each."""
-        from bwbayes.app.running.explaining import lines
-        from bwbayes.app.running.fingerprint import version_remarks, versions
-        from bwbayes.diagnosis.conflict import conflicts
-        from bwbayes.diagnosis.consistency import disagreements
-        from bwbayes.diagnosis.explanations import likely_causes
-        from bwbayes.diagnosis.identifiability import undetermined
-        from bwbayes.diagnosis.innovations import departures
+        from bwbayes.app.running.remarks import run_remarks
 
-        problem, posterior = self.problem, self.problem.posterior
-        looked_at = counted(3, watch)
-        remarks = [
-            *version_remarks(self.chain.attributes().get("versions"), versions(posterior.engine)),
-            *problem.remarks,
-            *self.outcome.remarks,
-        ]
-        looked_at(1)
-        remarks += map(str, conflicts(posterior.prior, self.flat_draws, problem.defaults))
-        looked_at(1)
-        remarks += map(str, undetermined(posterior, self.chain.point))
-        looked_at(1)
-        if not self.converged:
-            return tuple(remarks)
-        remarks += map(str, disagreements(self.consistency))
-        of = {name: f"{name}: " if len(problem.records) > 1 else "" for name in problem.records}
-        for name, whitened in self.innovations.items():
-            remarks += [f"{of[name]}{finding}" for finding in departures(whitened)]
-        for name, lock in self.drive_locks.items():
-            remarks += [f"{of[name]}{finding}" for finding in lock.findings]
-        for name, explanations in self.explanations.items():
-            remarks += [of[name] + line for line in lines(likely_causes(explanations))]
-        for bands in self.predictions:
-            remarks += [f"{bands.name}: {bands.model_error_note}"] * bool(bands.model_error_note)
-        for name, verdict in self.validation.items():
-            remarks += [f"{name}: {note}" for note in verdict.notes]
-        return tuple(remarks)
+        return tuple(run_remarks(self, watch))
 
     @property
     def _computed(self) -> dict[str, Any]:

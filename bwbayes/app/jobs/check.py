@@ -15,7 +15,8 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.explaining import choose_model, explain_record, lines
+from bwbayes.app.running.explaining import choose_model, explain_record
+from bwbayes.app.running.remarks import lines
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner

@@ -1,4 +1,4 @@
-"""Explanations that describe the readings better than the model: found, shown, and added.
+"""Explanations that describe the readings better than the model: found, and added.
 
 :func:`chosen_noise` takes the noise that the records have evidence for: each is fitted from the
 mode of the rough one, and taken if its evidence leads by odds of twenty to one: the rough
@@ -12,7 +12,7 @@ while the fit follows what the actuator did not do: no stage mends a transient.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -66,20 +66,6 @@ def _scene(problem: Problem, name: str, places: FloatArray) -> ResidualAnalysis:
         record.start,
         alone=len(problem.records) == 1,
     )
-
-
-def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
-    """Write those of the best five explanations whose odds are above twenty to one, a line each.
-
-    Not those with which the model misses more: their evidence is that of the discrepancy, which
-    takes it up.
-    """
-    for explanation in explanations[:5]:
-        without, with_it = explanation.rmse
-        worse = with_it > 1.1 * without or explanation.misleads
-        if explanation.nats > TIED and not worse:
-            text = f"{explanation.text} ({explanation.worth})"
-            yield f"explained better by: {text}. Fix: {explanation.fix}."
 
 
 def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched) -> tuple[str, str]:

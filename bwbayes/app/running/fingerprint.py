@@ -85,17 +85,6 @@ def versions(engine: Engine = "numpy") -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
-def version_remarks(noted: object, now: Mapping[str, str]) -> tuple[str, ...]:
-    """Say, in one remark, which packages have other versions than when the chain was begun."""
-    before: dict[str, str] = json.loads(str(noted)) if noted else {}
-    changed = [
-        f"{name} {before[name]}, now {now[name]}"
-        for name in now
-        if before.get(name, now[name]) != now[name]
-    ]
-    return (f"the chain was begun with other versions: {'; '.join(changed)}",) if changed else ()
-
-
 def _shown(value: object) -> str:
     """Write a value as a config does, more or less; a prior as a function of its arguments."""
     if isinstance(value, Mapping):
