@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -154,9 +155,15 @@ def test_where_no_process_starts_this_one_computes(tmp_path: Path, broken: str) 
     assert "Traceback" not in ended.stderr
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 @pytest.mark.parametrize(
-    "file", ["result.npz", "chain/start.npz", "chain/sampling-0001.npz", "chain.h5", "posterior.nc"]
+    ("file", "share"),
+    [
+        *product(["result.npz", "chain.h5", "posterior.nc"], [0.0, 0.5]),
+        *product(["chain/start.npz", "chain/sampling-0001.npz"], [0.5]),
+        pytest.param("chain/start.npz", 0.0, marks=pytest.mark.slow),
+        pytest.param("chain/sampling-0001.npz", 0.0, marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_of_which_a_file_is_cut_off_is_resumed_to_its_end(
     copy: RunFolder, file: str, share: float

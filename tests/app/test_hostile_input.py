@@ -6,8 +6,8 @@ prior draws stands in for the point fit, no misfit is explained and no page is d
 longer than all the rest, but for a few cases.
 
 The default run takes the first 150, ten of each kind, which find what befalls one case in 50 with a
-probability of 0.95; ``-m slow`` takes all. A case is made again from its number:
-``tests.app.mutations.case(SEED, number)``.
+probability of 0.95, and one noise; ``-m slow`` takes all, and chooses theirs. A case is made again
+from its number: ``tests.app.mutations.case(SEED, number)``.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.watching import Watch
+from tests.app import small
 from tests.app.mutations import KINDS, QUICK, Case, case, made
-from tests.app.small import without_progress
 from tests.measured import keep
 
 SEED = 1
@@ -74,6 +74,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pointfit, "fit", best_draw)
+    small.without_explanations(monkeypatch)
     monkeypatch.setattr(explaining, "explain", lambda *_, **__: ())
     monkeypatch.setattr(app_check, "save", lambda *_, **__: [])
 
@@ -103,7 +104,7 @@ def check(one: Case, place: Path, seconds: int = SECONDS) -> Said:
         except SystemExit as end:
             status = end.code
     assert isinstance(status, int)
-    said = without_progress(err.getvalue())
+    said = small.without_progress(err.getvalue())
     return Said(status, out.getvalue(), said, time.process_time() - begun)
 
 
@@ -185,7 +186,10 @@ def spoilt(numbers: range, place: Path) -> dict[str, Counter[int]]:
 
 
 @pytest.mark.usefixtures("quick_fit")
-def test_spoilt_inputs_are_used_or_refused_in_one_line(place: Path) -> None:
+def test_spoilt_inputs_are_used_or_refused_in_one_line(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(explaining, "chosen_noise", lambda *_: ("discrepancy", ""))
     result = spoilt(range(FEW), place)
     assert sum(counts[0] for counts in result.values()) > 0.1 * FEW, "hardly any is used"
     for kind, counts in result.items():
