@@ -6,6 +6,11 @@ as many independent draws is any of the possible ones, each as likely as the nex
 as much as it promises (simulation-based calibration). :func:`replicate` is a pure function of an
 experiment, a seed and a number, so it does not matter where, when or in which order replicates are
 made; :mod:`bwbayes.calibration.evaluation` judges many of them.
+
+Around a posterior that was sampled, truths are its draws, and each replicate's readings are fitted
+together with its own: p(θ | own, replicated) has the posterior for its prior. So ranks are even if
+the posterior is right where the record has put it (posterior SBC: Säilynoja, Schmitt, Bürkner and
+Vehtari, arXiv:2502.03279, 2025).
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import repeat
 from typing import TypedDict
 
@@ -23,6 +28,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.calibration.records import OtherRecord, Simulated, band_coverage
 from bwbayes.errors import one_line
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.prediction.prediction import predict_windows, thin_draws
@@ -56,6 +62,19 @@ class Entry(TypedDict):
 
 
 @dataclass(frozen=True)
+class Sampled:
+    """A posterior that was sampled: its ``draws`` (draws, free), and the ``point`` fit.
+
+    Parameters are in their own units.
+    """
+
+    __repr__ = brief
+
+    draws: FloatArray
+    point: MAPEstimate
+
+
+@dataclass(frozen=True)
 class CalibrationSetup:
     """The setup that all replicates share.
 
@@ -75,6 +94,9 @@ class CalibrationSetup:
     source
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
+    around
+        The posterior's own draws, if truths come from these and not from its prior. What it was
+        fitted to is then fitted with each replicate, and no bands are predicted.
     """
 
     __repr__ = brief
@@ -84,6 +106,7 @@ class CalibrationSetup:
     held_out: Mapping[str, Sequence[slice]] = field(default_factory=dict)
     others: Mapping[str, OtherRecord] = field(default_factory=dict)
     source: Posterior | None = None
+    around: Sampled | None = None
 
     @property
     def truth(self) -> Posterior:
@@ -149,6 +172,8 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
         if record.displacement is not None
     }
     posterior = experiment.posterior.with_readings(readings)
+    if experiment.around is not None:
+        posterior = _together(experiment.posterior, posterior)
     true = np.stack([theta[name] for name in posterior.prior.names], axis=1)
     names, truth = experiment.statistics, experiment.measures(posterior, true)[0]
     entry = Entry(
@@ -163,7 +188,13 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     )
     # InputError, and what linear algebra raises: one record must not end the whole calibration.
     try:
-        chain = init_chain(posterior, pointfit.fit(posterior, fitting), experiment.plan, sampling)
+        around = experiment.around
+        point = (
+            pointfit.fit(posterior, fitting)
+            if around is None
+            else pointfit.refit(posterior, around.point)
+        )
+        chain = init_chain(posterior, point, experiment.plan, sampling)
         with ThreadPoolExecutor(1) as executor:
             outcome = sample(posterior, experiment.plan, chain, executor)
     except ValueError as error:
@@ -182,6 +213,8 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
         return Replicate(entry, np.empty((0, len(names))))
     drawn = experiment.measures(posterior, posterior.prior.theta(free))
     entry["ranks"] = dict(zip(names, np.sum(drawn < truth, axis=0).tolist(), strict=True))
+    if not experiment.bands:
+        return Replicate(entry, drawn)
     # Fewer draws than a run's, to save time.
     flat = thin_draws(chained.reshape(-1, free.shape[1]), predicting, 400)
     predictions = _predictions(experiment, posterior, flat, theta, simulated, predicting, others)
@@ -193,12 +226,23 @@ def replicate(experiment: CalibrationSetup, seed: int, number: int) -> Replicate
     return Replicate(entry, drawn)
 
 
+def _together(posterior: Posterior, replicated: Posterior) -> Posterior:
+    """Return the posterior of its own readings and of replicated ones: the same parameters."""
+    datasets = posterior.datasets + replicated.datasets
+    return replace(posterior, datasets=datasets, joint=posterior.table)
+
+
 def _simulated(
     experiment: CalibrationSetup, generator: np.random.Generator
 ) -> tuple[dict[str, FloatArray], dict[str, Simulated]]:
     """Draw a truth; return it by parameter, (1,) each, and its records by name."""
-    source = experiment.truth
-    theta = source.prior.theta(source.prior.draw(generator, 1))
+    source, around = experiment.truth, experiment.around
+    free = (
+        source.prior.draw(generator, 1)
+        if around is None
+        else generator.choice(around.draws, size=1)
+    )
+    theta = source.prior.theta(free)
     column = source.table.columns(theta)
     simulated = {}
     for fitted, dataset, likelihood in zip(

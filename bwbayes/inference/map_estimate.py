@@ -87,10 +87,21 @@ def fit(
             _add_mode(posterior, modes, start_point)
     else:
         point = fit(short, generator, part(watch, 0.0, 0.5))
-        spread = point.prior_covariance
-        for start_point in watched([*point.optima], part(watch, 0.5, 1.0)):
-            _add_mode(posterior, modes, start_point, point.covariance)
+        return refit(posterior, point, part(watch, 0.5, 1.0))
     watch(1.0)
+    return _estimate(modes, spread)
+
+
+def refit(posterior: Posterior, point: MAPEstimate, watch: Watch = unwatched) -> MAPEstimate:
+    """Find the mode of a posterior from the point fit of another one with the same modes."""
+    modes: list[Mode] = []
+    for start_point in watched([*point.optima], watch):
+        _add_mode(posterior, modes, start_point, point.covariance)
+    return _estimate(modes, point.prior_covariance)
+
+
+def _estimate(modes: list[Mode], spread: FloatArray) -> MAPEstimate:
+    """Return the point fit of modes, the best first, without those that hold nothing."""
     best = modes[0]
     worth = [m.coordinates for m in modes if m.log_density > best.log_density - NEGLIGIBLE]
     optima = distinct(worth, best.covariance)

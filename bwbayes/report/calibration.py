@@ -10,7 +10,17 @@ from markupsafe import Markup
 from bwbayes.calibration.evaluation import FAMILY_LEVEL, JUDGED_FROM, Calibration
 from bwbayes.calibration.replicates import RANKED
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.report.report import Banner, Facts, Picture, Report, Section, Table, TableColumn, Text
+from bwbayes.report.report import (
+    Banner,
+    Facts,
+    Kind,
+    Picture,
+    Report,
+    Section,
+    Table,
+    TableColumn,
+    Text,
+)
 from bwbayes.report.words import circumstances, symbol, unit_text
 
 # Ranked quantities besides parameters: their names and units.
@@ -21,17 +31,24 @@ EXTRA_WORDS = {
 }
 
 
+def outcome(passed: bool, telling: bool) -> tuple[Kind, str]:
+    """Return how good a calibration's outcome is, and what it is called."""
+    if not passed:
+        return "bad", "CALIBRATION FAILED"
+    return ("good", "Passed") if telling else ("note", "Passed, with too few replicates")
+
+
 def calibration_report(calibration: Calibration) -> Report:
     """Return what a calibration says: whether it has passed, the tests, and what was run."""
     bands, unconverged = _bands(calibration), calibration.unconverged
     counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
-    if not calibration.passed:
-        verdict = Banner("bad", "CALIBRATION FAILED", [counts], calibration.failures)
-    elif calibration.telling:
-        verdict = Banner("good", "Passed", [f"{counts}; nothing speaks against the posteriors"])
-    else:
-        power = "low power: more replicates are needed to detect SDs 20% too small"
-        verdict = Banner("note", "Passed, with too few replicates", [f"{counts}; {power}"])
+    kind, headline = outcome(calibration.passed, calibration.telling)
+    lines = {
+        "bad": counts,
+        "good": f"{counts}; nothing speaks against the posteriors",
+        "note": f"{counts}; low power: more replicates are needed to detect SDs 20% too small",
+    }
+    verdict = Banner(kind, headline, [lines[kind]], calibration.failures)
     numbers = ", ".join(map(str, unconverged))
     line = f"not converged, and counted with the others: replicates {numbers}"
     facts = [*calibration.facts, *circumstances(calibration.provenance)]

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.prediction.bands import Bands
 from bwbayes.report import tables
+from bwbayes.report.calibration import outcome
 from bwbayes.report.figures.pictures import Pictures
 from bwbayes.report.figures.pictures import pictures as all_pictures
 from bwbayes.report.figures.style import title
@@ -78,7 +79,11 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
     return Report(
         title=result.name,
         about="; ".join(about),
-        banners=[*_verdict_banners(result, numbers), *remarks_banner(result.remarks)],
+        banners=[
+            *_verdict_banners(result, numbers),
+            *_calibration_banner(numbers),
+            *remarks_banner(result.remarks),
+        ],
         blocks=[*blocks, *moves, *_details(result, numbers, pictures)],
     )
 
@@ -112,6 +117,19 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
     blocks: list[Block] = [Text(f"The chain converged, but {meaning}."), glossary]
     (on_screen,) = standing_banner(standing, on="screen")
     return [replace(on_screen, items=(), blocks=blocks, on="page"), on_screen]
+
+
+def _calibration_banner(numbers: Mapping[str, Any]) -> list[Banner]:
+    """Return how a calibration around the posterior came out, if there was one."""
+    calibration = numbers.get("calibration")
+    if not calibration:
+        return []
+    kind, headline = outcome(calibration["passed"], calibration["telling"])
+    line = (
+        f"{calibration['replicates']} records simulated with draws of this posterior and fitted "
+        "together with its readings; calibration/calibration.html has the ranks"
+    )
+    return [Banner(kind, f"Calibration: {headline}", [line], calibration["failures"])]
 
 
 def drives_like(facts: Mapping[str, str]) -> str:

@@ -8,15 +8,21 @@ import shutil
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import resume, start
-from bwbayes.app.running.folder import CalibrationFolder
+from bwbayes.app.running.folder import CalibrationFolder, RunFolder
+from bwbayes.calibration.replicates import CalibrationSetup
 from bwbayes.errors import InputError
+from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction.bands import KINDS, LEVELS
+from bwbayes.sampling.plan import SamplingPlan
 from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import MODEL
@@ -194,6 +200,54 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
     page = (tmp_path / "a/calibration.html").read_text(encoding="utf-8")
     assert "CALIBRATION FAILED" in page
     assert "replicates 0, 1" in page
+
+
+# Of a run
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_run_is_calibrated_in_its_folder_and_its_report_says_so(
+    bwbayes: Type, copy: RunFolder
+) -> None:
+    """More replicates can be asked for, and none is made again; those of another run are none."""
+    command = "calibrate", "copy", "--workers", "1", "--replicates"
+    said = bwbayes(*command, 1)
+    assert said.status == 0, said.err
+    for text in ("1 replicates, 0 not converged", "report: copy/calibration/calibration.html"):
+        assert text in said.out
+    first = copy.calibration.replicates.read_bytes()
+    assert bwbayes(*command, 2).status == 0
+    assert copy.calibration.replicates.read_bytes().startswith(first)
+    numbers = json.loads(copy.summary.read_text())["calibration"]
+    assert (True, 2, []) == (numbers["passed"], numbers["replicates"], numbers["unconverged"])
+    page = (copy.path / "report.html").read_text(encoding="utf-8")
+    assert "Calibration: Passed, with too few replicates" in page
+    assert "2 records simulated with draws of this posterior" in page
+    page = (copy.calibration.path / "calibration.html").read_text(encoding="utf-8")
+    assert "draws of the posterior; each record is fitted together with the run" in page
+    bwbayes(*command, 2, "--seed", 4).assert_refused("copy: is a run, with its seed and folder")
+    state = bw.open_run(copy.path).state
+    for path in (copy.calibration.replicates, copy.calibration.summary):
+        path.write_text(path.read_text().replace(state, "another"))
+    assert bw.open_run(copy.path).calibration is None
+    bwbayes(*command, 2).assert_refused("another config or record", "--overwrite")
+
+
+@pytest.mark.usefixtures("_without_pictures")
+def test_run_that_fails_its_calibration_says_so_and_ends_with_status_four(
+    bwbayes: Type, copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where no replicate converges."""
+
+    def short(posterior: Posterior, plan: SamplingPlan, **rest: Any) -> CalibrationSetup:
+        return CalibrationSetup(posterior, replace(plan, max_steps=25), **rest)
+
+    monkeypatch.setattr("bwbayes.app.jobs.calibrate.CalibrationSetup", short)
+    said = bwbayes("calibrate", "copy", "--replicates", 1, "--workers", 1)
+    assert said.status == 4
+    assert "CALIBRATION FAILED: 1 of 1 replicates did not converge" in said.err
+    page = (copy.path / "report.html").read_text(encoding="utf-8")
+    assert "Calibration: CALIBRATION FAILED" in page
 
 
 # Bad input

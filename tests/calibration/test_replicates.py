@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from bwbayes.arrays import FloatArray
 from bwbayes.calibration import replicates as module
+from bwbayes.calibration.evaluation import Calibration, evaluate_calibration, smooth_power
 from bwbayes.calibration.records import OtherRecord
 from bwbayes.calibration.replicates import (
     RANKED,
     CalibrationSetup,
     Replicate,
+    Sampled,
     replicate,
 )
+from bwbayes.inference import map_estimate
+from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference.noise import WhiteNoise
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record.record import Record
+from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
+from bwbayes.sampling.sampler import init_chain, sample
 from tests.inference.problems import posterior_of, short_posterior
 
 # Three free parameters, so that a replicate takes a fraction of a second.
@@ -64,8 +72,8 @@ def test_entry_is_plain_and_complete(third: Replicate) -> None:
     assert [f"{kind} {level}" for kind in KINDS for level in LEVELS] == list(entry["covered"])
     assert (3, True) == (entry["number"], entry["converged"])
     assert (RANKED, len(names)) == third.draws.shape
-    for name, true, draws in zip(names, entry["truth"].values(), third.draws.T, strict=True):
-        assert sum(draw < true for draw in draws) == entry["ranks"][name]
+    for name, true, column in zip(names, entry["truth"].values(), third.draws.T, strict=True):
+        assert sum(draw < true for draw in column) == entry["ranks"][name]
 
 
 def test_replicate_that_cannot_be_fitted_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,6 +93,103 @@ def test_replicate_with_too_few_draws_is_not_ranked() -> None:
     entry = replicate(small(plan=plan), 1, 0).entry
     assert (5, False) == (entry["steps"], entry["converged"])
     assert {} == entry["ranks"] == entry["covered"]
+
+
+# Around a posterior that was sampled
+
+
+@pytest.fixture(scope="module")
+def around() -> CalibrationSetup:
+    """Return an experiment around the posterior of the first replicate's record."""
+    posterior = replace(small().posterior, engine=resolve_engine())
+    _, records = module._simulated(small(), np.random.default_rng(1))
+    reading = records["record"].record.displacement
+    assert reading is not None
+    posterior = posterior.with_readings({"record": reading})
+    point = map_estimate.fit(posterior, np.random.default_rng(2))
+    chain = init_chain(posterior, point, PLAN, np.random.default_rng(3))
+    with ThreadPoolExecutor(1) as executor:
+        assert sample(posterior, PLAN, chain, executor).converged
+    flat = draws(posterior, chain).reshape(-1, len(posterior.names))
+    plan = replace(PLAN, ahead=10, tries=4)
+    return CalibrationSetup(posterior, plan, around=Sampled(flat, point))
+
+
+def calibrated(experiment: CalibrationSetup, count: int) -> Calibration:
+    entries = [replicate(experiment, 5, number).entry for number in range(count)]
+    return evaluate_calibration(entries, np.random.default_rng(6))
+
+
+def moved(experiment: CalibrationSetup, shift: float, width: float) -> CalibrationSetup:
+    """Move the draws by so many of their sds, and make these so many times as wide."""
+    assert experiment.around is not None
+    sampled = experiment.around.draws
+    middle = np.mean(sampled, axis=0)
+    wrong = middle + shift * np.std(sampled, axis=0) + width * (sampled - middle)
+    return replace(experiment, around=replace(experiment.around, draws=wrong))
+
+
+def test_ranks_around_a_posterior_are_even(around: CalibrationSetup) -> None:
+    """One sound calibration of a hundred fails; of defects as large as below none passes."""
+    assert calibrated(around, 12).passed
+
+
+@dataclass(frozen=True)
+class Loud(WhiteNoise):
+    """White noise that is twice as loud as it says."""
+
+    def draw(
+        self,
+        theta: FloatArray,
+        samples: int,
+        generator: np.random.Generator,
+        speed: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw twice the noise."""
+        slow, white = super().draw(theta, samples, generator, speed)
+        return slow, 2 * white
+
+
+def test_twice_the_noise_is_noticed(around: CalibrationSetup) -> None:
+    """The noise's sd is then half as large again as the truth, by five of its own sds."""
+    loud = around.posterior.altered(noise=Loud())
+    failures = calibrated(replace(around, source=loud), 8).failures
+    assert any(reason.startswith("sensor_sd: ranks") for reason in failures)
+
+
+def test_draws_beside_the_posterior_are_noticed(around: CalibrationSetup) -> None:
+    """By three sds: truths then lie 1.5 of them off, which are two of both records' together."""
+    failures = calibrated(moved(around, 3.0, 1.0), 8).failures
+    assert any("ranks are not even" in reason for reason in failures)
+
+
+@pytest.mark.slow
+def test_draws_that_are_too_narrow_are_noticed_by_more_replicates(
+    around: CalibrationSetup,
+) -> None:
+    """Draws a quarter as wide: truths lie sqrt((1 + 1/16) / 2) = 0.73 times as far off.
+
+    Two hundred replicates find that in one of three parameters 99 times in 100, and pass as often
+    without it.
+    """
+    assert 1 - (1 - smooth_power(200, 0.005 / 6, 1 / 0.73)) ** 3 > 0.99
+    assert calibrated(around, 200).passed
+    failures = calibrated(moved(around, 0.0, 0.25), 200).failures
+    assert any("ranks are not even" in reason for reason in failures)
+
+
+def test_readings_of_both_enter(around: CalibrationSetup) -> None:
+    """The log density of both together is the sum, less a prior."""
+    posterior = around.posterior
+    _, records = module._simulated(around, np.random.default_rng(9))
+    reading = records["record"].record.displacement
+    assert reading is not None
+    replicated = posterior.with_readings({"record": reading})
+    places = np.random.default_rng(8).normal(size=(5, len(posterior.names)))
+    parts = posterior.log_density(places) + replicated.log_density(places)
+    both = module._together(posterior, replicated).log_density(places)
+    _, log_prior = posterior.prior.constrain(places)
+    np.testing.assert_allclose(both, parts - log_prior, rtol=1e-10)
 
 
 # Simulated records

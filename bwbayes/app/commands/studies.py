@@ -30,11 +30,13 @@ def calibrate(
     replicates: int | None,
     **options: Any,
 ) -> int:
-    """Simulation-based calibration of CONFIG: fit records simulated from its prior.
+    """Simulation-based calibration of CONFIG, or of the run whose folder CONFIG is.
 
     Each replicate draws parameters from the config's prior, simulates its record and fits it
-    as a run does. Exit status 4: the posteriors are not what they say, or more than 1% of the
-    replicates did not converge.
+    as a run does. Those of a run are drawn from its posterior, and each record is fitted together
+    with the run's: are these intervals right for this record? It is kept in the run's folder, 200
+    replicates by default, and shown in its report. Exit status 4: the posteriors are not what they
+    say, or more than 1% of the replicates did not converge.
 
     Parameters
     ----------
@@ -51,28 +53,42 @@ def calibrate(
     """
     with working():
         from bwbayes.app.config.config import load
+        from bwbayes.app.fit.fitted import open_converged
+        from bwbayes.app.jobs.calibrate import calibrate as calibrate_run
         from bwbayes.app.jobs.calibrate import resume, start
         from bwbayes.app.running.folder import CalibrationFolder
         from bwbayes.report.calibration import calibration_report
 
     new = {"out": out, "seed": seed, "overwrite": overwrite}
     _refuse_beside_resume("calibrate", resumed, new)
-    if config is None:
-        folder = CalibrationFolder.open(Path(str(resumed)))
-    else:
-        chosen = load(config).renamed(config.stem, seed)
-        path = out or Path("results") / f"{config.stem}-calibration"
+    console, standing = Console(stderr=True, quiet=quiet), ExitStatus.SUCCESS
+    options["replicates"] = replicates
+    if config is not None and config.is_dir():
+        if out is not None or seed is not None:
+            raise InputError(f"{config}: is a run, with its seed and folder; remove --seed, --out")
         with working():
-            folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)
-    with resumable(folder.resuming):
-        console = Console(stderr=True, quiet=quiet)
-        calibration = resume(folder, console, replicates=replicates, **options)
+            fit = open_converged(config)
+        folder, standing = fit.folder.calibration, fit.standing.exit_status
+        for line in fit.standing.messages:
+            click.echo(line, err=True)
+        with resumable(f"`bwbayes calibrate {config}`"):
+            calibration = calibrate_run(fit, console, overwrite=overwrite, **options)
+    else:
+        if config is None:
+            folder = CalibrationFolder.open(Path(str(resumed)))
+        else:
+            chosen = load(config).renamed(config.stem, seed)
+            path = out or Path("results") / f"{config.stem}-calibration"
+            with working():
+                folder = start(chosen, config.parent, path, replicates, overwrite=overwrite)
+        with resumable(folder.resuming):
+            calibration = resume(folder, console, **options)
     page = folder.path / "calibration.html"
     if not quiet:
         show_report(calibration_report(calibration))
         click.echo(f"report: {page}")
     if calibration.passed:
-        return 0
+        return standing
     first, *others = calibration.failures
     more = f", and {len(others)} more" if others else ""
     click.echo(f"CALIBRATION FAILED: {first}{more}; see {page}", err=True)

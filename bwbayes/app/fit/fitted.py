@@ -146,19 +146,25 @@ class Run(Shown):
         require_own(problem, self.folder.chain, self.chain.attributes())
         return problem
 
+    @property
+    def state(self) -> str:
+        """A digest of problem and chain as they are now."""
+        from bwbayes.app.running.fingerprint import state_of
+
+        return state_of(self.problem, self.chain)
+
     @cached_property
     def kept(self) -> dict[str, Any]:
         """What was computed before of the chain as it is now, by stage; nothing if it has grown."""
-        from bwbayes.app.running.fingerprint import load, state_of
+        from bwbayes.app.running.fingerprint import load
 
-        return load(self.folder.result, state_of(self.problem, self.chain)) or {}
+        return load(self.folder.result, self.state) or {}
 
     def keep(self, folder: RunFolder) -> None:
         """Write what is computed to a folder: all that neither the chain nor the config holds."""
-        from bwbayes.app.running.fingerprint import save, state_of
+        from bwbayes.app.running.fingerprint import save
 
-        state = state_of(self.problem, self.chain)
-        save(folder.result, state, {"outcome": self.outcome, **self._computed})
+        save(folder.result, self.state, {"outcome": self.outcome, **self._computed})
 
     @cached_property
     def outcome(self) -> SamplingResult:
@@ -511,9 +517,19 @@ class Run(Shown):
             "wall_s": self.seconds,
             "versions": versions(self.problem.posterior.engine),
             "data_sha256": self.problem.sha256,
+            "calibration": self.calibration,
         }
         rendered: dict[str, object] = self.quantities.rendered(numbers)
         return rendered
+
+    @property
+    def calibration(self) -> dict[str, Any] | None:
+        """How ``bwbayes calibrate`` came out for the run as it is now; None if it was not run."""
+        numbers = self.folder.calibration.numbers()
+        if numbers.get("of") != self.state:
+            return None
+        names = ("passed", "telling", "failures", "replicates", "unconverged")
+        return {name: numbers[name] for name in names}
 
     @cached_property
     def posterior(self) -> Any:

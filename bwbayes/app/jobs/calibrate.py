@@ -1,10 +1,11 @@
-"""Simulation-based calibration of a config's posterior, from first replicate to last file.
+"""Simulation-based calibration of a config or a run, from first replicate to last file.
 
 :func:`start` makes the folder: the config with every prior an explicit number, the same for all
 replicates. :func:`resume` makes whatever replicates are missing, side by side, writes a line for
 each, and judges them all. Each replicate depends on the config, the seed and its number alone, so
 it does not matter in how many pieces or with how many workers a calibration is done. Replicates of
-another config or record are refused.
+another config or record are refused. :func:`calibrate` does the same around the posterior of a run,
+whose folder keeps it.
 """
 
 from __future__ import annotations
@@ -24,19 +25,25 @@ from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder
 from bwbayes.app.running.progress import StepProgress, batch
+from bwbayes.app.running.run import redraw
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, replicate
+from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, Sampled, replicate
 from bwbayes.errors import InputError
+from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.instruments import EXACT
 from bwbayes.report.calibration import calibration_report
 from bwbayes.report.outputs import save
+from bwbayes.sampling.chain import draws
+
+AROUND = "draws of the posterior; each record is fitted together with the run's own readings"
 
 
 class _Request(BaseModel):
@@ -112,56 +119,113 @@ def resume(
     """
     with folder.locked(), one_thread():
         problem = resolve_config(load(folder.config), folder.path)
-        common, identity, seed = experiment(problem), _identity(problem), problem.config.seed
-        requested, entries = _read(folder, common, identity)
-        if replicates not in (None, requested):
-            requested = replicates or requested
-            _append(folder, _Request(replicates=requested, of=identity).model_dump_json())
-        # The summary is the sign that all is done; now there is more to do.
-        for path in (folder.summary, folder.path / "calibration.html"):
-            path.unlink(missing_ok=True)
-        shutil.rmtree(folder.path / "figures", ignore_errors=True)
-        unconverged = sum(not entry["converged"] for entry in entries.values())
-        for result in batch(
-            replicate,
-            [(common, seed, number) for number in range(requested) if number not in entries],
-            lambda result: "" if result.entry["converged"] else "not converged",
-            console=console,
-            kind="replicate",
-            done=len(entries),
-            short={"not converged": unconverged},
-            workers=workers,
-            executor=executor,
-        ):
-            entries[result.entry["number"]] = result.entry
-            _append(folder, json.dumps(result.entry))
-        with StepProgress(console, "judging and drawing ...") as watch:
-            ordered = [entries[number] for number in sorted(entries)]
-            plan, packages = problem.plan, versions(problem.posterior.engine)
-            calibration = replace(
-                evaluate_calibration(ordered, generator(seed, "ranks")),
-                name=problem.config.name or "calibration",
-                parameters=problem.parameters,
-                quantities=problem.quantities,
-                facts=[
-                    *problem.facts.items(),
-                    ("held out", ", ".join(problem.validations) or "nothing"),
-                    (
-                        "sampling",
-                        f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS "
-                        f"{plan.ess:g}, at most {plan.max_steps} steps",
-                    ),
-                ],
-                provenance={"seed": seed, "data_sha256": problem.sha256, "versions": packages},
-            )
-            # Nothing in its files depends on when or how it was computed.
-            save(
-                calibration_report(calibration),
-                folder.path,
-                "calibration",
-                pictures="figures",
-                watch=partial(watch, "figures"),
-            )
+        common, identity = experiment(problem), _identity(problem)
+        return _finish(folder, problem, common, identity, console, replicates, workers, executor)
+
+
+def calibrate(
+    fit: Run,
+    console: Console,
+    *,
+    replicates: int | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    executor: str | Executor | None = None,
+) -> Calibration:
+    """Calibrate the posterior of a run that has converged, and keep that in its folder.
+
+    Each replicate is made with a draw of the posterior, along the run's voltage, and fitted
+    together with the run's readings. All else is as in :func:`resume`, by default of 200
+    replicates; ``overwrite`` begins anew. Report and summary of the run are written again.
+    """
+    fit.require_converged()
+    problem, folder, plan = fit.problem, fit.folder.calibration, fit.problem.plan
+    flat = draws(problem.posterior, fit.chain).reshape(-1, len(problem.posterior.names))
+    flat = thin_draws(flat, generator(problem.config.seed, "truths"))
+    # A rank among 199 draws needs no more.
+    plan = replace(plan, ess=min(plan.ess, 2.0 * RANKED))
+    common = CalibrationSetup(problem.posterior, plan, around=Sampled(flat, fit.chain.point))
+    with fit.folder.locked(), one_thread():
+        if overwrite or not folder.replicates.exists():
+            shutil.rmtree(folder.path, ignore_errors=True)
+            folder.path.mkdir()
+            request = _Request(replicates=replicates or 200, of=fit.state)
+            _append(folder, request.model_dump_json())
+        calibration = _finish(
+            folder, problem, common, fit.state, console, replicates, workers, executor
+        )
+    with StepProgress(console, "writing the run's report ...") as watch:
+        redraw(fit.folder, watch)
+    return calibration
+
+
+def _finish(
+    folder: CalibrationFolder,
+    problem: Problem,
+    common: CalibrationSetup,
+    identity: str,
+    console: Console,
+    replicates: int | None,
+    workers: int | None,
+    executor: str | Executor | None,
+) -> Calibration:
+    """Make the missing replicates of a problem, judge all, and write the files of a folder."""
+    seed, plan = problem.config.seed, common.plan
+    requested, entries = _read(folder, common, identity)
+    if replicates not in (None, requested):
+        requested = replicates or requested
+        _append(folder, _Request(replicates=requested, of=identity).model_dump_json())
+    # The summary is the sign that all is done; now there is more to do.
+    for path in (folder.summary, folder.path / "calibration.html"):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder.path / "figures", ignore_errors=True)
+    unconverged = sum(not entry["converged"] for entry in entries.values())
+    for result in batch(
+        replicate,
+        [(common, seed, number) for number in range(requested) if number not in entries],
+        lambda result: "" if result.entry["converged"] else "not converged",
+        console=console,
+        kind="replicate",
+        done=len(entries),
+        short={"not converged": unconverged},
+        workers=workers,
+        executor=executor,
+    ):
+        entries[result.entry["number"]] = result.entry
+        _append(folder, json.dumps(result.entry))
+    with StepProgress(console, "judging and drawing ...") as watch:
+        ordered = [entries[number] for number in sorted(entries)]
+        packages = versions(problem.posterior.engine)
+        calibration = replace(
+            evaluate_calibration(ordered, generator(seed, "ranks")),
+            name=problem.config.name or "calibration",
+            parameters=problem.parameters,
+            quantities=problem.quantities,
+            facts=[
+                *problem.facts.items(),
+                ("truths", "the prior's draws" if common.around is None else AROUND),
+                ("held out", ", ".join(common.bands and problem.validations) or "nothing"),
+                (
+                    "sampling",
+                    f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS "
+                    f"{plan.ess:g}, at most {plan.max_steps} steps",
+                ),
+            ],
+            provenance={
+                "seed": seed,
+                "data_sha256": problem.sha256,
+                "versions": packages,
+                "of": identity,
+            },
+        )
+        # Nothing in its files depends on when or how it was computed.
+        save(
+            calibration_report(calibration),
+            folder.path,
+            "calibration",
+            pictures="figures",
+            watch=partial(watch, "figures"),
+        )
     return calibration
 
 

@@ -178,6 +178,11 @@ class RunFolder(Folder):
                 draft.replicates.write_bytes(mark)
         return cls(path)
 
+    @property
+    def calibration(self) -> CalibrationFolder:
+        """The files of the calibration around its posterior, if there was one."""
+        return CalibrationFolder(self.path / "calibration")
+
     def problem(self) -> Problem:
         """Return what its config and records say."""
         from bwbayes.app.config.config import load

@@ -198,6 +198,8 @@ def copy_run(fit: Run, path: Path, overwrite: bool) -> RunFolder:
     with folder.locked():
         shutil.copytree(fit.folder.chain, folder.chain)
         shutil.copyfile(fit.folder.backend, folder.backend)
+        if fit.folder.calibration.path.exists():
+            shutil.copytree(fit.folder.calibration.path, folder.calibration.path)
         write_files(fit, folder, FigureWorker())
         # Predictions that were asked for now may have needed them.
         for original, copy in (
