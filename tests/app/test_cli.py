@@ -132,6 +132,7 @@ def test_a_text_that_is_neither_config_nor_record_is_called_so(
         bwbayes(command, name).assert_refused(f"{name}: is no config, and no record; a config has")
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
     bwbayes: Type, tmp_path: Path
 ) -> None:

@@ -100,6 +100,7 @@ def test_resolved_config_resolves_to_the_same_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
 
 
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_a_run_resolves_once_and_reads_each_record_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

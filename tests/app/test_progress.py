@@ -184,7 +184,7 @@ COMMANDS = {
 }
 
 
-@pytest.mark.usefixtures("copy", "_without_pictures")
+@pytest.mark.usefixtures("copy", "_without_pictures", "_without_explanations")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
     bwbayes: Type, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str

@@ -21,6 +21,7 @@ from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Waveform
+from tests.app import small
 from tests.app.conftest import Type
 
 OWN = "time_s,voltage_V,displacement_um"
@@ -210,7 +211,7 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     write: Write, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where `check` shows what a run refuses; what its misfit comes from takes longer than all."""
-    monkeypatch.setattr("bwbayes.app.running.explaining.explain", lambda *_, **__: ())
+    small.without_explanations(monkeypatch)
     path = write(change=_turned)
     done = command("check", path, "--out", path.parent / "page")
     assert 0 == done.return_value

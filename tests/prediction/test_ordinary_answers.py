@@ -64,7 +64,7 @@ def answers(seed: int, folder: Path, gain: float = 1.0) -> dict[str, BandValidat
         [validation.other]
         file = "another.h5"
     """
-    return dict(judge(problem_of(text, folder), generator).validation)
+    return dict(judge(problem_of(text, folder), generator, again=False).validation)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.2])
