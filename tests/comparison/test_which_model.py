@@ -30,6 +30,7 @@ from bwbayes.app.running.run import begin
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.compared import Comparison
 from bwbayes.record import Record
+from tests.app import small
 from tests.measured import keep
 
 NINE = (
@@ -160,7 +161,10 @@ def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(
     assert np.sum(near) >= 18
 
 
-def test_a_record_without_hysteresis_is_said_to_have_none(tmp_path: Path) -> None:
+def test_a_record_without_hysteresis_is_said_to_have_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small.without_explanations(monkeypatch)
     record, _ = plant("linear", 1)
     names = ["bouc-wen + white", "linear + white"]
     assert record.displacement is not None
