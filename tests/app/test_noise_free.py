@@ -10,6 +10,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
+from tests.app import small
 
 TIME = 0.005 * np.arange(400)
 VOLTAGE = 60 * np.exp(-0.1 * TIME) * np.sin(2 * np.pi * TIME)
@@ -19,7 +20,8 @@ EXACT = 0.7 * VOLTAGE - np.ravel(bw.hysteresis(VOLTAGE, **TRUTH))
 
 def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
     record = bw.Record.from_arrays(voltage, displacement, interval=0.005)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
         warnings.simplefilter("ignore")
         return bw.fit(
             record, dynamics="none", noise="white", search="none", ess=200, progress=False
