@@ -171,7 +171,7 @@ class Verb:
         }
 
 
-# Of a run.
+# Verbs of a run.
 VERBS = (
     Verb(
         "bwbayes.app.jobs.predict:predict",
@@ -199,7 +199,7 @@ VERBS = (
 
 PAIR = "--voltage FILE and --displacement FILE"
 
-# All others: from a record to a run, many of them, and what there is without any.
+# All other verbs: from a record to a run, many of them, and what there is without any.
 COMMANDS = (
     Verb("bwbayes.app.commands.fitting:init", either={"RECORD": "RECORD,", "--voltage FILE": PAIR}),
     Verb(

@@ -52,7 +52,7 @@ class ConfigProposal:
 
     @property
     def blocking_issue(self) -> Finding | None:
-        """What makes a fit pointless, if anything."""
+        """The first finding that makes a fit pointless, if any."""
         kinds = ("no relation", "reversed sign", "swapped columns", "late voltage")
         return next((finding for finding in self.findings if finding.kind in kinds), None)
 

@@ -4,8 +4,8 @@
 makes one. Without a folder of one's own it lives in a temporary one, as long as the object does.
 
 Its stages are computed once, when first asked for, and kept in its folder. A stage knows what it
-needs and asks for that. Progress and figures listen to stages; no computation knows of them. To
-open a run is to read files: a stage loads what it needs when it is computed.
+needs and asks for that. Progress and figures listen to stages; no computation knows of them.
+Opening a run only reads files: a stage loads what it needs when it is computed.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ VOLTAGE_NOISE = "voltage_noise_covariance"
 class RunStage[T](cached_property[T]):
     """A stage of a run, from the function that computes it, of the run and a watch.
 
-    What an earlier process has kept is not computed again. Unless a stage is there ``always``, to
-    ask for it without convergence raises a NotConvergedError.
+    A result that an earlier process has kept is not computed again. Asking for a stage without
+    convergence raises a NotConvergedError, unless the stage is there ``always``.
     """
 
     def __init__(self, compute: Callable[[Any, Watch], T], *, always: bool = False) -> None:
@@ -133,7 +133,7 @@ class Run(Shown):
 
     @cached_property
     def problem(self) -> Problem:
-        """What was fitted: config in explicit numbers, record, priors.
+        """The fitted problem: config in explicit numbers, record, priors.
 
         Raises
         ------
@@ -155,7 +155,7 @@ class Run(Shown):
 
     @cached_property
     def kept(self) -> dict[str, Any]:
-        """What was computed before of the chain as it is now, by stage; nothing if it has grown."""
+        """Results computed before from the chain as it is now, by stage; none if it has grown."""
         from bwbayes.app.running.fingerprint import load
 
         return load(self.folder.result, self.state) or {}
@@ -261,7 +261,7 @@ class Run(Shown):
 
     @cached_property
     def background(self) -> ValidationContext:
-        """What the validation of bands needs to know of the fit."""
+        """Facts about the fit that the validation of bands needs."""
         from bwbayes.diagnosis.validation import ValidationContext
 
         return ValidationContext.of(self.problem.posterior, self.flat_draws)
@@ -357,7 +357,7 @@ class Run(Shown):
         if of not in fitted:
             rng = generator(problem.config.seed, f"rivals of {problem.records[of].sha256}")
             fitted[of] = fit_rivals(problem.study.for_record(of), rng, watch)
-            # What predicts elsewhere may only read the folder.
+            # A process that predicts elsewhere may have no right to write to the folder.
             with suppress(OSError):
                 save(path, state, fitted)
         rivals: tuple[Rival, ...] = fitted[of]
@@ -431,7 +431,7 @@ class Run(Shown):
 
     @property
     def _computed(self) -> dict[str, Any]:
-        """What is computed by now, by stage."""
+        """Results computed by now, by stage."""
         return {name: vars(self)[name] for name in STAGES if name in vars(self)}
 
     def compute(
@@ -465,7 +465,7 @@ class Run(Shown):
 
     @property
     def quantities(self) -> Quantities:  # type: ignore[override]
-        """What its records are of, in whose words it is shown."""
+        """Quantities of its records, in whose words it is shown."""
         return self.problem.quantities
 
     @cached_property

@@ -78,7 +78,7 @@ STATUSES = {
     "passed": ExitStatus.SUCCESS,
 }
 
-# What a population needs of a run, in the run's folder.
+# File in a run's folder with the numbers that a population needs.
 SPECIMEN = "specimen.npz"
 
 
@@ -201,7 +201,7 @@ class Campaign(Product):
 
     @property
     def notes(self) -> list[str]:
-        """What is short, and what lies off the population, a line each."""
+        """Records that fell short, and outliers of the population, a line each."""
         notes = [f"{name}: {why}" for name, why in self.short.items()]
         return notes + [
             f"{n}: off the population in {', '.join(o)}" for n, o in self.outliers.items()

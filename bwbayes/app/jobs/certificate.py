@@ -82,7 +82,7 @@ def budget(fit: Run, *, watch: WatchSteps = unwatched) -> UncertaintyBudget:
 
 @dataclass(frozen=True)
 class Certificate(Product):
-    """What was found of an actuator, for those who have to rely on it.
+    """Findings on an actuator, for those who have to rely on it.
 
     ``stated`` is said of it by subject; ``equations`` are those of the model's parts; ``estimates``
     have mean, standard uncertainty, coverage interval and expanded uncertainty of each quantity;

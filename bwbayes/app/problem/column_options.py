@@ -18,7 +18,7 @@ from bwbayes.record.io.formats import read_source
 from bwbayes.record.io.recognition import series_named
 from bwbayes.record.io.series import Source
 
-# What a file of the same columns is read by, too.
+# Options by which another file of the same columns is read, too.
 KEPT = ("units", "fs", "voltage_is", "input", "output", "linearity")
 
 

@@ -128,7 +128,7 @@ class Problem:
 
     @property
     def quantities(self) -> Quantities:
-        """What its records are of, in whose words all is said."""
+        """Quantities of its records, in whose words all is said."""
         return self.record.quantities
 
     @property

@@ -3,7 +3,7 @@
 :func:`chosen_noise` takes the noise that the records have evidence for: each is fitted from the
 mode of the rough one, and taken if its evidence leads by odds of twenty to one: the rough
 discrepancy claims least, because it has white noise as a limit, and corners that a smooth one has
-not. What another noise could gain shows in the rough one's innovations, which are cheap to look at.
+not. The rough one's innovations, which are cheap to compute, show what another noise could gain.
 
 :func:`search_stages` gives a model the stages for which its record has evidence. None is added
 while the fit follows what the actuator did not do: no stage mends a transient.
@@ -94,7 +94,7 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
         spec = replace(problem.study.spec, noise=_beside(noise, sensor))
         other = problem.study.with_model(spec).posterior
-        # What only the other noise has starts at its prior's median.
+        # Parameters that only the other noise has start at their priors' medians.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
         places = np.stack([named.get(name, nothing) for name in other.names], axis=1)
@@ -107,7 +107,7 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
             )
             for (name, fit), of_record in parts([*rough.items()], of_noise)
         ]
-        # Not one that takes up the readings, of which it would tell nothing anew.
+        # A noise that takes up the readings itself is no explanation of them.
         if all(fit.follows for fit in fits):
             evidence[noise] = sum(fit.log_evidence for fit in fits)
     watch(1.0)
@@ -199,7 +199,7 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
             del notes[chosen.kind]
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(explanations)):
-            # Of those that tie a stage before another hold, and the one with the fewest parameters.
+            # A tie goes to a stage before another hold, then to the fewest parameters.
             chosen, chain = min(parts, key=partial(_size, problem)), problem.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)

@@ -2,14 +2,14 @@
 
 Draws are stored as coordinates of one posterior: of a model, priors, bounds, fixed values, windows
 and readings. Under any other they mean something else, so a chain notes the posterior it was
-sampled from, and whoever goes on with the chain, or reads it, compares. What does not change the
-posterior may change: names, the target and budget of the sampling, the engine (which has a check
-of its own), and what is predicted.
+sampled from, and code that resumes or reads the chain compares. Settings that leave the posterior
+as it is may change: names, the target and budget of the sampling, the engine (which has a check of
+its own), and predictions.
 
-To open a run is to read files. The one that holds what was worked out of a chain has arrays and a
-text that says how dataclasses are made of them, after a digest of both. Nothing in it is run: only
-dataclasses of this package come out of it. It belongs to one state of the run; what belongs to
-another one, or is damaged, is worked out again.
+Opening a run only reads files. The file with the results worked out of a chain begins with a
+digest of the rest: arrays, and a text that says how dataclasses are made of them. Nothing in it is
+run: only dataclasses of this package come out of it. It belongs to one state of the run; the
+results of another state, or of a damaged file, are worked out again.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _shown(value: object) -> str:
 def state_of(problem: Problem, chain: ChainFile) -> str:
     """Return a digest of all that a result depends on."""
     depends = (
-        # What a certificate says of the measurement may be written afterwards.
+        # A certificate's statements about the measurement may be written afterwards.
         dump(problem.config.model_copy(update={"certificate": CertificateConfig()})),
         problem.digests,
         versions(problem.posterior.engine),

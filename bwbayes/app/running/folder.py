@@ -42,7 +42,7 @@ class Folder:
 
     path: Path
 
-    # What it holds, patterns of what it has and has not in it, and what begins and resumes it.
+    # Its content, patterns of files it has and lacks, and commands that begin and resume it.
     KIND: ClassVar[str]
     HAS: ClassVar[tuple[str, ...]]
     LACKS: ClassVar[tuple[str, ...]] = ()
@@ -51,7 +51,7 @@ class Folder:
 
     @property
     def resuming(self) -> str:
-        """What resumes it, for messages."""
+        """The command that resumes it, for messages."""
         return f"`{self.RESUME.format(path=str(self.path))}`"
 
     def is_of_its_kind(self) -> bool:
@@ -334,7 +334,7 @@ class CampaignFolder(Folder):
             return False
 
 
-# What a run's folder has once it came to its end.
+# File that a run's folder has once the run came to its end.
 ENDED = "ended.json"
 
 

@@ -65,7 +65,7 @@ from bwbayes.watching import Watch, part, unwatched
 type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]
 """Rivals of the model on a training record, by its name; None unless its error follows the drive.
 
-To be called with a watch: they may have to be fitted."""
+The call takes a watch, because the rivals may have to be fitted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,7 +105,7 @@ class Prediction(Product, Bands):
 
     @property
     def notes(self) -> list[str]:
-        """What is to be known: where the drive extrapolates, and what does not hold."""
+        """Notes on the bands: where the drive extrapolates, and what does not hold."""
         return [*(f"{self.name}: {remark}" for remark in self.remarks), *self.standing.messages]
 
     @property
@@ -309,8 +309,8 @@ def _from_rest_remark(
 ) -> str:
     """Say what it would change to declare a record from rest.
 
-    Nothing unless it may start so, or where width and coverage stay the same to a tenth. Of every
-    fourth draw.
+    The text is empty if the record cannot start so, or if width and coverage stay the same to a
+    tenth. The change is computed from every fourth draw.
     """
     record, start = other.record, other.start
     assert record is not None

@@ -42,7 +42,7 @@ class ProgressLine(Live):
             console=console,
             transient=True,
             auto_refresh=redrawn,
-            # What others print stands above the line, but where there is none, and in a file.
+            # Other output goes above the line, unless there is no line or the output is a file.
             redirect_stdout=redrawn and sys.stdout.isatty(),
             redirect_stderr=redrawn,
         )

@@ -1,4 +1,4 @@
-"""What to know of a run: of its record and priors, its sampling, and what the model may miss."""
+"""Remarks on a run: on its record and priors, its sampling, and what the model may miss."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def run_remarks(run: Run, watch: Watch = unwatched) -> list[str]:
 def lines(explanations: Sequence[Explanation]) -> Iterator[str]:
     """Write those of the best five explanations whose odds are above twenty to one, a line each.
 
-    Not those with which the model misses more: their evidence is that of the discrepancy, which
-    takes it up.
+    Explanations with which the model misses more are left out: their evidence is that of the
+    discrepancy, which takes the error up.
     """
     for explanation in explanations[:5]:
         without, with_it = explanation.rmse

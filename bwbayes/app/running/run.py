@@ -84,7 +84,7 @@ def resume(
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
         sampling = config.sampling.model_copy(update=targets)
-        # What computes is refused before anything is computed for it.
+        # An executor that cannot be used is refused before anything is computed for it.
         with open_executor(workers, resolve_engine(sampling.engine), executor) as pool:
             if targets:
                 _rewrite(folder, config.model_copy(update={"sampling": sampling}))

@@ -39,7 +39,7 @@ from threadpoolctl import threadpool_limits
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.inference.engine import Engine
 
-# What `--executor` may say; a cluster goes by its address besides, dask://HOST:PORT.
+# Values of `--executor`; a cluster also goes by its address, dask://HOST:PORT.
 KINDS = ("local", "threads", "processes", "dask")
 
 # Seconds to wait for a scheduler, and for its first worker.
@@ -157,7 +157,7 @@ def processes(count: int, method: Literal["spawn", "fork"] = "spawn") -> Iterato
             started = _starts(pool, count)
         yield ByValue(pool) if started else None
     except BaseException:
-        # Whoever is interrupted does not wait for the end of what nobody will read.
+        # An interrupted caller does not wait for results that nobody will read.
         for process in [*(pool._processes or {}).values()]:
             process.kill()
         raise
@@ -261,7 +261,7 @@ def _cluster(address: str, workers: int | None) -> Iterator[ByValue]:
         The scheduler is gone, or workers die under one call.
     """
     dask, distributed = _dask()
-    # What a person has to know is said in one line; the rest is for those who run the cluster.
+    # One line tells the user the problem; these logs are for those who run the cluster.
     for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     scheduler: Any = f"tcp://{address}"
