@@ -165,7 +165,7 @@ def follow(
     skipped
         As in :meth:`~bwbayes.inference.state_space.Noise.whiten`.
     along
-        What goes along the readings, as :func:`run` does.
+        Function that goes along the readings, as :func:`run` does.
     """
     models, count, readings = series.shape
     states, size = noise.states, noise.states + count - 1

@@ -197,7 +197,8 @@ class Likelihood:
         that it has in effect.
 
         ``displacement`` (models, readings), um, takes the place of what the actuator does from rest
-        at θ, if it is given. Of fewer of them models take one after the other, in turn.
+        at θ, if it is given. If it has fewer rows than there are models, they take its rows in
+        turn.
         """
         products, log_determinant = self.products_of_series(theta, shapes, displacement)
         start, end = self._integrated(theta, products, log_determinant), 1 + self.unknowns

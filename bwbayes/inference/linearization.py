@@ -65,8 +65,8 @@ def gradient_and_hessian(
     """Return a function's gradient (free,) and Hessian (free, free) at w = 0.
 
     ``function`` maps (models, free) to (models,), in one call; ``value`` is f(0), if it is known.
-    Of several functions side by side, (models, functions), these come last: (free, functions) and
-    (free, free, functions).
+    If ``function`` is several side by side, (models, functions), these come last in the results:
+    (free, functions) and (free, free, functions).
     With f± a ``step`` h along a coordinate, or along two,
 
         gᵢ = (fᵢ₊ − fᵢ₋) / 2h,   Hᵢⱼ = (fᵢⱼ₊ + fᵢⱼ₋ − fᵢ₊ − fᵢ₋ − fⱼ₊ − fⱼ₋ + 2f) / 2h²,

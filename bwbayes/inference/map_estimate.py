@@ -219,7 +219,7 @@ def _zero_noise_starts(
 def _exchanged_starts(posterior: Posterior, start_point: FloatArray) -> list[FloatArray]:
     """Return starts (free,) with two time constants of lags in a row exchanged, where possible.
 
-    Of lags that differ, one is the actuator's and one the sensor's. The other way round they do
+    If two lags differ, one is the actuator's and one the sensor's. The other way round they do
     nearly the same, in another mode, which no step from the first one finds.
     """
     prior, starts = posterior.prior, []

@@ -207,8 +207,8 @@ class Posterior:
         """Log likelihood (models,) at θ (models, parameters): the sum over the records.
 
         ``displacement`` (models, readings), um, takes the place of what models do from rest, if it
-        is known; readings are those of all records, one after the other. Of fewer models take one
-        after the other, in turn.
+        is known; readings are those of all records, one after the other. If ``displacement``
+        has fewer rows than there are models, models take its rows in turn.
         """
         total = np.zeros(len(theta))
         of_records = zip(self.datasets, self.likelihoods, self._columns, strict=True)

@@ -79,7 +79,7 @@ class TrainingRecord:
 
     @cached_property
     def ranges(self) -> Ranges:
-        """What default priors may know of its windows."""
+        """Ranges in its windows, which default priors may depend on."""
         return ranges_of(self.record.inputs, self.displacement, self.windows)
 
 
@@ -113,7 +113,7 @@ class Study:
 
     @property
     def quantities(self) -> Quantities:
-        """What the records are of."""
+        """Quantities of the records."""
         return next(iter(self.records.values())).record.quantities
 
     def with_model(self, spec: ModelSpec, added: Mapping[str, Stated] | None = None) -> Self:
