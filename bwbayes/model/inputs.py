@@ -43,13 +43,13 @@ class Inputs:
     start
         Time of the first sample, s.
     voltage_is
-        What the voltage is: ``"command"``, which is held until the next sample, or ``"output"``,
+        Kind of voltage: ``"command"``, which is held until the next sample, or ``"output"``,
         which goes straight to it.
     covariates
         Further columns (samples,) by name.
     quantities
-        What the voltage is, what comes out, and whether there is a clock; all numbers are in their
-        units.
+        Quantities of voltage and displacement, and whether there is a clock; all numbers are in
+        their units.
     """
 
     __repr__ = brief

@@ -45,7 +45,7 @@ class Delay(Stage):
             "V/s",
             r"v_{\delta}",
             "speed of the voltage before the record",
-            # Of a triangle's slope, twice.
+            # Twice the slope of a triangle.
             lambda context: normal(0.0, 4 * context.ranges.voltage / context.ranges.time),
             scope="record",
             at_rest=0.0,

@@ -142,6 +142,6 @@ class SensorLag(_Lag):
     parameters = _declared("sensor_lag", "\\tau_{s}", "sensor", "um", "displacement")
 
 
-# Time constants of first-order lags in a row, by name. What they are together is plain; which of
-# them is which, a record hardly tells.
+# Time constants of first-order lags in a row, by name. A record determines them as a set, but
+# hardly which of them is which.
 TIME_CONSTANTS = "lag", AmplifierLag.parameters[0].name, SensorLag.parameters[0].name
