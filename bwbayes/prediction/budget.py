@@ -153,7 +153,7 @@ def uncertainty_budgets(
 def _information(target: Target, place: FloatArray) -> dict[str, FloatArray]:
     """Return the Fisher information in the physical coordinates at a place (free,), by source.
 
-    What neither noise nor discrepancy brings is that of unknown starts of the dynamics.
+    Information from neither noise nor discrepancy is that of unknown starts of the dynamics.
     """
     posterior = target.posterior
     linear = target.linearize(place[np.newaxis])

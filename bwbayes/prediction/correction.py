@@ -10,8 +10,8 @@ which covers at least ``level`` of the next block's readings on average, whateve
 is like: conformal risk control (Angelopoulos et al., ICLR 2024, equation (4)), with the share that
 is missed for the risk. There is none with fewer than 19 blocks, and here with fewer than twenty.
 
-What differs from record to record, as an offset or an initial state that a lead-in has told badly,
-the blocks of one record do not show: there the next one is covered less.
+The blocks of one record do not show differences between records, such as an offset or an initial
+state that a lead-in has told badly: with these, the next record is covered less.
 """
 
 from __future__ import annotations

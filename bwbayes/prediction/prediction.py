@@ -62,7 +62,7 @@ class TailScales(NamedTuple):
 
 
 class SensorScale(NamedTuple):
-    """What turns readings into displacements, and is unsure: see :mod:`bwbayes.record.instruments`.
+    """Unsure conversion of readings into displacements: see :mod:`bwbayes.record.instruments`.
 
     ``scale`` (draws,) acts on what lies beyond the sensor's ``zero``, um, which says nothing of
     the actuator; ``curve_sd`` is the sd of the sensor's curve, um.
@@ -205,7 +205,7 @@ def predict_record(
     record
         The other record, at any sampling interval: the model lives in continuous time.
     start
-        What is known of its start.
+        Initial conditions of the record.
     generator
         Draws the starts.
     name
@@ -214,7 +214,7 @@ def predict_record(
         Part of the record (start, stop) that is predicted, s; by default all. It is simulated from
         its first sample in any case.
     model_error_sd
-        What displacement and sensor bands have in them besides, um.
+        SD that displacement and sensor bands include besides, um.
 
     Raises
     ------
