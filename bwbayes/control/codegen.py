@@ -33,8 +33,8 @@ def c_functions(
     Parameters
     ----------
     functions
-        Of numbers, and of arrays. C returns the first number that they return, and writes the
-        others through pointers.
+        Functions of numbers, and of arrays. C returns the first number that they return, and writes
+        the others through pointers.
     shapes
         Shapes of the arrays by the names of arguments; those in ``WRITTEN`` are written to.
     prefix

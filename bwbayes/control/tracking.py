@@ -288,7 +288,7 @@ def track(
         Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
         leave 71% of a sine, or to a tenth of the samples.
     amplitude
-        Of the references, um; by default 80% of what the mean model reaches.
+        Amplitude of the references, um; by default 80% of what the mean model reaches.
     all_theta
         (draws, parameters): all draws that the controller must be stable with, and whose mean is
         the model; by default those that are simulated.
