@@ -82,7 +82,7 @@ class Calibration:
     name, parameters, facts, provenance
         The calibrated problem, facts about it, and seed, digest of the data and versions.
     quantities
-        What its records are of, in whose words it is shown.
+        Quantities of its records, in whose words it is shown.
     """
 
     __repr__ = brief
@@ -143,7 +143,7 @@ class Calibration:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``calibration.json`` holds."""
+        """Contents of ``calibration.json``."""
         return dict(self.provenance) | {
             "passed": self.passed,
             "telling": self.telling,

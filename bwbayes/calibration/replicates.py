@@ -95,8 +95,8 @@ class CalibrationSetup:
         Where truths and records come from, if not from ``posterior``, whose parameters it must
         include. A calibration then must fail: on records that the analysis is wrong about.
     around
-        The posterior's own draws, if truths come from these and not from its prior. What it was
-        fitted to is then fitted with each replicate, and no bands are predicted.
+        The posterior's own draws, if truths come from these and not from its prior. The
+        readings behind these draws are then fitted with each replicate, and no bands are predicted.
     """
 
     __repr__ = brief
