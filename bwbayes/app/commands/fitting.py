@@ -145,9 +145,9 @@ def run(
             if not quiet:
                 # A proposed config has shown its remarks already.
                 banners = [] if is_proposal else remarks_banner(remarks)
-                said: Any = {"banners": banners, "quantities": problem.quantities}
+                report_fields: Any = {"banners": banners, "quantities": problem.quantities}
                 priors = priors_table(problem.posterior.prior)
-                show_report(Report(title="priors", blocks=[priors], **said))
+                show_report(Report(title="priors", blocks=[priors], **report_fields))
             options |= {"workers": workers, "figure_worker": figure_worker}
             return finish(folder.path, quiet=quiet, problem=problem, **options)
 

@@ -178,7 +178,7 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
     """
     watch("certificate", 0.0)
     result, problem, stated = fit.result, fit.problem, fit.problem.config.certificate
-    said = {
+    entries = {
         "certificate": stated.number,
         "laboratory": stated.laboratory,
         "object": stated.object or fit.name,
@@ -186,7 +186,7 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
         "instruments": "; ".join(stated.instruments) or None,
     }
     facts = problem.facts
-    pairs = {subject: text or "not stated" for subject, text in said.items()}
+    pairs = {subject: text or "not stated" for subject, text in entries.items()}
     instruments = problem.record.instruments.facts
     for subject in ("sensor scale", "monitor scale"):
         pairs[subject] = instruments.get(subject, "taken as exact: no uncertainty is stated")
@@ -226,14 +226,14 @@ def _equations(fit: Run) -> list[str]:
     """Return what the parts of the model say of themselves: their equations."""
     actuator = fit.problem.posterior.datasets[0].actuator
     parts = [actuator.hysteresis, actuator.nonlinearity, actuator.filter, actuator.creep]
-    said = []
+    equations = []
     for part in filter(None, [*parts, *actuator.stages]):
         first, *lines = (
             (inspect.getdoc(type(part)) or "").partition("\nParameters\n")[0].split("\n")
         )
         formulas = [line.strip().rstrip(",.") for line in lines if line.startswith("    ")]
-        said.append("; ".join([first.rstrip("."), *formulas]))
-    return [*said, f"noise: {fit.problem.config.model.noise}"]
+        equations.append("; ".join([first.rstrip("."), *formulas]))
+    return [*equations, f"noise: {fit.problem.config.model.noise}"]
 
 
 def _estimates(fit: Run) -> list[dict[str, Any]]:

@@ -66,27 +66,29 @@ def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Quantity
         beyond = problem.extrapolations[bands.name]
         rng = generator(problem.config.seed, f"budget {record.sha256}")
 
-        def begun(posterior: Posterior, own: FloatArray) -> InitialStates:
-            theta = posterior.prior.theta(own)
+        def begun(posterior: Posterior, own_draws: FloatArray) -> InitialStates:
+            theta = posterior.prior.theta(own_draws)
             return estimate_initial_states(posterior, theta, record, validation.start, rng)
 
-        alone, own = problem.posterior.for_record(of), problem.posterior.select_draws(draws, of)
-        states = begun(alone, own)
+        alone = problem.posterior.for_record(of)
+        own_draws = problem.posterior.select_draws(draws, of)
+        states = begun(alone, own_draws)
         reached = reaching(problem, draws, of, record, beyond)
     else:
         of = next(name for name in problem.records if bands.name in problem.windows(name))
         record = problem.records[of]
-        alone, own = problem.posterior.for_record(of), problem.posterior.select_draws(draws, of)
+        alone = problem.posterior.for_record(of)
+        own_draws = problem.posterior.select_draws(draws, of)
         rng = generator(problem.config.seed, f"budget {record.sha256}")
-        states = training_initial_states(alone, alone.prior.theta(own), rng)
+        states = training_initial_states(alone, alone.prior.theta(own_draws), rng)
         reached = None
     sample = int(np.argmin(np.abs(record.time - bands.time[at])))
     inputs = record.inputs[: sample + 1]
 
     def values(of: InitialStates) -> FloatArray:
         last = np.empty(0)
-        for piece in of.pieces(inputs, PIECE):
-            last = piece[:, -1]
+        for simulated in of.pieces(inputs, PIECE):
+            last = simulated[:, -1]
         return last - of.mean_offset
 
     displacement = values(states)
@@ -95,7 +97,7 @@ def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Quantity
         creep = np.var(values(crept)) - np.var(displacement)
         added[budget.CREEP] = max(float(creep), 0.0)
     dataset = alone.single_record
-    slow, _ = dataset.noise.marginal_sd(alone.noise_of_new(alone.prior.theta(own)))
+    slow, _ = dataset.noise.marginal_sd(alone.noise_of_new(alone.prior.theta(own_draws)))
     added[budget.MODEL] = float(np.mean(slow**2)) + (bands.model_error_sd or 0.0) ** 2
     added[budget.STATE] = float(np.mean(states.offset_sd**2))
     added[budget.CURVE] = problem.record.instruments.linearity_sd(dataset.extent) ** 2
