@@ -129,9 +129,10 @@ def rank_designs(
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
             informations = planned.linearize(chosen[batch], expected=True).fisher_information
-            for gradient, whole in zip(gradients[batch], informations, strict=True):
+            for gradient, full_information in zip(gradients[batch], informations, strict=True):
                 information = _left_open(
-                    whole, *(np.searchsorted(planned.physical, c) for c in (columns, new))
+                    full_information,
+                    *(np.searchsorted(planned.physical, c) for c in (columns, new)),
                 )
                 # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
                 inner = np.eye(len(factor)) + factor.T @ information @ factor
@@ -148,8 +149,8 @@ def _planned(posterior: Posterior, voltage: FloatArray) -> Posterior:
 
     It starts as the one that was fitted.
     """
-    nothing, whole = np.zeros(voltage.size), (slice(0, voltage.size),)
-    return posterior.altered(voltage=voltage, displacement=nothing, training=whole)
+    nothing, windows = np.zeros(voltage.size), (slice(0, voltage.size),)
+    return posterior.altered(voltage=voltage, displacement=nothing, training=windows)
 
 
 def _left_open(information: FloatArray, columns: IntArray, new: IntArray) -> FloatArray:
@@ -214,9 +215,9 @@ class _Paths:
         Returns the sizes (records, draws) of the deviations, and the nats (records,) that their
         evidence trails that of a model that makes the readings, but for what any fit takes up.
         """
-        residual, known = readings - self.mean[name], self.deviations[name]
+        residual, deviations = readings - self.mean[name], self.deviations[name]
         constant = np.full((1, residual.shape[1]), self.posterior.single_record.extent)
-        shapes = np.concatenate([known, constant])
+        shapes = np.concatenate([deviations, constant])
         noise = self.posterior.single_record.noise.at(self.stride[name] * self.interval)
         series = np.concatenate([shapes, residual])[np.newaxis]
         white = noise.whiten(self.noise, series)[0][0]

@@ -296,7 +296,7 @@ class RivalDesign(Design):
             f"along it rivals differ from the model by {validation.difference_um:.2g} um, "
             f"{validation.difference_um / validation.sd_um:.2g} times the SD of a reading"
         )
-        left = (
+        training_text = (
             f"fitted, too, it would leave {training.sd_ratio:.0%} of the rivals' differences, and "
             f"tell {training.told_apart:.0%} of all pairs of models apart"
         )
@@ -328,7 +328,7 @@ class RivalDesign(Design):
                     f"Validate on: {validation.name}, {seconds:.3g} s",
                     [differ],
                 ),
-                Banner("note", f"Train on: {training.name}", [left]),
+                Banner("note", f"Train on: {training.name}", [training_text]),
                 *remarks_banner(
                     [f"{p.name} {p.refused}" for p in self.scores if p.refused],
                     "What the amplifier cannot make",
