@@ -140,9 +140,9 @@ def agreements(
         with_noise = replace(single, prior=JointPrior(parameters, single.prior.constraint))
         names = (posterior.table.name_of(plain, name) for plain in with_noise.names)
         columns = [posterior.names.index(column) for column in names]
-        own = climb(with_noise, point.mode[columns])
+        own_fit = climb(with_noise, point.mode[columns])
         series = innovations(single, joint_free[0], (begin or {}).get(name, 0.0))
-        own_residual = innovations(with_noise, own.free).residual
+        own_residual = innovations(with_noise, own_fit.free).residual
         joint_rms_um, single_rms_um, size = (
             float(np.sqrt(np.mean(x**2))) for x in (series.residual, own_residual, series.white)
         )
@@ -151,7 +151,7 @@ def agreements(
         compared[name] = Consistency(
             joint_rms_um,
             single_rms_um,
-            *_distance(posterior, point, columns, own),
+            *_distance(posterior, point, columns, own_fit),
             size,
             series.time.size,
             series.time[step],
@@ -162,7 +162,7 @@ def agreements(
 
 
 def _distance(
-    posterior: Posterior, point: MAPEstimate, columns: Sequence[int], own: LocalFit
+    posterior: Posterior, point: MAPEstimate, columns: Sequence[int], own_fit: LocalFit
 ) -> tuple[float, float, tuple[str, float]]:
     """Return D as a χ², its degrees of freedom, and the shared parameter that is farthest off.
 
@@ -172,29 +172,34 @@ def _distance(
     rows = [physical.index(column) for column in columns]
     # The covariance given the noise, as that of the record's own fit is.
     precision = scipy.linalg.inv(point.covariance)[np.ix_(physical, physical)]
-    taken = own.covariance - scipy.linalg.inv(precision)[np.ix_(rows, rows)]
-    added = scipy.linalg.inv(own.covariance) - np.eye(len(rows))
+    taken = own_fit.covariance - scipy.linalg.inv(precision)[np.ix_(rows, rows)]
+    added = scipy.linalg.inv(own_fit.covariance) - np.eye(len(rows))
     weights = np.maximum(scipy.linalg.eigvals(added @ taken).real, 0.0)
     # What a record tells by itself alone differs by rounding: then nothing can be compared.
     smallest = 0.05
     if not weights.sum() > smallest:
         return 0.0, 0.0, ("", 0.0)
     unit = float(np.sum(weights**2) / np.sum(weights))
-    spread = np.sqrt(np.maximum(np.diag(taken), smallest * np.diag(own.covariance)))
-    away = own.coordinates - point.mode[columns]
+    spread = np.sqrt(np.maximum(np.diag(taken), smallest * np.diag(own_fit.covariance)))
+    away = own_fit.coordinates - point.mode[columns]
     shifts = {
         name: float(shift)
-        for name, shift in zip(own.posterior.names, away / spread, strict=True)
+        for name, shift in zip(own_fit.posterior.names, away / spread, strict=True)
         if name in posterior.names
     }
     farthest = max(shifts, key=lambda name: abs(shifts[name]))
     fraction = 1e-3
     step = -fraction * away
     places = np.stack(
-        [own.coordinates, point.mode[columns], own.coordinates + step, own.coordinates - step]
+        [
+            own_fit.coordinates,
+            point.mode[columns],
+            own_fit.coordinates + step,
+            own_fit.coordinates - step,
+        ]
     )
-    _, log_prior = own.posterior.prior.constrain(places)
-    log_likelihood = own.posterior.log_density(places[:2]) - log_prior[:2]
+    _, log_prior = own_fit.posterior.prior.constrain(places)
+    log_likelihood = own_fit.posterior.log_density(places[:2]) - log_prior[:2]
     # At the mode, the likelihood's slope is the prior's turned round.
     slope = (log_prior[3] - log_prior[2]) / (2 * fraction)
     cost = max(float(2 * (log_likelihood[0] - log_likelihood[1] + slope)), 0.0)

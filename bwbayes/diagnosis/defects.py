@@ -66,8 +66,8 @@ class Defect:
         flags = {"foreign": self.foreign, "removes": self.removes, "noise": self.noise}
         words = partial(self.words, scene)
         for sighting in self.sightings(scene):
-            for found in scene.changed(self.kind, words, (self.stage,), sighting, flags):
-                yield replace(found, spec=None) if sighting.named_only else found
+            for explanation in scene.changed(self.kind, words, (self.stage,), sighting, flags):
+                yield replace(explanation, spec=None) if sighting.named_only else explanation
 
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
         """Yield from where to fit the stage."""
@@ -82,8 +82,8 @@ class Defect:
 class _Transient(Defect):
     def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
         """Leave the start out, until a five-hundredth of the range is left of the transient."""
-        least = 0.002 * scene.extent
-        until = values["transient_time"] * np.log(max(abs(values["transient"]) / least, 1.0))
+        threshold = 0.002 * scene.extent
+        until = values["transient_time"] * np.log(max(abs(values["transient"]) / threshold, 1.0))
         window = f"set exclude = [[{scene.clock(0.0)}, {scene.clock(until)}]] in [record]"
         settled = int(np.searchsorted(scene.time[: scene.voltage.size], until))
         return super().words(scene, values)[0], settle_fix(scene.voltage, settled, window)
@@ -164,8 +164,8 @@ class _LongDelay(_Delay):
         if abs(late) < max(scene.turn_time / 50, scene.interval / scene.stride) or not rows:
             return
         kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
-        whole = (slice(0, kept.size),)
-        moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=whole)
+        windows = (slice(0, kept.size),)
+        moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
         places = map_estimate.local_minima(moved, scene.generator)
         # By its prior, which is as wide as a quarter of the time between two reversals.
         yield Sighting(starts=[{"delay": 4 * late / scene.turn_time}], places=places)

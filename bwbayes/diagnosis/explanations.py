@@ -80,16 +80,16 @@ def explain(
                 break
             looked_at = scene.of_beginning()
             rough = rough if looked_at is scene else looked_at.with_rough_noise()
-        found = [] if rough is None else [*_in_time(kind(rough), until)]
+        explanations = [] if rough is None else [*_in_time(kind(rough), until)]
         lead = 0.0 if rough is None else rough.lead
-        worth = frozenset(cause.kind for cause in found if cause.nats + lead > LIMIT)
+        worth = frozenset(cause.kind for cause in explanations if cause.nats + lead > LIMIT)
         if rough is None:
-            found = [*_in_time(kind(looked_at), until)]
+            explanations = [*_in_time(kind(looked_at), until)]
         elif worth:
-            found += _in_time(kind(replace(looked_at, kinds=worth)), until)
-        for explanation in found:
-            known = best.get(explanation.kind, explanation)
-            best[explanation.kind] = max(known, explanation, key=lambda either: either.nats)
+            explanations += _in_time(kind(replace(looked_at, kinds=worth)), until)
+        for explanation in explanations:
+            previous = best.get(explanation.kind, explanation)
+            best[explanation.kind] = max(previous, explanation, key=lambda either: either.nats)
         watch((number + 1) / len(kinds))
     ranked = _ranked(best.values())
     # A long record was looked at in parts: what leads has to lead on all of it.

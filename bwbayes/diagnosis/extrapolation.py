@@ -163,16 +163,16 @@ def unexcited(findings: Iterable[Finding]) -> str:
 
 def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator[Finding]:
     """Hold what parts of the model see beside the voltage against what they saw in training."""
-    seen = {stage.sees for stage in posterior.datasets[0].actuator.stages}
-    for name in sorted(seen & {*inputs.covariates}):
+    seen_names = {stage.sees for stage in posterior.datasets[0].actuator.stages}
+    for name in sorted(seen_names & {*inputs.covariates}):
         ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
         low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
-        least, most = inputs.range_of(name, [window])
+        smallest, largest = inputs.range_of(name, [window])
         slack = 0.02 * (high - low)
-        if least < low - slack or most > high + slack:
+        if smallest < low - slack or largest > high + slack:
             text = (
-                f"{name} of {least:.4g} to {most:.4g} exceeds the training range {low:.4g} to "
-                f"{high:.4g}; the bands extrapolate, their level untested"
+                f"{name} of {smallest:.4g} to {largest:.4g} exceeds the training range "
+                f"{low:.4g} to {high:.4g}; the bands extrapolate, their level untested"
             )
             yield Finding("covariate", text, "train on a record that spans this range")
 

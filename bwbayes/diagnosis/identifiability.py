@@ -246,8 +246,8 @@ class InformationGain:
             for name, taught in self.parameters.items()
             if taught.prior_decides
         ]
-        for combination, left in self.combinations[:1]:
-            text = f"{combination}: {remaining(left)}"
+        for combination, sd_ratio in self.combinations[:1]:
+            text = f"{combination}: {remaining(sd_ratio)}"
             fix = "quote its members together, or add a record that tells them apart"
             findings.append(Finding("determined worst", text, fix))
         return findings
@@ -257,7 +257,9 @@ class InformationGain:
         """What ``summary.json`` has of it, as ``identifiability``."""
         return {
             "parameters": {name: taught.numbers for name, taught in self.parameters.items()},
-            "combinations": [{"text": text, "left": left} for text, left in self.combinations],
+            "combinations": [
+                {"text": text, "left": sd_ratio} for text, sd_ratio in self.combinations
+            ],
             "findings": [str(finding) for finding in self.findings],
         }
 
@@ -318,12 +320,16 @@ def information_gain(
     # The three directions that keep most of their prior sd, in coordinates, whose spread the
     # constraints may have changed: the eigenvectors of the posterior's covariance relative to the
     # prior's.
-    prior_covariance, left = (np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after))
-    variances, directions = scipy.linalg.eigh(left, prior_covariance)
+    prior_covariance, posterior_covariance = (
+        np.atleast_2d(np.cov(z, rowvar=False)) for z in (before, after)
+    )
+    variances, directions = scipy.linalg.eigh(posterior_covariance, prior_covariance)
     combinations = []
     for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
         sd = float(np.sqrt(max(variances[i], 0.0)))
         if sd >= LEFT_OPEN:
             # How the scores move together along it, and not what picks it out.
-            combinations.append((combined(left @ directions[:, i], prior.free_names), sd))
+            combinations.append(
+                (combined(posterior_covariance @ directions[:, i], prior.free_names), sd)
+            )
     return InformationGain(parameters, tuple(combinations))

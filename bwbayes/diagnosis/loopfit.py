@@ -312,8 +312,8 @@ def _with_creep(
 
 def _decay_left(residual: FloatArray, decay: float, among: FloatArray) -> float:
     """Return the part of the sum of squares without a decay, the last column, that is left."""
-    left = float(residual @ residual)
-    return left / max(left + decay**2 / max(float(_inverse(among)[-1, -1]), 1e-300), 1e-300)
+    squares = float(residual @ residual)
+    return squares / max(squares + decay**2 / max(float(_inverse(among)[-1, -1]), 1e-300), 1e-300)
 
 
 def _products(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -235,5 +235,7 @@ def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
         if kind == "speed" and slope > 0 and scene.alone and not (noise.tailed or noise.paced):
             spec = replace(scene.study.spec, noise=f"{scene.study.spec.noise} + paced")
             fix = lines(scene.study.spec, spec)
-        found = Explanation(f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse)
-        yield replace(found, noise=True, spec=spec)
+        explanation = Explanation(
+            f"noise by {kind}", text, fix, nats=float(nats - scene.lead), rmse=rmse
+        )
+        yield replace(explanation, noise=True, spec=spec)

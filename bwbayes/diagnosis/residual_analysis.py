@@ -180,9 +180,9 @@ class ResidualAnalysis:
         that optimum.
         """
         theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
-        whole, posterior = posterior, thin_posterior(posterior, theta, READINGS)
-        if posterior is not whole:
-            posterior = posterior.altered(displacement=readings_at(posterior, whole, theta))
+        unthinned, posterior = posterior, thin_posterior(posterior, theta, READINGS)
+        if posterior is not unthinned:
+            posterior = posterior.altered(displacement=readings_at(posterior, unthinned, theta))
         rows = posterior.single_record.readings.rows
         if rows.size > READINGS:
             # Every so many of them: the voltage stays as it is.
@@ -206,8 +206,8 @@ class ResidualAnalysis:
                 best = max(best, climb(posterior, places[-1]), key=lambda fit: fit.log_evidence)
         # As they are: with the start of the record they would be drawn to where the fit is.
         starts = best.distinct(places)
-        held_out = thin_windows(held_out, stride_of(posterior, whole))
-        return cls(best, whole, starts, generator, study, held_out, begin, alone)
+        held_out = thin_windows(held_out, stride_of(posterior, unthinned))
+        return cls(best, unthinned, starts, generator, study, held_out, begin, alone)
 
     def of_beginning(self) -> ResidualAnalysis:
         """Return the same of a long record's beginning, if the record cannot be thinned.
@@ -395,8 +395,8 @@ class ResidualAnalysis:
             text, advice = words(dict(zip(posterior.table.names, theta, strict=True)))
         fix = lines(self.study.spec, spec)
         if stated:
-            known = f"what is known of {', '.join(stated)} in [parameters]"
-            fix = f"state {known}" if spec == self.study.spec else f"{fix}, with {known}"
+            statement = f"what is known of {', '.join(stated)} in [parameters]"
+            fix = f"state {statement}" if spec == self.study.spec else f"{fix}, with {statement}"
         if advice:
             fix = advice if any(flags.values()) else f"{advice}, or {fix}"
         yield self.explained(
