@@ -290,9 +290,9 @@ class Likelihood:
 
         def onwards(last: int) -> FloatArray:
             nonlocal state, now
-            piece, now = inputs[now:last], last
+            next_inputs, now = inputs[now:last], last
             moved, state = self.actuator.advance(
-                model, piece, state, initial_transient, from_rest=self.from_rest
+                model, next_inputs, state, initial_transient, from_rest=self.from_rest
             )
             return moved
 

@@ -122,7 +122,7 @@ def local_minima(
         As :func:`fit`.
     """
     posterior = beginning(posterior, SAMPLES)
-    return np.stack(_places(posterior, generator, starts, least=NEARBY)[0])
+    return np.stack(_places(posterior, generator, starts, tolerance=NEARBY)[0])
 
 
 def mode_weights(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:
@@ -145,7 +145,7 @@ def _places(
     generator: np.random.Generator,
     starts: int = STARTS,
     watch: Watch = unwatched,
-    least: float = 1e-8,
+    tolerance: float = 1e-8,
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Return places (free,) to climb from; of prior draws, the noise and the covariance."""
     prior = posterior.prior
@@ -159,7 +159,7 @@ def _places(
         least_squares = LeastSquares(posterior, center, np.sqrt(np.diag(spread)), steps=steps)
         order = np.argsort(least_squares.costs(draws[:DRAWS]), kind="stable")
         optima += _distinct_minima(
-            least_squares, least_squares.optima(draws[order[:starts]], least, of_steps)
+            least_squares, least_squares.optima(draws[order[:starts]], tolerance, of_steps)
         )
     noise = draws[:DRAWS, ~least_squares.physical]
     places = [_with_noise(posterior, optimum, noise, generator) for optimum in optima]

@@ -27,10 +27,10 @@ def _sensor_sd(context: Context) -> Distribution:
         # that.
         return Distribution("lognorm", {"s": 4.0, "loc": rounding, "scale": rounding})
     usual = lognormal(0.006 * context.ranges.displacement, 2.0)
-    if not (least := round_to_scale(context.ranges.resolution)):
+    if not (resolution := round_to_scale(context.ranges.resolution)):
         return usual
     scale, width = usual.arguments["median"], usual.arguments["sigma"]
-    return Distribution("lognorm", {"s": width, "loc": least, "scale": scale})
+    return Distribution("lognorm", {"s": width, "loc": resolution, "scale": scale})
 
 
 SENSOR_SD = Declaration(

@@ -122,13 +122,13 @@ class Study:
         It keeps statements about parameters that the other model has too: a parameter of
         another unit is another one, whatever its name. ``added`` is stated of others, or instead.
         """
-        say, known = self.quantities.say, {**self.stated, **(added or {})}
-        values = _values_of(known)
+        say, statements = self.quantities.say, {**self.stated, **(added or {})}
+        values = _values_of(statements)
         units = {d.name: say(d.unit_in(values)) for d in declarations_of(spec, self.extent)}
         stated = {
-            name: said
-            for name, said in known.items()
-            if (plain := name.partition("[")[0]) in units and said.unit in (None, units[plain])
+            name: statement
+            for name, statement in statements.items()
+            if (plain := name.partition("[")[0]) in units and statement.unit in (None, units[plain])
         }
         per_record, shared = (
             tuple(name for name in names if name in units)
@@ -138,11 +138,13 @@ class Study:
 
     def for_record(self, record: str) -> Self:
         """Return the study of one of the records, with what is stated of its own parameters."""
-        stated = {name.removesuffix(f"[{record}]"): said for name, said in self.stated.items()}
+        stated = {
+            name.removesuffix(f"[{record}]"): statement for name, statement in self.stated.items()
+        }
         return replace(
             self,
             records={record: self.records[record]},
-            stated={name: said for name, said in stated.items() if "[" not in name},
+            stated={name: statement for name, statement in stated.items() if "[" not in name},
             per_record=(),
             shared=(),
         )
@@ -263,9 +265,9 @@ class Study:
     def _said_of(self, column: Column) -> Stated:
         """Return what is stated of a column of θ: of it alone, or of all records' together."""
         name = column.declaration.name
-        said = self.stated.get(column.name, self.stated.get(name))
-        if said is not None:
-            return said
+        statement = self.stated.get(column.name, self.stated.get(name))
+        if statement is not None:
+            return statement
         at_rest = 0.0 if name == "initial" else column.declaration.at_rest
         if column.declaration.scope == "record" and at_rest is not None:
             names = [column.record] if column.record else [*self.records]
@@ -283,8 +285,8 @@ class Study:
 def _values_of(stated: Mapping[str, Stated], record: str = "") -> dict[str, float | Distribution]:
     """Return the values and priors among statements, also of a record's own parameters."""
     values: dict[str, float | Distribution] = {}
-    for name, said in stated.items():
-        value = said.fixed if said.prior is None else said.prior
+    for name, statement in stated.items():
+        value = statement.fixed if statement.prior is None else statement.prior
         if value is not None:
             values[name.removesuffix(f"[{record}]")] = value
     return values
@@ -364,15 +366,16 @@ def _parameter(
         if value and not 1e-60 < abs(value) < 1e60:
             raise InputError(f"parameters.{name}: {value:g} is out of proportion; check its unit")
     unit = declared.unit_in(context.stated)
-    own = quantities.say(unit)
-    if stated.unit is not None and own not in (stated.unit, re.sub("[µμ]", "u", stated.unit)):
+    own_unit = quantities.say(unit)
+    if stated.unit is not None and own_unit not in (stated.unit, re.sub("[µμ]", "u", stated.unit)):
         raise InputError(
-            f"parameters.{name}.unit: its numbers are in {own}, not {stated.unit}; convert them"
+            f"parameters.{name}.unit: its numbers are in {own_unit}, not {stated.unit}; convert "
+            "them"
         )
     above = record.replace("_", r"\_")
     return Parameter(
         name,
-        stated.unit if stated.unit and own == unit else unit,
+        stated.unit if stated.unit and own_unit == unit else unit,
         stated.label or declared.label + (rf"^{{\mathrm{{{above}}}}}" if record else ""),
         stated.description or declared.description + (f" of {record}" if record else ""),
         declared,

@@ -34,11 +34,11 @@ def thin_posterior(posterior: Posterior, theta: FloatArray, samples: int) -> Pos
         models = posterior.table.of(theta, dataset.name)
         stride = dataset.readings.samples // samples
         if stride > 1:
-            whole = displacement(posterior, dataset, models)
-            limit = ERROR * np.ptp(whole, axis=1)
+            full_displacement = displacement(posterior, dataset, models)
+            limit = ERROR * np.ptp(full_displacement, axis=1)
         while stride > 1:
             short, kept = thin(dataset, stride), np.sum(dataset.readings.rows % stride == 0)
-            change = displacement(posterior, short, models) - whole[:, ::stride]
+            change = displacement(posterior, short, models) - full_displacement[:, ::stride]
             error = np.sqrt(np.mean(change**2, axis=1))
             # There may be fewer readings than samples, and none of them at those that are kept.
             enough = 2 * kept >= min(dataset.readings.rows.size, samples)

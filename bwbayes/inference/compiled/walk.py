@@ -63,11 +63,11 @@ def walk(
 
     def onwards(last: int) -> FloatArray:
         nonlocal memories, now
-        moved, piece, now = core(last), inputs[now:last], last
+        moved, next_inputs, now = core(last), inputs[now:last], last
         if memories is None:
-            memories = actuator.begin_outputs(column, moved[:, 0], piece, from_rest=from_rest)
+            memories = actuator.begin_outputs(column, moved[:, 0], next_inputs, from_rest=from_rest)
         moved, memories = pass_stages(
-            actuator.outputs, column, moved, memories, piece, actuator.timing, _advance_stage
+            actuator.outputs, column, moved, memories, next_inputs, actuator.timing, _advance_stage
         )
         return moved + column["offset"][:, np.newaxis]
 
@@ -89,8 +89,8 @@ def _walk_core(
     else:
         along = advance_of(operator)
 
-        def advance(piece: Inputs, memory: Any) -> tuple[FloatArray, Any]:
-            return along(operator, column, piece.voltage, memory)
+        def advance(next_inputs: Inputs, memory: Any) -> tuple[FloatArray, Any]:
+            return along(operator, column, next_inputs.voltage, memory)
 
         memory = actuator.begin(column, voltage, from_rest=from_rest)
         compiled = prepared(operator, column, voltage, memory)
@@ -110,14 +110,14 @@ def _walk_core(
     def onwards(last: int) -> FloatArray:
         nonlocal memory, now
         displacement = np.empty((column["offset"].size, last - now))
-        piece, begin, plan = slice(0, None), now, stage.plan
+        window, begin, plan = slice(0, None), now, stage.plan
         if compiled is None:
-            # The drive of this piece is known, and what goes with it begins where it does.
-            piece, begin = slice(now, last), 0
-            drive, memory = advance(inputs[piece], memory)
+            # The drive of this window is known, and what goes with it begins where it does.
+            window, begin = slice(now, last), 0
+            drive, memory = advance(inputs[window], memory)
             plan = np.ascontiguousarray(drive)
         _walk(
-            stage.kind, groups, plan, curve[piece], lags, growth[piece], state, read_only[piece],
+            stage.kind, groups, plan, curve[window], lags, growth[window], state, read_only[window],
             begin, begin + last - now, displacement,
         )  # fmt: skip
         now = last
@@ -150,9 +150,9 @@ def _of_own(
             remembered = [s.remembered(of_one) for s, of_one in zip(steps, memory, strict=True)]
             memory = np.concatenate(remembered)
 
-    def advance(piece: Inputs, memories: Any) -> tuple[FloatArray, Any]:
+    def advance(next_inputs: Inputs, memories: Any) -> tuple[FloatArray, Any]:
         before, memory = memories
-        driven, before = actuator.pass_inputs(column, piece, before, _advance_stage)
+        driven, before = actuator.pass_inputs(column, next_inputs, before, _advance_stage)
         if step is None:
             drive, memory = actuator.drive(column, driven, memory)
         else:
