@@ -99,16 +99,16 @@ class Inputs:
     def __getitem__(self, samples: slice) -> Self:
         """Return some of the samples, on the same clock."""
         first, _, step = samples.indices(self.samples)
-        part = replace(
+        selected = replace(
             self,
             **self.each_series(lambda values: values[samples]),
             interval=self.interval * step,
             start=self.start + self.interval * first,
         )
         if step == 1:
-            whole, begin = self.around
-            object.__setattr__(part, "_around", (whole, begin + first))
-        return part
+            full_voltage, begin = self.around
+            object.__setattr__(selected, "_around", (full_voltage, begin + first))
+        return selected
 
     def followed_by(self, other: Inputs) -> Self:
         """Return these samples and then those of others, which are as far apart.

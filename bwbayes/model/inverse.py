@@ -109,14 +109,14 @@ def inverse(
     for row, samples in enumerate(target):
         column = {name: values[row : row + 1] for name, values in columns.items()}
         single = _Single(actuator, column, from_rest)
-        known = Inputs(np.zeros(samples.size), interval=actuator.interval)
-        result[row] = single.voltage(samples, known, limits or Limits(), nearest)
+        inputs = Inputs(np.zeros(samples.size), interval=actuator.interval)
+        result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
         # A stage that sees the command is undone with that of the pass before.
         follows = [stage.name for stage in actuator.stages if stage.sees == "voltage"]
         for _ in range(PASSES if follows else 0):
-            known = replace(known, voltage=result[row].copy())
-            result[row] = single.voltage(samples, known, limits or Limits(), nearest)
-            change = np.abs(result[row] - known.voltage)
+            inputs = replace(inputs, voltage=result[row].copy())
+            result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
+            change = np.abs(result[row] - inputs.voltage)
             if np.max(change) <= 1e-9 * np.ptp(result[row]):
                 break
         else:
@@ -143,14 +143,14 @@ class _Single:
         return abs(float(np.ravel(self.actuator.hysteresis.typical_slope(self.column, span))[0]))
 
     def voltage(
-        self, displacement: FloatArray, known: Inputs, limits: Limits, nearest: bool
+        self, displacement: FloatArray, inputs: Inputs, limits: Limits, nearest: bool
     ) -> FloatArray:
-        """Return the voltage (samples,) for a displacement; stages see the ``known`` inputs."""
+        """Return the voltage (samples,) for a displacement; stages see the ``inputs``."""
         actuator, interval = self.actuator, self.actuator.interval
-        rest_value = actuator.level_at_rest(self.column, known) if self.from_rest else None
+        rest_value = actuator.level_at_rest(self.column, inputs) if self.from_rest else None
         drive = (displacement - self.column["offset"][0])[np.newaxis]
         drive = undo_stages(
-            actuator.outputs, self.column, drive, known, actuator.timing, rest_value
+            actuator.outputs, self.column, drive, inputs, actuator.timing, rest_value
         )[0]
         span, peak = self.actuator.span or UNIT, float(np.max(np.abs(drive)))
         size = peak / self.slope if self.slope > 0 else 1.0
@@ -159,8 +159,8 @@ class _Single:
         if nearest:
             low, high = max(limits.low, -extent), min(limits.high, extent)
             voltage = self._undo(drive, Limits(low, high, limits.rate))
-            return np.clip(self._command(voltage, known), low, high)
-        voltage = self._command(self._undo(drive, Limits(-extent, extent)), known)
+            return np.clip(self._command(voltage, inputs), low, high)
+        voltage = self._command(self._undo(drive, Limits(-extent, extent)), inputs)
         edges = np.abs(voltage) >= extent
         if edges.any():
             sample = int(np.argmax(edges))
@@ -175,12 +175,12 @@ class _Single:
             )
         return voltage
 
-    def _command(self, voltage: FloatArray, known: Inputs) -> FloatArray:
+    def _command(self, voltage: FloatArray, inputs: Inputs) -> FloatArray:
         """Return the command (samples,), V, that makes a voltage at the hysteresis."""
         rest_value = np.zeros(1) if self.from_rest else None
         actuator, path = self.actuator, voltage[np.newaxis]
         command = undo_stages(
-            actuator.inputs, self.column, path, known, actuator.timing, rest_value
+            actuator.inputs, self.column, path, inputs, actuator.timing, rest_value
         )
         return np.asarray(command[0])
 

@@ -47,12 +47,12 @@ class StageSpec(NamedTuple):
     @classmethod
     def of(cls, slot: Slot, name: str, options: Mapping[str, Any]) -> Self:
         """Return a stage with those of the options that are said, whose lists become tuples."""
-        said = [
+        stated_options = [
             (option, tuple(value) if isinstance(value, list) else value)
             for option, value in sorted(options.items())
             if value is not None
         ]
-        return cls(slot, name, tuple(said))
+        return cls(slot, name, tuple(stated_options))
 
     @property
     def place(self) -> str:

@@ -17,12 +17,12 @@ from bwbayes.model.elementwise import select
 from bwbayes.model.stage import Side, Stage, Timing
 
 
-def _size(name: str, unit: str, label: str, description: str, part: float) -> Declaration:
+def _size(name: str, unit: str, label: str, description: str, fraction: float) -> Declaration:
     """Declare a size of an event, whose prior sd is a part of the displacement's range."""
 
     def default(context: Context) -> Distribution:
         over = context.ranges.duration ** unit.count("s")
-        return normal(0.0, part * 2 * context.ranges.displacement / over)
+        return normal(0.0, fraction * 2 * context.ranges.displacement / over)
 
     return Declaration(name, unit, label, description, default, scope="event", at_rest=0.0)
 

@@ -119,16 +119,18 @@ class Delay(Stage):
         values = values - _late(numbers, memory, np.zeros(1), values.shape[1])
         commands = np.empty(values.shape)
         for row, (shift,) in enumerate(numbers.tolist()):
-            whole = int(np.floor(shift))
-            part, wanted, late = shift - whole, values[row], whole
+            floor = int(np.floor(shift))
+            fraction, wanted, late = shift - floor, values[row], floor
             # From the side on which errors fade: y = (1 − f) u₀ + f u₁, where f is at most a half.
-            backwards = part > 0.5
+            backwards = fraction > 0.5
             if backwards:
-                part, wanted, late = 1 - part, wanted[::-1], whole + 1
-            fade = [1 - part, part]
-            found, _ = scipy.signal.lfilter([1.0], fade, wanted, zi=[-part / fade[0] * wanted[0]])
-            found = found[::-1] if backwards else found
-            commands[row] = found[np.clip(np.arange(found.size) + late, 0, found.size - 1)]
+                fraction, wanted, late = 1 - fraction, wanted[::-1], floor + 1
+            fade = [1 - fraction, fraction]
+            command, _ = scipy.signal.lfilter(
+                [1.0], fade, wanted, zi=[-fraction / fade[0] * wanted[0]]
+            )
+            command = command[::-1] if backwards else command
+            commands[row] = command[np.clip(np.arange(command.size) + late, 0, command.size - 1)]
         return commands
 
 
@@ -137,10 +139,10 @@ def _late(shifts: FloatArray, speed: FloatArray, path: FloatArray, samples: int)
 
     Before its first sample the path came at a speed (models, 1), V a sample.
     """
-    whole = np.floor(shifts)
-    after = np.arange(samples) - whole.astype(np.intp)
+    floor = np.floor(shifts)
+    after = np.arange(samples) - floor.astype(np.intp)
     late, before = (
         path[np.clip(at, 0, path.size - 1)] + speed * np.minimum(at, 0) for at in (after, after - 1)
     )
-    result: FloatArray = late + (shifts - whole) * (before - late)
+    result: FloatArray = late + (shifts - floor) * (before - late)
     return result
