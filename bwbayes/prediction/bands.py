@@ -149,14 +149,14 @@ class Bands:
             return self
         lower, upper, read_sds = dict(self.lower), dict(self.upper), self.read_sds
         if read_sds is not None:
-            left = np.maximum(read_sds["displacement"] ** 2 - self.model_error_sd**2, 0.0)
-            read_sds = {**read_sds, "displacement": np.sqrt(left)}
+            variance = np.maximum(read_sds["displacement"] ** 2 - self.model_error_sd**2, 0.0)
+            read_sds = {**read_sds, "displacement": np.sqrt(variance)}
         for kind in KINDS[1:]:
             sd = self.sd(kind)
-            left = np.sqrt(np.maximum(1 - (self.model_error_sd / sd) ** 2, 0.0))
+            ratio = np.sqrt(np.maximum(1 - (self.model_error_sd / sd) ** 2, 0.0))
             for level in LEVELS:
                 for edges in (lower, upper):
-                    edges[kind, level] = self.mean + left * (edges[kind, level] - self.mean)
+                    edges[kind, level] = self.mean + ratio * (edges[kind, level] - self.mean)
         return replace(
             self,
             lower=lower,
@@ -217,22 +217,22 @@ class Bands:
 
     def within(self, windows: Sequence[slice]) -> Bands:
         """Return the bands of some windows: from the first sample of them to the last."""
-        whole = slice(windows[0].start, windows[-1].stop)
+        span = slice(windows[0].start, windows[-1].stop)
         inside = np.zeros(self.time.size, dtype=np.bool_)
         for window in windows:
             inside[window] = True
         changes: dict[str, Any] = {
-            name: np.where(inside, values, np.nan)[whole]
+            name: np.where(inside, values, np.nan)[span]
             for name in ("measured", "truth", "pit", "crps", "log_score")
             if (values := getattr(self, name)) is not None
         }
         for name in ("time", "voltage", "mean"):
-            changes[name] = getattr(self, name)[whole]
+            changes[name] = getattr(self, name)[span]
         for name in ("lower", "upper"):
-            changes[name] = {band: edge[whole] for band, edge in getattr(self, name).items()}
+            changes[name] = {band: edge[span] for band, edge in getattr(self, name).items()}
         if self.read_sds is not None:
-            changes["read_sds"] = {kind: sd[whole] for kind, sd in self.read_sds.items()}
-        inside = inside[whole]
+            changes["read_sds"] = {kind: sd[span] for kind, sd in self.read_sds.items()}
+        inside = inside[span]
         return replace(self, **changes, inside=None if inside.all() else inside)
 
     def columns(self) -> Iterator[tuple[str, FloatArray]]:

@@ -189,7 +189,7 @@ def _shares(
     if is_actuator.any():
         block = precision[np.ix_(is_actuator, is_actuator)]
         weights[is_actuator] = np.linalg.solve(block, slopes[is_actuator])
-    parts = {source: float(weights @ part @ weights) for source, part in information.items()}
+    parts = {source: float(weights @ matrix @ weights) for source, matrix in information.items()}
     parts[PRIOR] = float(weights @ weights)
     variance = float(slopes @ np.linalg.solve(precision, slopes))
     parts[STATE] += variance - float(slopes @ weights)

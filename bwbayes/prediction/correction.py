@@ -62,8 +62,8 @@ def residual_memory(z: FloatArray, scored: BoolArray) -> float:
         scipy.signal.correlate(series, series, method="fft")[z.size - 1 :]
         for series in (z, scored.astype(np.float64))
     )
-    known = np.rint(pairs) > 0
-    correlation = np.where(known, products, 0.0) / np.maximum(np.rint(pairs), 1.0)
+    has_pairs = np.rint(pairs) > 0
+    correlation = np.where(has_pairs, products, 0.0) / np.maximum(np.rint(pairs), 1.0)
     if correlation[0] <= 0:
         return 1.0
     correlation = correlation[: 2 * (z.size // 2)] / correlation[0]

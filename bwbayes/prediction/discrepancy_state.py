@@ -47,9 +47,11 @@ class DiscrepancyState:
         """
         later = np.maximum(first + np.arange(samples) - self.last, 0).astype(np.float64)
         row = self.noise.observe @ self.noise.transition(self.parameters, later)
-        known = np.einsum("dtj,djk,dtk->dt", row, self.gained, row)
+        known_variance = np.einsum("dtj,djk,dtk->dt", row, self.gained, row)
         always = self.noise.marginal_sd(self.parameters)[0][:, np.newaxis] ** 2
-        share = np.divide(known, always, out=np.zeros_like(known), where=always > 0)
+        share = np.divide(
+            known_variance, always, out=np.zeros_like(known_variance), where=always > 0
+        )
         return np.einsum("dtj,dj->dt", row, self.mean), np.minimum(share, 1.0)
 
 

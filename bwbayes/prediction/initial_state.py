@@ -193,7 +193,7 @@ def estimate_initial_states(
     if window is not None:
         assert record.displacement is not None
         readings = Readings.of(record.displacement, [window])
-    whole = Likelihood(
+    likelihood = Likelihood(
         inputs,
         readings,
         actuator,
@@ -206,16 +206,18 @@ def estimate_initial_states(
     )
     theta, redrawn = _of_new_record(posterior, theta, start, generator)
     earlier = (span,) if start.from_rest else actuator.hysteresis.earlier(span)
-    likelihoods = tuple(replace(whole, actuator=replace(actuator, span=swept)) for swept in earlier)
+    likelihoods = tuple(
+        replace(likelihood, actuator=replace(actuator, span=swept)) for swept in earlier
+    )
     if window is None:
         return _unseen(likelihoods, theta, generator, settled=start.settled)
     if estimate_offset:
         assert record.displacement is not None
         level = np.full(len(theta), np.nanmean(record.displacement[window]))
-        theta = whole.table.replaced(theta, "offset", level)
+        theta = likelihood.table.replaced(theta, "offset", level)
     elif len(likelihoods) > 1:
         # The mean is in the domain, which is convex; a median of each parameter need not be.
-        typical = whole.table.actuator(np.mean(theta, axis=0)[np.newaxis])
+        typical = likelihood.table.actuator(np.mean(theta, axis=0)[np.newaxis])
         between = _between(likelihoods, typical)
         likelihoods = tuple(replace(history, offset_sd=between) for history in likelihoods)
     histories, start_theta, evidence = choose_histories(
@@ -232,7 +234,7 @@ def estimate_initial_states(
     informed = replace(informed, rows=rows)
     if not start.after:
         return informed
-    return continue_discrepancy(informed, whole, theta, generator, part(watch, 0.5, 1.0))
+    return continue_discrepancy(informed, likelihood, theta, generator, part(watch, 0.5, 1.0))
 
 
 def _of_new_record(

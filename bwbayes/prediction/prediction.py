@@ -121,7 +121,7 @@ def predict_windows(
     edges = [(window.start, window.stop) for parts in several.values() for window in parts]
     first = min(start for start, _ in edges)
     window = slice(first, max(stop for _, stop in edges))
-    whole = _bands("", posterior, theta, start_states, record, window, watch)
+    full_bands = _bands("", posterior, theta, start_states, record, window, watch)
     bands = []
     for name, parts in several.items():
         training = any(
@@ -130,7 +130,7 @@ def predict_windows(
             for p in parts
         )
         moved = [slice(window.start - first, window.stop - first) for window in parts]
-        bands.append(replace(whole.within(moved), name=name, training=training))
+        bands.append(replace(full_bands.within(moved), name=name, training=training))
     return bands
 
 
@@ -181,8 +181,8 @@ def continued(record: Record, voltage: FloatArray) -> Record:
 
     Its covariates are unknown from there on.
     """
-    whole = np.concatenate([record.path.voltage, voltage])
-    return replace(record, voltage=whole, covariates={}, displacement=None, truth=None)
+    full_voltage = np.concatenate([record.path.voltage, voltage])
+    return replace(record, voltage=full_voltage, covariates={}, displacement=None, truth=None)
 
 
 def predict_record(
@@ -287,8 +287,8 @@ def _bands(
     more = counted(window.stop, watch)
 
     def put() -> None:
-        first, piece = pending.popleft()
-        for key, values in piece.result().items():
+        first, future = pending.popleft()
+        for key, values in future.result().items():
             joined[key][first : first + values.size] = values
         more(values.size)
 

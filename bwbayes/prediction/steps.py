@@ -131,7 +131,9 @@ def measure_step(
     estimates["level_um"] = Estimate.of(um * settled)
     if actuator.filter.parameters:
         share = without / settled[:, np.newaxis]
-        begin, end = (np.exp(first_passage(np.log(time), share, part)) for part in (0.1, 0.9))
+        begin, end = (
+            np.exp(first_passage(np.log(time), share, fraction)) for fraction in (0.1, 0.9)
+        )
         estimates["rise_s"] = Estimate.of(end - begin)
         overshoot = 100 * np.maximum(np.max(share, axis=1) - 1, 0.0)
         estimates["overshoot_percent"] = Estimate.of(overshoot)
