@@ -56,10 +56,10 @@ class Scales(NamedTuple):
         """
         factor = np.ones_like(self.sensor)
         top, *below = unit.split("/")
-        for part, sign in ((top, 1), *((part, -1) for part in below)):
-            for token, power in re.findall(r"(?<!\w)(um|V)(?!\w)(?:\^(\(1-n\)|-?[\d.]+))?", part):
-                known = 1 - exponent if power == "(1-n)" else float(power or 1)
-                factor *= (self.sensor if token == "um" else self.amplifier) ** (sign * known)
+        for term, sign in ((top, 1), *((term, -1) for term in below)):
+            for token, power in re.findall(r"(?<!\w)(um|V)(?!\w)(?:\^(\(1-n\)|-?[\d.]+))?", term):
+                degree = 1 - exponent if power == "(1-n)" else float(power or 1)
+                factor *= (self.sensor if token == "um" else self.amplifier) ** (sign * degree)
         return factor
 
 

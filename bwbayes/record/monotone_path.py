@@ -99,8 +99,8 @@ def _local_fits(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, Float
     weight = sum(1 / side.variance for side in sides)
     fits = sum(side.fit / side.variance for side in sides) / weight
     apart = sum((side.fit - fits) ** 2 / side.variance for side in sides) / weight
-    least = np.minimum.reduce([side.variance for side in sides])
-    return fits, np.sqrt(least + apart), np.sqrt(least)
+    min_variance = np.minimum.reduce([side.variance for side in sides])
+    return fits, np.sqrt(min_variance + apart), np.sqrt(min_variance)
 
 
 def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, bool]:
@@ -109,7 +109,7 @@ def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, boo
     The first of them is the extreme that the path begins at.
     """
     reached_above, reached_below = (fits - margin).tolist(), (fits + margin).tolist()
-    found: list[int] = []
+    reversals: list[int] = []
     top = bottom = direction = 0
     first_is_top = False
     for i in range(1, fits.size):
@@ -118,13 +118,13 @@ def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, boo
         if direction <= 0 and reached_below[i] < reached_below[bottom]:
             bottom = i
         if direction <= 0 and reached_above[i] > reached_below[bottom]:
-            found.append(bottom)
+            reversals.append(bottom)
             direction, top = 1, i
         elif direction >= 0 and reached_below[i] < reached_above[top]:
-            first_is_top = first_is_top or not found
-            found.append(top)
+            first_is_top = first_is_top or not reversals
+            reversals.append(top)
             direction, bottom = -1, i
-    return np.array(found, dtype=np.int64), first_is_top
+    return np.array(reversals, dtype=np.int64), first_is_top
 
 
 def _monotone(
@@ -162,8 +162,8 @@ def _leveled(
         # As far as the first that lies outside: more samples at another level agree again.
         outside = outermost > ABOUT * noise_sd / np.sqrt(count)
         inside = nearest[: np.argmax(outside) if outside.any() else None]
-        part = slice(before + inside.min(), before + inside.max() + 1)
-        near = voltage[part]
+        samples = slice(before + inside.min(), before + inside.max() + 1)
+        near = voltage[samples]
         level, error = np.full(near.size, np.mean(near)), noise_sd / sqrt(near.size)
         x = np.arange(near.size) - (near.size - 1) / 2
         bend = x * x - (near.size**2 - 1) / 12
@@ -173,6 +173,6 @@ def _leveled(
             level += (bend @ near) / (bend @ bend) * bend + (x @ near) / (x @ x) * x
             error *= 1.5
         if near.size >= 3 and error < sd[extremum]:
-            result[part] = level
+            result[samples] = level
         is_top = not is_top
     return result

@@ -169,20 +169,20 @@ class Record(Inputs):
         if interval is not None and not 0 < interval < np.inf:
             raise InputError(f"{origin}: interval: {interval} s is not a positive time")
         named: dict[str, Any] = {"units": units, "input": input, "output": output}
-        own = Naming.stated(**named, covariates=tuple(covariates or ()))
-        names = own.quantities.input.name, own.quantities.output.name
+        stated_naming = Naming.stated(**named, covariates=tuple(covariates or ()))
+        names = stated_naming.quantities.input.name, stated_naming.quantities.output.name
         arrays = {"time": time, names[0]: voltage, names[1]: displacement}
         source = array_source(origin, arrays | dict(covariates or {}), interval, start or 0.0)
         common = {"time": "s", "voltage": "V", "displacement": "um"}
-        if own.quantities.input != VOLTAGE:
+        if stated_naming.quantities.input != VOLTAGE:
             del common["voltage"]
-        if own.quantities.output != DISPLACEMENT:
+        if stated_naming.quantities.output != DISPLACEMENT:
             del common["displacement"]
         columns: dict[str, str | int] = {}
-        if not own.quantities.are_default:
+        if not stated_naming.quantities.are_default:
             columns = {"voltage": names[0]}
             columns |= {} if displacement is None else {"displacement": names[1]}
-        naming = replace(own, units=common | dict(own.units), columns=columns)
+        naming = replace(stated_naming, units=common | dict(stated_naming.units), columns=columns)
         return cls._of(source, naming, voltage_is, displacement is not None)
 
     @classmethod

@@ -90,10 +90,10 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
             return VoltagePath(voltage)
         residual = u - hum - fitted.path
         frequency = _line(residual, sd)
-        known = any(abs(frequency - other) < 6 / u.size for other in frequencies)
-        if not frequency or (len(frequencies) == LINES and not known):
+        is_known = any(abs(frequency - other) < 6 / u.size for other in frequencies)
+        if not frequency or (len(frequencies) == LINES and not is_known):
             break
-        frequencies += [] if known else [frequency]
+        frequencies += [] if is_known else [frequency]
         phases = np.outer(np.arange(u.size), frequencies)
         waves = np.hstack([np.cos(phases), np.sin(phases)])
         more = waves @ np.linalg.lstsq(waves.T @ waves, waves.T @ residual)[0]
@@ -101,9 +101,9 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         if sqrt(2) * size < step / np.pi:  # the error of rounding a ramp has such a line
             break
         # The path follows a part of the hum, so what is left of it falls by one factor each time.
-        left = size / last if known and last else 0.0
-        last = 0.0 if left else size
-        hum = hum + (more / (1 - left) if left < 0.95 else more)
+        ratio = size / last if is_known and last else 0.0
+        last = 0.0 if ratio else size
+        hum = hum + (more / (1 - ratio) if ratio < 0.95 else more)
     path = fitted.path + hum
     shown = f"noise of {sd:.2g} V SD ({100 * sd / extent:.2g}% of its range)"
     length = _length(path)

@@ -116,18 +116,18 @@ class Naming:
 
     def _split_units(self) -> None:
         """Take the uncertainties out of the units, to the instruments."""
-        units, known = dict(self.units), dict[str, float]()
+        units, uncertainties = dict(self.units), dict[str, float]()
         names = {"displacement": "sensor_scale", "voltage": "amplifier_gain"}
         for quantity, text in units.items():
             units[quantity], uncertainty = split_uncertainty(text, f"units: {quantity}")
             if uncertainty is not None:
                 if quantity not in names:
                     raise InputError(f"units: {quantity}: has no uncertainty; give its unit alone")
-                known[names[quantity]] = uncertainty
+                uncertainties[names[quantity]] = uncertainty
         if self.linearity is not None:
-            known["linearity"] = part_of_range(self.linearity, "linearity")
+            uncertainties["linearity"] = part_of_range(self.linearity, "linearity")
         object.__setattr__(self, "units", units)
-        object.__setattr__(self, "instruments", replace(self.instruments, **known))
+        object.__setattr__(self, "instruments", replace(self.instruments, **uncertainties))
 
     @property
     def stated_units(self) -> dict[str, str]:
@@ -144,12 +144,12 @@ class Naming:
     def _require_units(self) -> None:
         """Refuse a unit that its quantity cannot have."""
         for quantity, unit in self.units.items():
-            own = self.quantities.of_key(quantity)
-            if own not in (VOLTAGE, DISPLACEMENT, TIME):
-                if conversion(unit, own.unit) is None:
+            expected = self.quantities.of_key(quantity)
+            if expected not in (VOLTAGE, DISPLACEMENT, TIME):
+                if conversion(unit, expected.unit) is None:
                     raise InputError(
-                        f"units: {own.name} in {unit!r} is unknown; write {own.unit}, a unit that "
-                        f"converts to it, or a number of them, as '0.35 {own.unit}'"
+                        f"units: {expected.name} in {unit!r} is unknown; write {expected.unit}, a "
+                        f"unit that converts to it, or a number of them, as '0.35 {expected.unit}'"
                     )
                 continue
             if (scale := scale_of(unit, quantity)) is None:

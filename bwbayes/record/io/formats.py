@@ -233,8 +233,8 @@ def _existing(path: Path) -> Path:
     """Return a path, or the one that `path_text` wrote so as its name is not UTF-8."""
     if path.exists():
         return path
-    whole = os.fsencode(path)
-    name = re.sub(rb"\\x([0-9a-f]{2})", lambda code: bytes.fromhex(code[1].decode()), whole)
+    encoded = os.fsencode(path)
+    name = re.sub(rb"\\x([0-9a-f]{2})", lambda code: bytes.fromhex(code[1].decode()), encoded)
     return Path(os.fsdecode(name))
 
 
@@ -254,9 +254,9 @@ def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path
         return partial(read_workbook, table=table)
     if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise InputError(f"{path}: a workbook or an archive; export it as CSV or .xlsx")
-    for known in FORMATS:
-        if begin.startswith(known.mark):
-            return known.read
+    for file_format in FORMATS:
+        if begin.startswith(file_format.mark):
+            return file_format.read
     if suffix == ".mat":
         return read_mat
     if suffix in _BINARY:

@@ -178,16 +178,16 @@ def _without_repeats(
     is_left_out = (is_late & ~is_early)[of] & (rank > 0)
     number, sample = int(np.count_nonzero(is_repeat)), int(np.argmax(is_repeat))
     several, time = "s are" if number > 1 else " is", clock(start + elapsed[sample], interval)
-    said = f"{number} time{several} repeated, first {time} s"
+    issue = f"{number} time{several} repeated, first {time} s"
     if (lost := int(np.count_nonzero(is_left_out))) > 0.05 * elapsed.size:
         advice = "remove one of two samples, or give `fs=HZ` for the times if none are missing"
-        raise table.error(f"{said}; {advice}", "time", sample)
+        raise table.error(f"{issue}; {advice}", "time", sample)
     kinds = {
         "equal to the row above, left out": int(np.count_nonzero(is_copy)),
         "moved to times without a sample": int(np.count_nonzero(shift)),
         "left out": lost,
     }
-    remark = f"{said}: {', '.join(f'{n} {kind}' for kind, n in kinds.items() if n)}"
+    remark = f"{issue}: {', '.join(f'{n} {kind}' for kind, n in kinds.items() if n)}"
     warnings.warn(str(table.error(remark, "time", sample)), InputWarning, stacklevel=6)
     moved = elapsed[rows] + interval * shift
     return table.only(rows[~is_left_out]), moved[~is_left_out]

@@ -111,8 +111,8 @@ def record_notes(record: Record) -> dict[str, str | float]:
         "covariates": ", ".join(record.covariates),
     }
     if record.quantities != DEFAULT:
-        own = record.quantities
-        notes |= {"input_is": str(own.input), "output_is": str(own.output)}
+        quantities = record.quantities
+        notes |= {"input_is": str(quantities.input), "output_is": str(quantities.output)}
     if not record.quantities.has_clock:
         del notes["interval_s"]
     notes |= dict(zip(INSTRUMENT_NOTES, astuple(record.instruments), strict=True))

@@ -69,16 +69,16 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         width = Counter(map(len, split)).most_common(1)[0][0]
         if width < 2 or (candidate == "," and _is_one_with_decimals(split)):
             continue
-        whole = [row for row in split if len(row) == width]
-        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in whole])
+        full_rows = [row for row in split if len(row) == width]
+        numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in full_rows])
         # An empty cell speaks for no separator, nor against one.
-        filled = sum(bool(cell) for row in whole for cell in row)
-        share = float(numeric.sum()) / max(filled, 1) * len(whole) / len(split)
+        filled = sum(bool(cell) for row in full_rows for cell in row)
+        share = float(numeric.sum()) / max(filled, 1) * len(full_rows) / len(split)
         numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
         if share > best and numeric_columns:
             best, separator, fields, columns = share, candidate, width, numeric_columns
             whole_columns = np.flatnonzero(numeric.all(axis=0)).tolist()
-            empty_columns = [i for i in range(width) if not any(row[i] for row in whole)]
+            empty_columns = [i for i in range(width) if not any(row[i] for row in full_rows)]
     # A column alone has no separator; as none of its cells has tabs, they are as good as any.
     alone = [_NUMBER.fullmatch(line.strip(' "')) is not None for line in rows]
     if not columns and np.mean([False, *alone]) > 0.5:
@@ -161,7 +161,9 @@ def find_header(
         is_unit = [
             is_time_form(cell) or any(scale_of(cell, q) for q in QUANTITIES) for cell in stated
         ]
-        others = [cell for cell, known in zip(stated, is_unit, strict=True) if not known]
+        others = [
+            cell for cell, cell_is_unit in zip(stated, is_unit, strict=True) if not cell_is_unit
+        ]
         if not any(is_unit) or not all(map(is_other_unit, others)):
             rows.append((index, cells))
         elif unit_row is None:

@@ -39,10 +39,10 @@ def with_own_times(
         Their times differ, and one column of times is said to count for both.
     """
     read = {q: chosen[q] for q in ("voltage", "displacement") if q in chosen}
-    own = {q: times for q, series in read.items() if (times := _beside(source, series))}
-    seconds = {q: _seconds(times, naming) for q, times in own.items()}
+    own_times = {q: times for q, series in read.items() if (times := _beside(source, series))}
+    seconds = {q: _seconds(times, naming) for q, times in own_times.items()}
     # One column of times for both, or one that cannot be understood, is the matter of others.
-    is_known = len({times.name for times in own.values()}) == 2
+    is_known = len({times.name for times in own_times.values()}) == 2
     is_known &= all(times.size > 1 for times in seconds.values())
     if naming.fs is not None or not is_known:
         return dict(chosen)
@@ -51,8 +51,8 @@ def with_own_times(
     size = min(first.size, last.size)
     apart = float(np.abs(first[:size] - last[:size]).max())
     if first.size == last.size and apart <= 0.01 * interval:
-        return {"time": own["voltage"], **chosen}
-    names = [repr(times.name) for times in own.values()]
+        return {"time": own_times["voltage"], **chosen}
+    names = [repr(times.name) for times in own_times.values()]
     differ = f"{source.path}: {names[1]}: not the times of {names[0]}, by up to {apart:.6g} s"
     if "time" in naming.columns:
         advice = "name no column of times to put each by its own"
@@ -76,8 +76,8 @@ def _beside(source: Source, series: Series) -> Series | None:
     if source.lines:
         before = source.series[: source.series.index(series)]
         return next((s for s in before[::-1] if s in times), None) if times[1:] else None
-    own = [s for s in times if s.group == series.group != ""]
-    return own[0] if len(own) == 1 else None
+    group_times = [s for s in times if s.group == series.group != ""]
+    return group_times[0] if len(group_times) == 1 else None
 
 
 def _seconds(times: Series, naming: Naming) -> FloatArray:
@@ -98,6 +98,8 @@ def _clocked(series: Series, seconds: FloatArray) -> Series:
     uniform = seconds[0] + interval * np.arange(seconds.size)
     if np.abs(seconds - uniform).max() > 0.01 * interval:
         return series
-    whole, size = series.load_readings or series.load, seconds.size
+    load_all, size = series.load_readings or series.load, seconds.size
     clock = Clock(interval, float(seconds[0]))
-    return replace(series, size=size, load=lambda: whole()[:size], load_readings=None, clock=clock)
+    return replace(
+        series, size=size, load=lambda: load_all()[:size], load_readings=None, clock=clock
+    )

@@ -31,16 +31,16 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
     errors: list[ColumnsError] = []
     for quantity in ("displacement", "voltage"):
         source = sources[quantity]
-        own = _own(source, naming, quantity)
+        own_naming = _own(source, naming, quantity)
         # Of the file with the voltage times are asked for, unless the other one has them.
         is_asked = quantity == "voltage" and not any("time" in t.columns for t in tables.values())
         may_have_times = len(source.series) > 1 and any(map(rises, source.series))
         needed = ["time"] * (is_asked or may_have_times) + [quantity]
         try:
-            tables[quantity] = select(source, own, needed)
+            tables[quantity] = select(source, own_naming, needed)
         except ColumnsError as error:
             if quantity not in naming.columns:
-                error.guess["columns"].pop(quantity if quantity in own.columns else "", None)
+                error.guess["columns"].pop(quantity if quantity in own_naming.columns else "", None)
             errors.insert(0, error)
     if errors:
         both = [error.guess for error in errors]
@@ -82,13 +82,16 @@ def _joined(voltage: ColumnTable, displacement: ColumnTable, naming: Naming) -> 
         )
     if "time" in displacement.columns:
         column = displacement.columns["time"]
-        own, times = (c.scaled(c.values, "time") for c in (column, columns.get("time", column)))
-        apart = np.abs(own - times) > 0.01 * np.ptp(own) / own.size
+        reading_times, times = (
+            c.scaled(c.values, "time") for c in (column, columns.get("time", column))
+        )
+        apart = np.abs(reading_times - times) > 0.01 * np.ptp(reading_times) / reading_times.size
         if apart.any():
             sample = int(np.argmax(apart))
             raise InputError(
-                f"{other}: {column.name}: sample {sample} is at {own[sample]:.9g} s, in {path} at "
-                f"{times[sample]:.9g} s; give both at the same times, or `fs=HZ` for the times"
+                f"{other}: {column.name}: sample {sample} is at {reading_times[sample]:.9g} s, "
+                f"in {path} at {times[sample]:.9g} s; give both at the same times, or `fs=HZ` for "
+                "the times"
             )
         columns["time"] = columns.get("time", column)
     columns["displacement"] = replace(reading, name=f"{other.name}: {reading.name}")

@@ -46,15 +46,15 @@ def conversion(unit: str, to: str) -> Conversion | None:
     if match[2] == to.strip():
         return lambda values: factor * values
     registry: Any = pint.get_application_registry()  # type: ignore[no-untyped-call]
-    (own, size), (target, target_size) = map(_spelled, (match[2], to))
+    (source_unit, size), (target, target_size) = map(_spelled, (match[2], to))
     try:
-        own, target = registry.parse_units(own), registry.parse_units(target)
-        registry.Quantity(1.0, own).to(target)
+        source_unit, target = registry.parse_units(source_unit), registry.parse_units(target)
+        registry.Quantity(1.0, source_unit).to(target)
     except Exception:  # pint raises many kinds, some of them Python's own
         return None
 
     def convert(values: FloatArray) -> FloatArray:
-        quantity = registry.Quantity(factor * size / target_size * values, own)
+        quantity = registry.Quantity(factor * size / target_size * values, source_unit)
         return np.asarray(quantity.m_as(target))
 
     return convert
@@ -93,28 +93,28 @@ def in_stated_quantities(
     quantities = Quantities.of(*stated)
     columns, units = dict(naming.columns), dict(naming.units)
     changed = {series.name: series for series in source.series}
-    found = dict[str, Series]()
-    for key, own, default in (
+    series_by_key = dict[str, Series]()
+    for key, quantity, default in (
         ("voltage", quantities.input, VOLTAGE),
         ("displacement", quantities.output, DISPLACEMENT),
     ):
-        if own == default:
+        if quantity == default:
             continue
-        series = _series_of(source, naming, key, own, [*found.values()])
+        series = _series_of(source, naming, key, quantity, [*series_by_key.values()])
         unit = units.pop(key, "")
         for other in source.series:  # what this quantity would be by default is none of it
             is_like = likeness(other.label, other.unit, key) is not None
-            if is_like and other not in found.values():
+            if is_like and other not in series_by_key.values():
                 changed[other.name] = replace(changed[other.name], alias="other", unit="")
         if series is not None:
-            found[key] = series
+            series_by_key[key] = series
             columns.pop(key, None)
-            changed[series.name] = _converted(source, series, key, own, unit)
+            changed[series.name] = _converted(source, series, key, quantity, unit)
     truth = next((s for s in source.series if _parts(s, quantities.output)[0] == "truth"), None)
     if truth is not None and quantities.output != DISPLACEMENT:
         changed[truth.name] = replace(truth, alias="truth_um", unit="")
     fs = naming.fs
-    if "time" in needed and _is_timeless(source, naming, [*found.values()]):
+    if "time" in needed and _is_timeless(source, naming, [*series_by_key.values()]):
         quantities, fs = Quantities.of(*stated, has_clock=False), 1.0
     source = replace(source, series=tuple(changed[series.name] for series in source.series))
     return source, replace(naming, columns=columns, units=units, fs=fs), quantities
@@ -130,31 +130,31 @@ def _noted(source: Source) -> tuple[str | None, str | None]:
     return None, None
 
 
-def _parts(series: Series, own: Quantity) -> tuple[str, str]:
+def _parts(series: Series, quantity: Quantity) -> tuple[str, str]:
     """Return the name of a series in lower case, and its unit, as the file states them."""
     match = re.fullmatch(r"(.*?)[\s_]*[(\[](.*)[)\]]\s*", series.label)
     if match is not None:
         return match[1].casefold(), series.unit or match[2]
     match = re.fullmatch(r"(.+?)[\s_/]+(\S+)", series.label)
-    if match is not None and conversion(match[2], own.unit) is not None:
+    if match is not None and conversion(match[2], quantity.unit) is not None:
         return match[1].casefold(), series.unit or match[2]
     return series.label.casefold().strip(), series.unit
 
 
 def _series_of(
-    source: Source, naming: Naming, key: str, own: Quantity, taken: list[Series]
+    source: Source, naming: Naming, key: str, quantity: Quantity, taken: list[Series]
 ) -> Series | None:
     """Return the series of a stated quantity: the one that is named, by its word or its unit."""
     if key in naming.columns:
-        return series_named(source, naming.columns[key], own.name)
+        return series_named(source, naming.columns[key], quantity.name)
     others = [s for s in source.series if s not in taken and s.size > 1]
     role = {"voltage": "input", "displacement": "output"}[key]
-    for word in (own.name.casefold(), role):
-        named = [s for s in others if _parts(s, own)[0] == word]
+    for word in (quantity.name.casefold(), role):
+        named = [s for s in others if _parts(s, quantity)[0] == word]
         if len(named) == 1:
             return named[0]
-    units = [(s, _parts(s, own)[1]) for s in others]
-    in_unit = [s for s, unit in units if unit and conversion(unit, own.unit) is not None]
+    units = [(s, _parts(s, quantity)[1]) for s in others]
+    in_unit = [s for s, unit in units if unit and conversion(unit, quantity.unit) is not None]
     if len(in_unit) != 1:
         return None
     remark = f"taken by its unit: {key} is {in_unit[0].name!r}; if not, say `columns`"
@@ -162,14 +162,14 @@ def _series_of(
     return in_unit[0]
 
 
-def _converted(source: Source, series: Series, key: str, own: Quantity, unit: str) -> Series:
+def _converted(source: Source, series: Series, key: str, quantity: Quantity, unit: str) -> Series:
     """Return a series with its numbers in the stated unit, under the package's own name."""
-    unit = unit or _parts(series, own)[1] or own.unit
-    convert = conversion(unit, own.unit)
+    unit = unit or _parts(series, quantity)[1] or quantity.unit
+    convert = conversion(unit, quantity.unit)
     if convert is None:
         raise InputError(
-            f"{source.path}: {series.name!r}: {unit!r} cannot be converted to {own.unit!r}; state "
-            f"the column's unit, as units {own.name}={own.unit!r}"
+            f"{source.path}: {series.name!r}: {unit!r} cannot be converted to {quantity.unit!r}; "
+            f"state the column's unit, as units {quantity.name}={quantity.unit!r}"
         )
 
     def loaded(load: Callable[[], NDArray[Any]], convert: Conversion) -> NDArray[Any]:

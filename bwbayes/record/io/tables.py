@@ -95,8 +95,8 @@ def index_of(
         return titles.index(str(table))
     if str(table).isdecimal() and 1 <= int(str(table)) <= len(titles):
         return int(str(table)) - 1
-    whole = [f"{title!r}{more}" for title, more in zip_longest(titles, said, fillvalue="")]
-    listed = ", ".join(f"{i} {text}" for i, text in enumerate(whole, start=1))
+    labels = [f"{title!r}{more}" for title, more in zip_longest(titles, said, fillvalue="")]
+    listed = ", ".join(f"{i} {text}" for i, text in enumerate(labels, start=1))
     if table is None:
         raise InputError(
             f"{path}: {len(titles)} tables with numbers: {listed}; choose one, as `table=1`"

@@ -86,8 +86,8 @@ def text_source(
     if (longest := max(map(len, lines))) > csv.field_size_limit():
         raise InputError(f"{path}: a line of {longest} characters; write a line a sample, as CSV")
     tables = tables_of(lines)
-    said = described(tables, lines) if tables[1:] else ()
-    chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, said)]
+    descriptions = described(tables, lines) if tables[1:] else ()
+    chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, descriptions)]
     is_whole |= chosen.stop < len(lines)
     # Empty lines in place of the tables above, so that the others keep their numbers; a block below
     # an empty line has the header of the one above.
@@ -322,13 +322,13 @@ def _shown_marks(text: str, separator: str) -> list[Marks]:
         begin, end = rf'(?<![^\s"{separator}])', rf'(?![^\s"{separator}])'
         if mark == separator:  # within quotes
             begin, end = '(?<=")', '(?=")'
-        whole = f"{_GROUPED.format(mark)}{end}"
+        grouped_number = f"{_GROUPED.format(mark)}{end}"
         digits = rf"(?:\d+|\d{{1,3}}(?:\{other}\d{{3}})+)"
         number = rf"[+-]?(?:{digits}\{mark}\d*|\{mark}\d+)(?:[eE][+-]?\d+)?{end}"
         several = rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}}){{2,}}{end}"
         if mark not in text or (mark == separator and '"' not in text):
             continue
-        if re.search(f"{begin}(?!{whole}){number}", text):
+        if re.search(f"{begin}(?!{grouped_number}){number}", text):
             shown.add(mark)
         elif re.search(rf"{begin}{_GROUPED.format(mark)}(?:\{other}\d*)?{end}", text):
             grouped.append(mark)
@@ -399,8 +399,8 @@ def _numbers(
     if column.dtype.kind in "iuf":
         return np.asarray(column)
     text, (decimal, thousands) = column.astype(str), marks
-    whole = text.str.replace(thousands, "") if thousands else text
-    numbers = pd.to_numeric(whole.str.replace(decimal, "."), errors="coerce")
+    ungrouped = text.str.replace(thousands, "") if thousands else text
+    numbers = pd.to_numeric(ungrouped.str.replace(decimal, "."), errors="coerce")
     wrong = np.flatnonzero(numbers.isna() & column.notna() & (text.str.lower() != "nan"))
     if not wrong.size:
         return np.asarray(numbers, dtype=np.float64)

@@ -43,7 +43,7 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
     tables: dict[str, tuple[Source, list[str]]] = {}
     unread: dict[str, InputError] = {}
     for sheet, text in texts.items():
-        titles = [found.title for found in tables_of(text.split("\n"))]
+        titles = [text_table.title for text_table in tables_of(text.split("\n"))]
         for number, title in enumerate(titles, start=1):
             name = sheet if len(titles) == 1 else f"{sheet}: {title}"
             try:
@@ -58,8 +58,8 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
     if str(table) in unread or not tables:
         nothing = NoNumbersError(f"{path}: no sheet has columns of numbers; give a row a sample")
         raise unread.get(str(table), nothing)
-    source, said = [*tables.values()][index_of(path, [*tables], table)]
-    for remark in said:
+    source, messages = [*tables.values()][index_of(path, [*tables], table)]
+    for remark in messages:
         warnings.warn(remark, InputWarning, stacklevel=4)
     return source
 
