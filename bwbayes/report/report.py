@@ -227,7 +227,7 @@ class Report:
             return self
         head, newline, rows = self.csv.partition("\n")
         heading = ",".join(map(self.quantities.heading, head.split(",")))
-        said = {
+        changes = {
             "title": self.quantities.say(self.title),
             "heading": self.quantities.say(self.heading),
             "about": self.quantities.say(self.about),
@@ -236,7 +236,7 @@ class Report:
             "numbers": self.quantities.rendered(self.numbers),
             "csv": f"{heading}{newline}{rows}",
         }
-        return replace(self, **said, quantities=DEFAULT)
+        return replace(self, **changes, quantities=DEFAULT)
 
     def all_blocks(self) -> Iterator[Block]:
         """Yield all blocks, those within others too, in their order."""

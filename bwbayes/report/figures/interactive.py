@@ -57,17 +57,17 @@ def draw(result: Result) -> dict[str, Markup]:
     return {name: _page_json(plot, i, say) for i, (name, plot) in enumerate(plots.items())}
 
 
-def _said(part: Any, say: Callable[[str], str], key: str = "") -> Any:
+def _said(node: Any, say: Callable[[str], str], key: str = "") -> Any:
     """Return the JSON of a plot with its labels in the words of the run's quantities."""
-    if isinstance(part, str):
-        return say(part) if key in ("axis_label", "text", "value", "tooltips") else part
-    if isinstance(part, list):
+    if isinstance(node, str):
+        return say(node) if key in ("axis_label", "text", "value", "tooltips") else node
+    if isinstance(node, list):
         # Of a tooltip the label; what it shows is a column of the source.
-        is_pair = key == "tooltips" and len(part) == 2 and isinstance(part[0], str)
-        return [say(part[0]), part[1]] if is_pair else [_said(item, say, key) for item in part]
-    if isinstance(part, dict):
-        return {name: _said(item, say, name) for name, item in part.items()}
-    return part
+        is_pair = key == "tooltips" and len(node) == 2 and isinstance(node[0], str)
+        return [say(node[0]), node[1]] if is_pair else [_said(item, say, key) for item in node]
+    if isinstance(node, dict):
+        return {name: _said(item, say, name) for name, item in node.items()}
+    return node
 
 
 def _page_json(plot: models.Model, number: int, say: Callable[[str], str]) -> Markup:

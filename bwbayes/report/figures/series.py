@@ -84,11 +84,11 @@ def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
     panel.plot(time, readings, ls="", color=style.Color.MEASURED, **dots)
 
 
-def _around_largest_error(bands: Bands, height: float = 8.0, least: int = 40) -> slice:
+def _around_largest_error(bands: Bands, height: float = 8.0, min_samples: int = 40) -> slice:
     """Return the judged samples about the largest error, within their window.
 
     As many as show at most ``height`` sensor bands of displacement, and a tenth of all samples, but
-    at least ``least`` to either side.
+    at least ``min_samples`` to either side.
     """
     judged = slice(min(bands.scored_from, bands.time.size - 1), None)
     error = np.abs(bands.mean if bands.measured is None else bands.measured - bands.mean)
@@ -99,7 +99,7 @@ def _around_largest_error(bands: Bands, height: float = 8.0, least: int = 40) ->
     samples = np.arange(window.start, window.stop)
     is_distant = np.abs(bands.mean[window] - bands.mean[at]) > height * width / 2
     reach = min([bands.time.size // 20, *np.abs(samples[is_distant] - at)])
-    reach = max(reach, least)
+    reach = max(reach, min_samples)
     return slice(max(at - reach, window.start), min(at + reach + 1, window.stop))
 
 
