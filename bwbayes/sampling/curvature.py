@@ -376,10 +376,10 @@ def _fit_log_scales(near: FloatArray, values: FloatArray) -> FloatArray:
     def loss(logs: FloatArray) -> tuple[float, FloatArray]:
         width = design @ logs
         with np.errstate(over="ignore"):
-            left = squares * np.exp(-2 * width)
+            scaled = squares * np.exp(-2 * width)
         # Drawn to zero by a hundredth of a draw each.
-        value = np.mean(width + 0.5 * left) + 0.005 * logs @ logs
-        return float(value), design.T @ (1 - left) / count + 0.01 * logs
+        value = np.mean(width + 0.5 * scaled) + 0.005 * logs @ logs
+        return float(value), design.T @ (1 - scaled) / count + 0.01 * logs
 
     optimum = scipy.optimize.minimize(loss, np.zeros(1 + others), jac=True, method="L-BFGS-B")
     gain = 0.5 + 0.5 * np.log(np.mean(squares)) - optimum.fun

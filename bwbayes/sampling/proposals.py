@@ -177,10 +177,10 @@ class StudentMixture:
 
     def of_posterior(self, posterior: Posterior) -> StudentMixture:
         """Return the mixture with maps that know what is sampled; a file does not keep it."""
-        known = [
+        maps = [
             replace(m, posterior=posterior) if isinstance(m, SecantMap) else m for m in self.maps
         ]
-        return replace(self, maps=tuple(known)) if self.has_secant else self
+        return replace(self, maps=tuple(maps)) if self.has_secant else self
 
     @property
     def has_secant(self) -> bool:

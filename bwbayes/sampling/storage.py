@@ -219,8 +219,8 @@ class ChainFile(Chain):
                         version=emcee.__version__, nwalkers=walkers, ndim=free, has_blobs=False,
                         iteration=steps,
                     )  # fmt: skip
-                    for row, part in enumerate(unpack_random_state(end.random_state)):
-                        group.attrs[f"random_state_{row}"] = part
+                    for row, element in enumerate(unpack_random_state(end.random_state)):
+                        group.attrs[f"random_state_{row}"] = element
                     for name, series in (("chain", coordinates), ("log_prob", log_density)):
                         values = series[:, number]
                         # Not of a fixed length: emcee's sampler may go on with it.
