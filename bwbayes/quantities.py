@@ -135,11 +135,11 @@ class Quantities:
         """Return what stands for a word, a unit or a time of the package."""
         if word := match["word"]:
             default = DISPLACEMENT if word[0] in "dD" else VOLTAGE
-            own = self.output if default == DISPLACEMENT else self.input
-            if own.name == default.name:
+            quantity = self.output if default == DISPLACEMENT else self.input
+            if quantity.name == default.name:
                 return word
-            several = " values" if len(own.name) <= 2 else "s"
-            name = own.name + several * word.endswith("s")
+            several = " values" if len(quantity.name) <= 2 else "s"
+            name = quantity.name + several * word.endswith("s")
             return name[0].upper() + name[1:] if word[0].isupper() else name
         if match["zero"] or match["slope"]:
             zero = match[0] if self.input == VOLTAGE else f"zero {self.input.name}"
@@ -152,11 +152,15 @@ class Quantities:
         """Return the unit that stands for one of the package, in brackets where that is needed."""
         before, token, after = match["before"] or "", match["unit"] or "", match["after"] or ""
         default = VOLTAGE if token in ("V", "volt", "volts") else DISPLACEMENT
-        own = self.input if default == VOLTAGE else self.output
-        if own.unit == default.unit:
+        quantity = self.input if default == VOLTAGE else self.output
+        if quantity.unit == default.unit:
             return match[0]
-        is_compound = (before or after) and re.search(r"[^\w%°µμ]|\d$", own.unit)
-        return f"{before}({own.unit}){after}" if is_compound else f"{before}{own.unit}{after}"
+        is_compound = (before or after) and re.search(r"[^\w%°µμ]|\d$", quantity.unit)
+        return (
+            f"{before}({quantity.unit}){after}"
+            if is_compound
+            else f"{before}{quantity.unit}{after}"
+        )
 
     def key(self, name: str) -> str:
         """Return a name such as ``rmse_um`` in these quantities: ``rmse_T``."""
@@ -166,7 +170,7 @@ class Quantities:
         words |= {"V": self.input.unit, "um": self.output.unit}
         if not self.has_clock:
             words |= {"s": self.clock.unit}
-        return "_".join(words.get(part, part) for part in name.split("_"))
+        return "_".join(words.get(word, word) for word in name.split("_"))
 
     def heading(self, name: str) -> str:
         """Return a column's name such as ``voltage_V`` in these quantities: ``H (A/m)``."""
@@ -193,12 +197,12 @@ class Quantities:
             return error
         roles = {"voltage": "input", "displacement": "output"}
         columns = {roles.get(q, q): column for q, column in error.guess["columns"].items()}
-        own = {"voltage": self.input.unit, "displacement": self.output.unit}
-        units = {roles.get(q, q): own.get(q, u) for q, u in error.guess["units"].items()}
+        own_units = {"voltage": self.input.unit, "displacement": self.output.unit}
+        units = {roles.get(q, q): own_units.get(q, u) for q, u in error.guess["units"].items()}
         fs = error.fs if self.has_clock else None
-        said = ColumnsError(self.say(error.problem), columns, units, error.place, fs)
-        said.is_said = True
-        return said
+        translated = ColumnsError(self.say(error.problem), columns, units, error.place, fs)
+        translated.is_said = True
+        return translated
 
     @contextmanager
     def spoken(self) -> Iterator[None]:
@@ -216,8 +220,8 @@ class Quantities:
                 raise
             finally:
                 notes = [w for w in caught if issubclass(w.category, InputWarning)]
-                said = [(self.say(str(w.message)), w.category) for w in notes]
-        for text, category in said:
+                messages = [(self.say(str(w.message)), w.category) for w in notes]
+        for text, category in messages:
             warnings.warn(text, category, stacklevel=4)
 
 
