@@ -1,4 +1,4 @@
-"""Voltage and displacement records: what they are, how they are read, checked and written."""
+"""Voltage and displacement records: their class, and functions to read, check and write them."""
 
 from __future__ import annotations
 

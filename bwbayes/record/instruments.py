@@ -1,4 +1,4 @@
-"""What the instruments are worth: how well the scales of sensor and voltage monitor are known.
+"""Uncertainty of the instruments: of the scales of the sensor and of the voltage monitor.
 
 A data sheet's sensitivity is a number with an uncertainty: ``'0.35 +- 0.004 um'`` or
 ``'0.35 um +- 1.2 %'``, a standard uncertainty. True displacement and true voltage are
@@ -6,12 +6,12 @@ A data sheet's sensitivity is a number with an uncertainty: ``'0.35 +- 0.004 um'
     x = s y,   V = g u,   s ~ N(1, r_s²),   g ~ N(1, r_g²),
 
 with the readings y and u. s and g are stages behind and before everything else. The likelihood,
-in the parameters as the readings have them, depends on neither: with every um times s and every V
-times g the same model says the same. So the posterior of s and g is their prior, independent of all
-others, and nothing is gained by sampling it: each draw gets one s and one g, and its parameters are
-multiplied by the powers of these that their units have, d in um/V by s / g, β in 1/V by 1 / g. That
-is exact where priors are those of the record's ranges; a stated prior or a fixed value is of the
-readings. A reading of the same sensor is predicted without s, which cancels.
+in parameters in the scales of the readings, depends on neither: multiplying every um by s and every
+V by g gives the same model. So the posterior of s and g is their prior, independent of all other
+parameters, and sampling them gains nothing: each draw gets one s and one g, and its parameters are
+multiplied by the powers of s and g that their units have, d in um/V by s / g, β in 1/V by 1 / g.
+This is exact where the priors follow from the record's ranges; a stated prior or a fixed value
+refers to the readings. A reading of the same sensor is predicted without s, which cancels.
 
 The records of a fit share one sensor and one monitor. A sensor's linearity, the largest departure
 of its curve from the straight line as a part of the range, is a smooth curve that the readings
@@ -34,23 +34,23 @@ from bwbayes.errors import InputError
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SIGN = r"\s*(?:\+-|\+/-|±)\s*"
-# Larger ones are no calibration, and a normal distribution would reach zero.
+# Largest uncertainty: beyond it there is no calibration, and a normal scale would reach zero.
 LARGEST = 0.2
 
 
 class Scales(NamedTuple):
-    """True over read values of draws: of displacements and of voltages, each (draws,)."""
+    """Ratios of true to read displacements and voltages, one for each draw, (draws,)."""
 
     sensor: FloatArray
     amplifier: FloatArray
 
     @classmethod
     def exact(cls, draws: int) -> Scales:
-        """Return those of instruments that are exact."""
+        """Return the ratios of exact instruments, all of them 1."""
         return cls(np.ones(draws), np.ones(draws))
 
     def factor(self, unit: str, exponent: float | FloatArray = 1.0) -> FloatArray:
-        """Return what turns numbers in a unit, such as ``um/V``, from read to true, (draws,).
+        """Return the ratio of true to read numbers in a unit, such as ``um/V``, (draws,).
 
         ``exponent`` is the n of ``um^(1-n)/V``.
         """
@@ -93,11 +93,11 @@ class Instruments:
                 )
 
     def updated(self, stated: Instruments) -> Instruments:
-        """Return these with what is stated of them."""
+        """Return these instruments with the uncertainties that are stated, those above zero."""
         return replace(self, **{name: value for name, value in vars(stated).items() if value})
 
     def scales(self, draws: int, rng: np.random.Generator) -> Scales:
-        """Draw the scales of so many draws, each in an equal part of its probability."""
+        """Draw scales by stratified sampling: each draw has its own part of the probability."""
         parts = (np.arange(draws) + 0.5) / draws
         scores = scipy.special.ndtri(np.stack([rng.permutation(parts) for _ in range(2)]))
         return Scales(1 + self.sensor_scale * scores[0], 1 + self.amplifier_gain * scores[1])
@@ -109,7 +109,7 @@ class Instruments:
     def displacements(
         self, draws: int, extent: float, rng: np.random.Generator
     ) -> Callable[[slice, FloatArray], FloatArray]:
-        """Return what turns the readings of some draws, (draws, samples), into displacements, um.
+        """Return a function from the readings of draws (draws, samples) to displacements, um.
 
         With φ = 2π y / E over the ``extent`` E, um, of the fitted readings, the sensor's curve is
         σ (a sin φ + b cos φ), a and b standard normal: its sd is that of the linearity everywhere.
@@ -128,7 +128,7 @@ class Instruments:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What is stated, for people."""
+        """The stated uncertainties in words, by subject."""
         named = {
             "sensor scale": (self.sensor_scale, "known to {:.3g} % (one standard uncertainty)"),
             "monitor scale": (
@@ -140,12 +140,12 @@ class Instruments:
         return {name: text.format(100 * value) for name, (value, text) in named.items() if value}
 
 
-# Instruments of which nothing is stated.
+# Instruments without stated uncertainties.
 EXACT = Instruments()
 
 
 def split_uncertainty(unit: str, where: str) -> tuple[str, float | None]:
-    """Return a unit without its uncertainty, and that, relative; None where none is stated.
+    """Return a unit without its uncertainty, and the relative uncertainty, or None without one.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def split_uncertainty(unit: str, where: str) -> tuple[str, float | None]:
 
 
 def part_of_range(text: str, where: str) -> float:
-    """Return the part of a range that a text such as ``0.1 %`` says.
+    """Return the part of a range that a text such as ``0.1 %`` states.
 
     Raises
     ------

@@ -20,14 +20,14 @@ from scipy.optimize import isotonic_regression
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-# Sds: half the intervals of windows that have to intersect, and how far the mean of the samples
-# about an extreme may lie from the outermost of them.
+# Half widths, in sds, of the windows' intervals that have to intersect, and the largest distance of
+# the mean of the samples about an extreme from the outermost of them.
 WITHIN, ABOUT = 1.5, 3.0
 
 
 @dataclass(frozen=True)
 class MonotonePath:
-    """A path (samples,) between so many reversals, and the sd of its length at the most, V."""
+    """A path (samples,), V, its number of reversals, and an upper bound of its length's sd, V."""
 
     path: FloatArray
     reversals: int
@@ -67,7 +67,7 @@ class _Side:
 
 
 def _local_fits(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fits (samples,) to a voltage, their sds, and what these are where the sides agree, V.
+    """Return fits (samples,) to a voltage, their sds, and the sds if both sides agree, V.
 
     A window of m samples has the orthogonal polynomials 1, x and x² − q about its center, whose
     coefficients are sums of u, j u and j² u over it: those of two windows of half its length.
@@ -104,9 +104,9 @@ def _local_fits(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, Float
 
 
 def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, bool]:
-    """Return the samples of the real reversals, and whether the first is a top: see step 2.
+    """Return the samples of the real reversals, and whether the first is a maximum: see step 2.
 
-    The first of them is the extreme that the path begins at.
+    The first of them is the extreme at which the path begins.
     """
     reached_above, reached_below = (fits - margin).tolist(), (fits + margin).tolist()
     reversals: list[int] = []
@@ -159,7 +159,7 @@ def _leveled(
         nearest = np.argsort(away, kind="stable")
         count = np.arange(1, nearest.size + 1)
         outermost = away[nearest] - np.cumsum(away[nearest]) / count
-        # As far as the first that lies outside: more samples at another level agree again.
+        # Stop at the first sample that lies outside: more samples at another level would agree.
         outside = outermost > ABOUT * noise_sd / np.sqrt(count)
         inside = nearest[: np.argmax(outside) if outside.any() else None]
         samples = slice(before + inside.min(), before + inside.max() + 1)

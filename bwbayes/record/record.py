@@ -49,27 +49,27 @@ class Record(Inputs):
     start : float, s
         Time of the first sample.
     voltage_is : "command" or "output"
-        What the voltage column is: the command that a DAC holds until the next sample, or the
+        Kind of the voltage column: the command that a DAC holds until the next sample, or the
         amplifier's output, which is continuous.
     covariates : dict of arrays (samples,)
         Further columns that may act on the actuator, one value a sample, by name.
     quantities : Quantities
-        What ``voltage`` and ``displacement`` are, and in which units, if they are others.
+        Quantities and units of ``voltage`` and ``displacement``, if they are others.
     origin : str
         Where the record comes from: a file's name or free text. Line breaks and other characters
         that do not print become blanks.
     truth : array (samples,), um, or None
         Noise-free displacement, known for simulated records only.
     time_offset : float, s
-        What a clock adds to the record's times, which count from about its first sample: the time
-        stamp of time zero.
+        Offset of the clock, to be added to the record's times, which count from about its first
+        sample: the time stamp of time zero.
     instruments : Instruments
-        How well the scales of sensor and voltage monitor are known.
+        Uncertainties of the scales of sensor and voltage monitor.
 
     Raises
     ------
     InputError
-        If an array is not a vector of finite numbers (of the displacement one is enough), lengths
+        If an array is not a vector of finite numbers (one is enough in the displacement), lengths
         differ, the interval is not a positive number, or `voltage_is` is unknown.
 
     Examples
@@ -137,15 +137,15 @@ class Record(Inputs):
             ``"-nm"`` turns the sign, ``"0.35 um"`` is a sensor's sensitivity, that of 1, and
             ``"0.35 +- 0.004 um"`` or ``"um +- 1.2 %"`` one with its standard uncertainty.
         covariates : dict of arrays as these
-            What else was measured and a model may see: ``{"temperature_degC": temperature}``.
+            Other measured quantities that a model may use: ``{"temperature_degC": temperature}``.
         input, output : str
-            What drives and what is measured, if not a voltage and a displacement: ``"H (A/m)"`` and
+            Input and output quantity, if not a voltage and a displacement: ``"H (A/m)"`` and
             ``"B (T)"``; then neither interval nor time is needed, and units are by these names.
 
         Raises
         ------
         InputError
-            All that a file is refused for; neither interval nor time, or both.
+            For every reason to refuse a file; or if neither interval nor time is given, or both.
 
         Warns
         -----
@@ -216,9 +216,9 @@ class Record(Inputs):
         fs : float, Hz
             The sampling rate, in place of a time column.
         covariates : dict or list of str
-            Further columns that a model may see, by name, as of :func:`read_record`.
+            Further columns that a model may use, by name, as for :func:`read_record`.
         input, output : str
-            What drives and what is measured, as of :func:`read_record`.
+            Input and output quantity, as for :func:`read_record`.
 
         Raises and warns as :func:`read_record` does.
         """
@@ -254,7 +254,7 @@ class Record(Inputs):
 
     @cached_property
     def inputs(self) -> Inputs:
-        """What drives a model: the voltage without its noise, on a clock that starts with it."""
+        """Inputs of a model: the voltage without its noise, on a clock that starts with it."""
         return Inputs(
             self.path.voltage,
             interval=self.interval,
@@ -265,7 +265,7 @@ class Record(Inputs):
 
     @property
     def has_reading(self) -> BoolArray:
-        """Whether the displacement was read, (samples,)."""
+        """True at the samples with a displacement reading, (samples,)."""
         if self.displacement is None:
             return np.zeros(self.samples, dtype=np.bool_)
         return ~np.isnan(self.displacement)
@@ -282,14 +282,14 @@ class Record(Inputs):
 
     @property
     def starts_at_zero(self) -> bool:
-        """Whether the first voltage is zero to a hundredth of the range: perhaps from rest."""
+        """True if the first voltage is zero to a hundredth of the range: perhaps from rest."""
         return abs(float(self.voltage[0])) <= 0.01 * float(np.ptp(self.voltage))
 
     @property
     def beginning(self) -> str:
-        """How the voltage starts: where, and how long it rests there, to a hundredth of the range.
+        """First voltage and time at rest there, to a hundredth of the range, in words.
 
-        A hundredth of the record at most counts as moving at once.
+        A rest of at most a hundredth of the record counts as moving at once.
         """
         first = float(self.voltage[0])
         moving = np.abs(self.voltage - first) > 0.01 * float(np.ptp(self.voltage))
@@ -311,7 +311,7 @@ class Record(Inputs):
         return digest.hexdigest()
 
     def like(self, other: Record) -> Record:
-        """Return the record as one of another one's quantities, in its units, by its instruments.
+        """Return the record with the quantities, units and instruments of another record.
 
         Raises
         ------
@@ -360,7 +360,7 @@ class Record(Inputs):
 
     @property
     def longest_gap(self) -> tuple[float, float] | None:
-        """The longest time without readings, s, from its first sample on; None if all are alike."""
+        """Start and end of the longest time without readings, s; None if all gaps are alike."""
         edges = np.concatenate([[-1], np.flatnonzero(self.has_reading), [self.samples]])
         gaps = np.diff(edges)
         if np.max(gaps) <= 2 * np.median(gaps):
@@ -370,7 +370,7 @@ class Record(Inputs):
         return self.start + first * self.interval, self.start + stop * self.interval
 
     def clock(self, time: float) -> str:
-        """Return a time in s with the decimals that tell neighboring samples apart."""
+        """Write a time, s, with the decimals that distinguish neighboring samples."""
         return clock(time, self.interval)
 
     def window(self, start: float, stop: float) -> Record:
@@ -380,8 +380,8 @@ class Record(Inputs):
     def upto(self, stop: float, first_reading: float | None = None) -> Record:
         """Return the record before `stop`, without the readings before `first_reading` (both s).
 
-        The voltage is kept from the first sample on: what it did before the readings that count is
-        the history that the hysteresis remembers.
+        The voltage is kept from the first sample on: its history before the readings that count
+        determines the state of the hysteresis.
         """
         end = self.window_slice(self.start if first_reading is None else first_reading, stop)
         record = self[: end.stop]
@@ -409,7 +409,7 @@ class Record(Inputs):
         """
         left_out = np.zeros(self.samples, dtype=np.bool_)
         for start, stop in windows:
-            # Refuses what is outside, or ends before it begins.
+            # Refuse windows that are outside, or end before they begin.
             self.window_slice(start, max(stop, start + self.interval) if start < stop else stop)
             first, last = self._offsets([start, stop])
             rounding = 1e-6  # of a sample
@@ -430,7 +430,7 @@ class Record(Inputs):
         return self.without(left_out)
 
     def each_series(self, change: Callable[..., FloatArray], *others: Inputs) -> dict[str, Any]:
-        """Return what a change makes of every series, and of the same one of others, by field."""
+        """Apply a change to every series and to the same series of others; return all by field."""
         series = super().each_series(change, *others)
         for name in ("displacement", "truth"):
             values = [getattr(record, name, None) for record in (self, *others)]
@@ -438,7 +438,7 @@ class Record(Inputs):
         return series
 
     def _offsets(self, times: Sequence[float]) -> FloatArray:
-        """Return the samples from the start to times, s, cut off where they are outside anyway."""
+        """Return the samples from the start to times, s, clipped slightly beyond both ends."""
         offsets = (np.asarray(times, dtype=np.float64) - self.start) / self.interval
         if np.isnan(offsets).any():
             raise InputError(f"window: {times} s: not times; give them in s")
@@ -446,9 +446,9 @@ class Record(Inputs):
 
 
 def _frozen(name: str, values: ArrayLike, samples: int) -> FloatArray:
-    """Return a vector of so many finite numbers that cannot be written to.
+    """Return a read-only vector of ``samples`` finite numbers.
 
-    A displacement may be missing (nan) in all places but one.
+    A displacement may be nan (missing) at all samples but one.
     """
     try:
         vector = np.array(values, dtype=np.float64)
@@ -461,7 +461,7 @@ def _frozen(name: str, values: ArrayLike, samples: int) -> FloatArray:
     missing = np.isnan(vector) & (name == "displacement")
     if missing.all():
         raise InputError(f"{name}: holds no reading; give at least one")
-    vector[missing] = np.nan  # one nan for all, as there are many and a digest tells them apart
+    vector[missing] = np.nan  # one bit pattern for all: a digest distinguishes kinds of nan
     finite = np.isfinite(vector) | missing
     if not finite.all():
         sample = int(np.argmin(finite))

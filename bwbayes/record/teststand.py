@@ -3,8 +3,8 @@
 A commanded electrode voltage goes through the DAC and the amplifier, drives the actuator of the
 paper's Table 1, and comes back through the laser sensor and the ADC as a
 :class:`~bwbayes.record.record.Record`. Another actuator can be put on it, made of any parts that a
-model can have. Because real actuators do what no model says, the displacement can also have a
-discrepancy of known kind and size, so that an analysis can be held against the truth.
+model can have. Because real actuators do not follow any model exactly, the displacement can also
+have a discrepancy of known kind and size, so that an analysis can be compared with the truth.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from bwbayes.record.true_values import true_values
 from bwbayes.record.waveforms import Waveform
 from bwbayes.shown import brief
 
-# Of the discrepancy process; like the others it is part of the stand and not adjustable.
+# Sd and correlation time of the discrepancy process; like all discrepancies it is not adjustable.
 PROCESS_SD = 1.5  # um
 PROCESS_TIME = 0.5  # s
 
@@ -157,7 +157,7 @@ class VirtualTestStand:
     Parameters
     ----------
     discrepancy : {"none", "process", "structural"}
-        Which discrepancy.
+        Kind of the discrepancy.
     sample_rate : float
         Hz.
     amplifier : Amplifier
@@ -168,7 +168,7 @@ class VirtualTestStand:
         The parts of the actuator, by default n = 1 Bouc-Wen hysteresis and a mass on a spring. Its
         interval is the stand's, its hold that of the amplifier.
     true : mapping of str to float
-        True values of its parameters; of those that are not given the ring bender's, or typical
+        True values of its parameters; those that are not given are the ring bender's, or typical
         ones. With an ``initial`` the hysteresis starts in that state.
 
     Raises
@@ -284,7 +284,7 @@ class VirtualTestStand:
 
     @property
     def _from_rest(self) -> bool:
-        """Whether the voltage came straight from zero; else ``initial`` is the first state."""
+        """True if the voltage came straight from zero; else ``initial`` is the first state."""
         one_state = isinstance(self.actuator.hysteresis, OneState)
         return not one_state and "initial" not in self.true
 
@@ -310,8 +310,8 @@ class VirtualTestStand:
 def creep(displacement: FloatArray, interval: float) -> FloatArray:
     """Creep, (samples,), um, of 1% of a displacement, (samples,), um, per decade of time.
 
-    By Kelvin-Voigt elements: each is a lag, ``tau_i c_i' + c_i = 0.005 x``, at rest at zero before
-    the first sample, and the creep is their sum. The times tau_i are two per decade from 0.01 s to
+    The creep is the sum of Kelvin-Voigt elements: each is a lag, ``tau_i c_i' + c_i = 0.005 x``, at
+    rest at zero before the first sample. The times tau_i are two per decade from 0.01 s to
     10,000 s, so that after a step the creep rises by 1% of it per decade within a hundredth of
     that (their ripple is 0.3%), from 0.1 s to 100 s after the step. The displacement is taken as
     linear between samples, an interval, s, apart.

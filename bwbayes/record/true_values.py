@@ -1,8 +1,8 @@
 """True values for any actuator on the virtual stand, of the size of the paper's ring bender.
 
-A ring bender moves by about 60 um either way at 100 V, a tenth of it hysteresis. Where the medians
-of a part's default priors make such an actuator, they are its true values; other values are stated
-here, in one table.
+A ring bender moves by about 60 um either way at 100 V, a tenth of it hysteresis. The medians of a
+part's default priors are its true values where they make such an actuator; this module states the
+other values in one table.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ RING_BENDER = Ranges(
     covariates={"temperature_degC": (20.0, 25.0)},
 )
 
-# Priors that other parameters' bounds cut, and priors about zero, say little by their medians.
-# Loops of the ring bender at 100 V, and terms beside it that show.
+# True values where medians are no guide: other parameters' bounds cut the prior, or it is centered
+# at zero. They give the ring bender's loops at 100 V, and visible further terms.
 OPERATORS: Mapping[type[Operator], Mapping[str, float]] = {
     BacklashLike: {"d": 0.7, "alpha": 0.35, "beta": 0.04, "initial": 0.0},
     BoucWenAsymmetric: {
@@ -69,8 +69,8 @@ def true_values(actuator: Actuator, table: Mapping[str, float]) -> dict[str, flo
     Raises
     ------
     InputError
-        Nothing says what a parameter's value might be: that of a part from outside the package,
-        without a default prior.
+        A parameter has no known value: its part is from outside the package and states no default
+        prior.
     """
     operator = actuator.hysteresis
     stated = table if isinstance(operator, BoucWen) else OPERATORS.get(type(operator), {})

@@ -1,9 +1,9 @@
-"""The path of a measured voltage: what is left of it without the noise of its reading.
+"""Path of a measured voltage: the voltage without the noise of its reading.
 
 Rate-independent hysteresis, dh = α du − β |du| h − γ du |h|, remembers every reversal of its input.
 White noise of the sd s on the reading of a voltage u adds a path of 2 s / √π per sample, and erases
-memory that the actuator still has. What counts of a path is which reversals are real, how high they
-are, and that it is monotone between them:
+memory that the actuator still has. The real reversals of a path and their heights have to be right,
+and it has to be monotone between them:
 
 1. The noise's sd comes from differences of rising order p, sd(Δᵖ u) = s √C(2p, p) for noise alone:
    the share of a smooth voltage dies out. While the estimates still fall, no noise can be told.
@@ -24,14 +24,14 @@ from bwbayes.arrays import FloatArray
 from bwbayes.record.monotone_path import fit_path
 from bwbayes.shown import brief
 
-# Parts of the range: from the first on the path is not known well enough for parameters; what
-# seems noise beyond the second is a voltage that changes too fast for its sampling.
+# Limits of the noise's sd as parts of the range: from the first on, the path is too uncertain for
+# parameters; beyond the second, the voltage changes too fast for its sampling.
 REPAIRABLE, LARGEST = 0.005, 0.03
 
-# The same of a step to which the voltage is rounded: a hold's level is known to half of it.
+# The same limit for a step to which the voltage is rounded: a hold is known to half of a step.
 COARSE = 0.003
 
-# Excess of path that does no harm, as a part of the path; of what is in doubt, in sds.
+# Harmless excess of the path, as a part of the path, and the smallest clear excess, in sds.
 HARMLESS, DOUBTFUL = 1e-3, 3.0
 
 # Fewer samples show no noise.
@@ -43,10 +43,10 @@ LINES, ROUNDS = 3, 8
 
 @dataclass(frozen=True)
 class VoltagePath:
-    """The voltage that moves the actuator, as far as its reading shows it.
+    """Estimate of the voltage that moves the actuator, from its reading.
 
-    ``voltage`` (samples,), V, is the measured one without noise of the sd ``noise_sd``, V; where
-    that is 0, it is the measured one bit for bit. ``remark`` is what to know of it, if anything.
+    ``voltage`` (samples,), V, is the measured one without noise of the sd ``noise_sd``, V; if that
+    is 0, it is the measured one bit for bit. ``remark`` is a note for the user, or "".
     """
 
     __repr__ = brief
@@ -56,7 +56,7 @@ class VoltagePath:
     remark: str = ""
 
     def redrawn(self, generator: np.random.Generator) -> FloatArray:
-        """Return the path (samples,), V, that is estimated of this one with new noise on it."""
+        """Add new noise to this path and return the path (samples,), V, estimated from that."""
         if self.noise_sd == 0:
             return self.voltage
         noise = self.noise_sd * generator.standard_normal(self.voltage.size)
@@ -78,14 +78,14 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
     hum, frequencies, last = np.zeros_like(u), list[float](), 0.0
     for searched in range(ROUNDS):
         sd, settled = noise_sd(u - hum)
-        # To round is monotone: that alone adds no reversal.
+        # Rounding is monotone, so that it adds no reversal.
         if sd == 0 or (settled and sd < 1.1 * step / sqrt(12)):
             return VoltagePath(voltage)
         if not (settled or searched):
             remark = "voltage changes too fast for its sampling to tell its noise: none is removed"
             return VoltagePath(voltage, remark=remark)
         fitted = fit_path(u - hum, max(sd, step / 2))
-        # The first and the last may not have shown yet that they are real.
+        # The first and the last reversal may be real without enough evidence.
         if not searched and turns(u) <= fitted.reversals + 1:
             return VoltagePath(voltage)
         residual = u - hum - fitted.path
@@ -124,7 +124,7 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
 
 
 def rounding_step(voltage: FloatArray) -> float:
-    """Return the step of which all differences of a voltage are multiples, V, or 0."""
+    """Return the step, V, that divides all differences of a voltage, or 0."""
     gaps = np.diff(np.unique(voltage))
     gaps = gaps[gaps > 1e-6 * np.ptp(voltage)]  # not the rounding of doubles
     if not gaps.size:
@@ -134,15 +134,15 @@ def rounding_step(voltage: FloatArray) -> float:
 
 
 def noise_sd(voltage: FloatArray) -> tuple[float, bool]:
-    """Return the sd of the white noise on a voltage, V, and whether it is that: see step 1.
+    """Return the sd of the white noise on a voltage, V, and whether it is noise: see step 1.
 
-    If not, the voltage changes too fast for its sampling, and the noise's sd may be less.
+    If it is not, the voltage changes too fast for its sampling, and the noise's sd may be less.
     """
     extent, orders, sds = float(np.ptp(voltage)), range(4, 11), list[float]()
     differences = np.diff(voltage, orders[0] - 1)
     for order in orders:
         differences = np.diff(differences)
-        # A median, as corners and steps are few.
+        # Take the median, since corners and steps are few.
         sd = float(np.median(np.abs(differences))) / 0.6745 / sqrt(comb(2 * order, order))
         sds.append(sd)
     if sds[-1] < 1e-9 * extent:
@@ -153,7 +153,7 @@ def noise_sd(voltage: FloatArray) -> tuple[float, bool]:
 
 
 def turns(voltage: FloatArray) -> int:
-    """Return how often a voltage turns."""
+    """Return the number of reversals of a voltage."""
     steps = np.diff(voltage)
     return int(np.count_nonzero(np.diff(np.sign(steps[steps != 0]))))
 
@@ -163,7 +163,7 @@ def _length(path: FloatArray) -> float:
 
 
 def _line(residual: FloatArray, noise_sd: float) -> float:
-    """Return the strongest line of a residual, rad per sample, or 0: 20 times its surroundings."""
+    """Return the frequency of a residual's strongest line, rad per sample, or 0 without any."""
     n = residual.size
     if n < 300:
         return 0.0
@@ -173,7 +173,7 @@ def _line(residual: FloatArray, noise_sd: float) -> float:
     near = np.median(power[max(k - 40, 1) : k + 41])
     if power[k] < max(12 + log(n), 20 * near):
         return 0.0
-    # Between the bins, by sums over parts along which a wave of the bin is off by little.
+    # Refine between the bins, by sums over parts in which a wave of the bin stays nearly in phase.
     parts = np.arange(0, n, max(n // 256, 1))
     sums = np.add.reduceat(residual * np.exp(-2j * np.pi * k / n * np.arange(n)), parts)
     offsets = 2 * np.pi / n * np.linspace(-1, 1, 81)

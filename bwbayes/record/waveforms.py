@@ -43,7 +43,7 @@ class Carrier(Protocol):
 
 @dataclass(frozen=True)
 class _Periodic:
-    """What a sine and a triangle share."""
+    """Fields and checks that a sine and a triangle share."""
 
     amplitude: float
     frequency: float
@@ -265,7 +265,7 @@ class Waveform:
         return time, self(time)
 
 
-# Those of the paper. Two misprints are read as the text means them: equation (2) lost its sine, so
+# The paper's signals. Two misprints are read as the text means them: equation (2) lost its sine, so
 # it is 100 sin(2 pi t), whose phase at 0.5 s is pi, and the voltage goes down first; the factor 1
 # - 0.1 (t - 4) of equations (3) and (4) turns negative after 14 s, where the text lets the
 # amplitude be zero. ASSUMPTIONS, where the paper says nothing: the verification signal decays
@@ -288,12 +288,12 @@ SIGNALS: Mapping[str, Waveform] = MappingProxyType(
 
 
 def signal_names() -> tuple[str, ...]:
-    """Return the names that :func:`signal` knows."""
+    """Return the names of all signals of :func:`signal`."""
     return tuple(SIGNALS)
 
 
 def signal(name: str) -> Waveform:
-    """Return one of the paper's signals by its name; :func:`signal_names` are all of them.
+    """Return one of the paper's signals by its name; :func:`signal_names` lists all names.
 
     ``identification``: rest for 0.5 s, then a sine of 100 V and 1 Hz whose amplitude decays from
     4 s on at 0.1 per second, 16 s long, equations (1)-(4). ``verification``: rest for 5 s, then a

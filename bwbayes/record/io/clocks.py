@@ -1,4 +1,4 @@
-"""Columns with clocks of their own: put together by their times, not by their numbers.
+"""Alignment of columns that have different clocks, by their times instead of their row numbers.
 
 LabVIEW's files state for each channel when it starts and how often it is sampled. The times of a
 record are the voltage's, as its whole path counts; displacement readings go to the nearest of them.
@@ -20,9 +20,9 @@ def align_clocks(table: ColumnTable) -> ColumnTable:
     """Return a table whose displacement readings are at the times of its voltage.
 
     Both are cut to the time that they have in common. Readings a whole number of samples away are
-    moved exactly, and others along their slope (:meth:`Grid.filled`) by up to half an interval. Of
-    a faster displacement the readings nearest to the voltage's times remain; a slower one has no
-    reading between. A time column gives way to clocks that differ, and they to a rate of the user.
+    moved exactly, and others along their slope (:meth:`Grid.filled`) by up to half an interval. A
+    faster displacement keeps the readings nearest to the voltage's times; a slower one has no
+    reading between. Clocks that differ replace a time column, and a user's rate replaces them.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def align_clocks(table: ColumnTable) -> ColumnTable:
     samples = np.arange(voltage.values.size)
     if times.size == samples.size and np.abs(times - samples).max() <= 0.01:
         return table
-    # A hair more than a half, so that rounding decides nothing halfway between two.
+    # Slightly more than a half, so that rounding decides nothing halfway between two.
     half = 0.5 + 1e-6
     readings = np.floor((samples - delay / interval) / ratio + half).astype(np.int64)
     away = times[readings.clip(0, times.size - 1)] - samples

@@ -1,9 +1,9 @@
-"""Which series of a file are time, voltage and displacement, and in which units.
+"""Choice of the series of a file that are time, voltage and displacement, and of their units.
 
 The package's own names carry quantity and unit (``voltage_mV``); other names are recognized by
 their word (``t [ms]``, ``pos``), or else by their unit, where they can mean nothing else; a
-:class:`Naming` settles the rest. What is still open is one :class:`ColumnsError`: all of it, with
-the series that there are and a guess.
+:class:`Naming` settles the rest. One :class:`ColumnsError` lists all that is still open, with the
+series in the file and a guess.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, epoch_unit, scale_
 
 @dataclass(frozen=True)
 class Naming:
-    """Which columns of a file hold the quantities, and in which units.
+    """Columns of a file that hold the quantities, and their units.
 
     Parameters
     ----------
@@ -55,17 +55,17 @@ class Naming:
     fs
         The sampling rate, Hz, in place of a time column.
     table
-        Of a file with several tables the one that counts: its number, from 1 on, or its title.
+        Table to read from a file with several: its number, from 1 on, or its title.
     displacement_file
         The file with the displacement, if it is another one than that with the voltage.
     covariates
-        The columns of covariates by their names; or columns that are called as these are.
+        The columns of covariates by the covariates' names, or a list of columns with those names.
     input, output
-        What the voltage and the displacement are, where they are others, as ``"H (A/m)"``.
+        Quantities in place of voltage and displacement, such as ``"H (A/m)"``.
     linearity
         The sensor's largest departure from a straight line: ``"0.1 %"`` of the range.
     instruments
-        How well the instruments are known, as units and linearity say.
+        Uncertainties of the instruments, from the units and the linearity.
 
     Raises
     ------
@@ -183,7 +183,7 @@ class Naming:
 
     @property
     def quantities(self) -> Quantities:
-        """What the voltage and the displacement are."""
+        """The quantities that stand for voltage and displacement."""
         return Quantities.of(self.input, self.output)
 
     @property
@@ -195,7 +195,7 @@ class Naming:
 
 @dataclass(frozen=True)
 class FileColumn:
-    """One column as it stands in a file; its unit may be a number of units, and negative."""
+    """A column as the file has it; its unit may have a factor, which may be negative."""
 
     name: str
     values: NDArray[Any]
@@ -203,7 +203,7 @@ class FileColumn:
     clock: Clock | None = None
 
     def scaled(self, values: FloatArray, quantity: str) -> FloatArray:
-        """Return values in this column's unit in the package's; without a unit as they are."""
+        """Convert values from this column's unit to the package's; without a unit, keep them."""
         if not self.unit:
             return values
         factor, power = scale_of(self.unit, quantity) or (1.0, 0)
@@ -215,9 +215,9 @@ class FileColumn:
 class ColumnTable:
     """The columns of a file by quantity ("time", "voltage", "displacement", "truth") or covariate.
 
-    ``notes`` is what the file says in words. ``naming`` finds the same columns again; the times
-    are those of its rate, or of the source, where there is no column of them. ``rows`` are the
-    samples of the file that are in it, if not all.
+    ``notes`` are the notes in the file. ``naming`` finds the same columns again; without a time
+    column, the times come from its rate or from the source. ``rows`` are the indices of the file's
+    samples that are in the table, or None for all.
     """
 
     source: Source
@@ -337,20 +337,20 @@ def _recognize(source: Source, chosen: dict[str, Series], naming: Naming) -> lis
                 for s in long
                 if s.name not in names
                 and likeness(s.label, s.unit, quantity) == rank
-                # Neither what counts the samples, nor what is asked for, nor an empty column.
+                # Exclude sample numbers, commanded displacements and empty columns of times.
                 and not (rank and quantity != "time" and counts_samples(s))
                 and not (rank == 2 and quantity == "displacement" and is_demand(s))
                 and not (quantity == "time" and s.clock and not finite(s).size)
             ]
             if rank == 1 and quantity == "voltage" and any(map(is_demand, candidates)):
-                # A command, unless an output may be there too.
+                # Take the command as the voltage only if no other column may be the output.
                 candidates += [s for s in long if likeness(s.label, s.unit, quantity) == 2]
             if quantity in settled or not candidates:
                 continue
             settled.add(quantity)
             candidates = beside(candidates, chosen)
-            if len(candidates) == 1:  # several leave it open, whatever their units are
+            if len(candidates) == 1:  # several candidates leave it open, whatever their units
                 chosen[quantity] = candidates[0]
-                if rank == 2 and quantity != "time":  # of seconds there is no doubt
+                if rank == 2 and quantity != "time":  # seconds leave no doubt
                     by_unit.append(quantity)
     return by_unit

@@ -1,9 +1,9 @@
-"""From the columns of a file to a record that can be trusted: units, lengths, numbers, gaps.
+"""Conversion of a file's columns to a checked record: units, lengths, finite numbers, gaps.
 
-What all formats share is checked here: lengths, finite numbers, a voltage and a displacement that
-move. A displacement may be missing here and there (nan, or a number far from all others), and so
-may whole samples, as times without a voltage are, where the voltage is known: a command is held,
-and an output is interpolated where that is right elsewhere. A problem is one line,
+The checks here apply to all formats: lengths, finite numbers, a voltage and a displacement that
+move. Single displacements may be missing (nan, or a number far from all others). Whole samples, or
+their voltages alone, may be missing where the voltage can be inferred: a command is held, and an
+output is interpolated if interpolation is right elsewhere. A problem is one line,
 ``file:line: column: problem; what to do``; files without lines name the sample, counted from 0.
 """
 
@@ -97,7 +97,7 @@ def record_fields(
 
 
 def _instruments(table: ColumnTable) -> Instruments:
-    """Return what the file says of the instruments, with what is stated of them."""
+    """Return the instruments by the file's notes, updated by the uncertainties the user states."""
     texts = [table.notes.get(name) or "0" for name in INSTRUMENT_NOTES]
     try:
         noted = Instruments(*map(float, texts))
@@ -107,7 +107,7 @@ def _instruments(table: ColumnTable) -> Instruments:
 
 
 def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
-    """Return a displacement that is asked for, (samples,), um, and its sampling interval, s.
+    """Return a reference displacement (samples,), um, and its sampling interval, s.
 
     Raises
     ------
@@ -148,10 +148,10 @@ def _without_empty_ends(table: ColumnTable) -> ColumnTable:
 
 
 def _without_marks(table: ColumnTable) -> ColumnTable:
-    """Return the table without readings of a number that marks missing ones, as inf, -9999 or 1e30.
+    """Return the table without readings that mark missing ones, such as inf, -9999 or 1e30.
 
-    A finite one is repeated, further from all others than they are apart, where the voltage is one
-    that others were read at.
+    A finite mark is a repeated number that is farther from all other readings than these are from
+    each other, mostly at voltages within the range at which the others were read.
     """
     column, voltage = table.columns["displacement"], table.columns["voltage"].values
     readings = np.array(column.values, dtype=np.float64)
@@ -170,7 +170,7 @@ def _without_marks(table: ColumnTable) -> ColumnTable:
         is_other = is_finite & ~is_mark
         if np.count_nonzero(is_other) < _MINIMUM_SAMPLES:
             break
-        # Halved, as the largest numbers are no further apart than a number can be.
+        # Halve all numbers: the difference of the largest ones could overflow.
         others, volts = readings[is_other] / 2, voltage[is_other]
         distance = max(others.min() - mark / 2, mark / 2 - others.max())
         inside = (voltage[is_mark] >= volts.min()) & (voltage[is_mark] <= volts.max())
@@ -196,7 +196,7 @@ def _check_moving(table: ColumnTable, quantity: str, values: FloatArray) -> None
 
 
 def _converted(table: ColumnTable, quantity: str) -> FloatArray:
-    """Return a column in the package's unit after refusing what is not finite or absurdly large."""
+    """Convert a column to the package's unit; refuse numbers not finite or absurdly large."""
     column = table.columns[quantity]
     largest = 1e12 if quantity == "time" else 1e9  # s; V or um, whatever the actuator
     if not table.quantities.are_default and quantity != "time":
@@ -230,15 +230,15 @@ def _grid(table: ColumnTable) -> tuple[ColumnTable, Grid]:
 def _without_gaps(
     table: ColumnTable, grid: Grid, quantity: str, values: FloatArray, held: bool
 ) -> FloatArray:
-    """Return a column at all times of the grid: held where samples are missing, or interpolated.
+    """Return a column at all times of the grid; hold or interpolate it where samples are missing.
 
-    Gaps are filled as is right elsewhere to 1% of the range: along the line between both ends, else
-    along a polynomial, else along the line if between others as far apart no value is beyond both.
+    An interpolation fills a gap if it is right elsewhere to 1% of the range: the line between both
+    ends, else a polynomial, else the line if no value between ends as far apart lies beyond both.
 
     Raises
     ------
     InputError
-        It is interpolated, and none of these will do.
+        The column is interpolated, and no interpolation is right elsewhere.
     """
     positions, sources = grid.positions, grid.sources
     if positions is None or sources is None:
@@ -257,7 +257,7 @@ def _without_gaps(
         errors = np.abs(inside - (1 - share) * ends[0] - share * ends[1])
         if errors.size and errors.max() <= 0.01 * np.ptp(values):
             continue
-        # Hysteresis depends on extrema alone: how far beyond both ends such a gap would hide one.
+        # Hysteresis depends on extrema alone: measure by how much such a gap would hide one.
         hidden = np.abs(inside - inside.clip(ends.min(axis=0), ends.max(axis=0)))
         hides_none = hidden.size > 0 and hidden.max() <= 0.01 * np.ptp(values)
         smooth = is_smooth(values, positions, missing)

@@ -1,6 +1,6 @@
 """Read and write records: text of any kind, HDF5, netCDF, MATLAB, NumPy and LabVIEW files.
 
-What a file is, its content says, not its suffix. Records are written by the suffix: ``.csv``,
+The content of a file tells its format, not its suffix. Records are written by the suffix: ``.csv``,
 ``.txt``, ``.h5``, ``.hdf5``, ``.mat``. The noise-free displacement of a simulated record travels
 with it: in a second text file ``NAME.truth.csv`` beside ``NAME.csv``, or as ``truth_um`` inside the
 binary formats.
@@ -40,21 +40,21 @@ _BINARY = (".h5", ".hdf5", ".mat")
 
 
 class Format(NamedTuple):
-    """A kind of file: what its content begins with, the suffix of its names, and what reads it."""
+    """A file format: the first bytes of its content, the suffix of its names, and its reader."""
 
     mark: bytes
     suffix: str
     read: Callable[[Path], Source]
 
 
-# A line a format. HDF5, archives and text, which begin with anything, are told by `_reader`.
+# One line for each format. `_reader` recognizes HDF5, archives and text, which have no fixed start.
 FORMATS: tuple[Format, ...] = (
     Format(b"\x93NUMPY", ".npy", read_numpy),
     Format(b"MATLAB", ".mat", read_mat),
     Format(b"TDSm", ".tdms", read_tdms),
     Format(b"CDF", ".nc", read_netcdf),
 )
-# What a folder of records is searched for.
+# Suffixes of the files that are taken as records in a folder.
 SUFFIXES = (
     *(*_TEXT, ".h5", ".hdf5", ".npz", ".lvm", ".xlsx", ".gz"),
     *(each.suffix for each in FORMATS),
@@ -85,7 +85,7 @@ def read_record(
         TDMS; the content says which. Columns may carry their units in their names, `time_s`,
         `voltage_V`, `displacement_um` or with other SI prefixes. Other names are recognized where
         they can mean nothing else: ``t [ms]``, ``U_mV``, ``pos (nm)``. Times that are not uniform
-        are taken as the nearest that are.
+        are moved to the nearest uniform ones.
     voltage_is : "command", "output" or None
         Overrides what the file says about its voltage; a file that says nothing means "output".
     need_displacement : bool
@@ -96,8 +96,8 @@ def read_record(
     units : dict
         A column's unit, if the file does not state it: nm; -nm turns the sign; '0.35 um' is a
         sensor's sensitivity, '0.35 +- 0.004 um' or '0.35 um +- 1.2 %' one with its standard
-        uncertainty. By quantity, ``{"displacement": "nm"}``; a sensitivity is that of 1 in the
-        column.
+        uncertainty. Units are given by quantity, ``{"displacement": "nm"}``; a sensitivity is the
+        displacement for 1 in the column.
     fs : float
         Sampling rate, Hz, in place of a time column.
     table : int or str
@@ -105,15 +105,15 @@ def read_record(
     displacement_file : path
         The file with the displacement, if the record's has the voltage alone.
     covariates : dict or list
-        Further columns that a model may see, by name: temperature_degC. A list names columns that
-        are called so.
+        Further columns that a model may use, by name: temperature_degC. A list holds the names of
+        columns in the file.
     input : str
-        What drives, if not a voltage: 'H (A/m)'. Its column is converted to that unit; columns and
-        units may be given for "input" and "output", or by the quantities' own names.
+        Input quantity, if it is not a voltage: 'H (A/m)'. Its column is converted to that unit;
+        columns and units may be given for "input" and "output", or by the quantities' own names.
     output : str
-        What is measured, if not a displacement: 'B (T)'.
+        Output quantity, if it is not a displacement: 'B (T)'.
     linearity : str
-        The sensor's largest departure from a straight line, of the range: '0.1 %'.
+        The sensor's largest departure from a straight line, as a part of the range: '0.1 %'.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def read_named(
 
 
 def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[FloatArray, float]:
-    """Read what a displacement is to be: its samples, um, and their interval, s.
+    """Read a reference displacement: its samples, um, and their interval, s.
 
     The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes,
     or as the ``naming`` says; a voltage in it does not count.
@@ -188,7 +188,7 @@ def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[Floa
 
 
 def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
-    """Read the columns of a file that count, with the naming that they were recognized by.
+    """Read the columns of a file that a record needs, with the naming that recognized them.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
 
 
 def read_source(path: Path, table: int | str | None = None) -> Source:
-    """Return what a file holds, whatever it is, or a ``table`` of it.
+    """Return the series of a file of any format, or those of one ``table`` in it.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
 
 
 def _existing(path: Path) -> Path:
-    """Return a path, or the one that `path_text` wrote so as its name is not UTF-8."""
+    """Return a path; if it does not exist, undo the escapes of `path_text` for bytes not UTF-8."""
     if path.exists():
         return path
     encoded = os.fsencode(path)
@@ -239,9 +239,9 @@ def _existing(path: Path) -> Path:
 
 
 def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path], Source]:
-    """Return what reads a file that begins so.
+    """Return the reader of a file with this beginning.
 
-    Raises InputError: it is of no kind that is read.
+    Raises InputError if the format is unknown.
     """
     if h5py.is_hdf5(path):  # MATLAB's of version 7.3 too
         return read_hdf5
@@ -314,7 +314,7 @@ def _truth_path(path: Path) -> Path:
 
 @contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """Give another name to write to, which becomes the file's in one step once it is whole."""
+    """Give a draft file to write, which replaces the file in one step once it is whole."""
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield draft

@@ -1,9 +1,9 @@
-"""The uniform grid on which the samples of a record are, from their times.
+"""Uniform time grid of a record, derived from the times of its samples.
 
 Times count as uniform as far as their digits can tell. Where samples are missing, the others stay
 at their places. Where times scatter, as those of a loop in a program do, samples move to the
 nearest times of the grid, along the columns' slopes. Time stamps of a clock count from the first;
-those of a coarse one, whose ticks are longer than an interval, may repeat. Of others a few may.
+those of a coarse one, whose ticks are longer than an interval, may repeat. A few others may, too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bwbayes.record.io.series import MAXIMUM_SAMPLES
 
 
 class Grid(NamedTuple):
-    """The times of a record, s, what a clock adds to them, and where the samples are on the grid.
+    """Times of a record, s, the offset of its clock, and the positions of the samples.
 
     Where not all times of the grid have one sample each, the samples ``sources`` (sources,) are at
     ``positions``; where they were taken at other times, ``elapsed`` (samples,) has these, s.
@@ -36,7 +36,7 @@ class Grid(NamedTuple):
     elapsed: FloatArray | None = None
 
     def only(self, rows: IntArray) -> Grid:
-        """Return the grid of some of its samples, (rows,), with those at both its ends."""
+        """Return the grid of some samples, (rows,), which include the first and the last."""
         if self.positions is None or self.sources is None:
             return self._replace(positions=rows, sources=np.arange(rows.size))
         has_sample = np.isin(self.sources, rows)
@@ -50,8 +50,8 @@ class Grid(NamedTuple):
         """Return a column (samples,) at all times of the grid, nan where no sample is.
 
         Values that were taken a little earlier or later are moved along the column's own slope, by
-        central differences. That keeps a branch of a loop, as it keeps all that is linear, and
-        white noise, but for an eighth more variance where they are moved by half an interval.
+        central differences. This keeps a branch of a loop, since it is exact for all that is
+        linear, and white noise, with up to an eighth more variance at half an interval.
         """
         if self.positions is None:
             return values
@@ -68,7 +68,7 @@ class Grid(NamedTuple):
 
 
 def decimals_of(interval: float) -> int:
-    """Return how many decimals tell the times of neighboring samples apart."""
+    """Return the number of decimals that distinguish the times of neighboring samples."""
     return max(0, -math.floor(math.log10(interval))) if interval > 0 else 9
 
 
@@ -95,8 +95,8 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
     column = table.columns["time"]
     is_float = column.values.dtype.kind == "f"
     raw = column.values if is_float else column.values.astype(np.int64)
-    # From the first one on, which loses no digits of a clock's times. No measurement counts from
-    # its beginning for 1e6 s: what does is a clock, whose first time is left out of the record's.
+    # Count from the first time, so that a clock's times lose no digits. A time above 1e6 s is that
+    # of a clock, not of a measurement that counts from its start: the record's times leave it out.
     elapsed = column.scaled((raw - raw[0]).astype(np.float64), "time")
     start = float(stamps[0])
     offset = start if abs(start) > 1e6 else 0.0
@@ -112,14 +112,14 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
         problem = f"all times are {later}; give those of the samples, or `fs=HZ` for them"
         raise table.error(problem, "time")
     require_plausible(table, interval, elapsed.size)
-    # What a number of the time column may be rounded off in memory, s.
+    # Rounding error of a number of the time column in memory, s.
     rounding = float(np.abs(stamps).max() * np.finfo(column.values.dtype).eps) if is_float else 0.0
     is_repeat = np.append(False, steps == 0)
     is_copy = is_repeat.copy()
     for name in table.columns:
         before, after = table.columns[name].values[:-1], table.columns[name].values[1:]
         is_copy[1:] &= (after == before) | (np.isnan(after) & np.isnan(before))
-    # A coarse clock repeats times, but not all that is read at them.
+    # A coarse clock repeats times, but not all other columns with them.
     if is_copy.any() and (is_copy == is_repeat).all():
         table, elapsed = _without_repeats(table, elapsed, start - offset, is_copy)
         stamps, steps, samples = start + elapsed, np.diff(elapsed), np.arange(elapsed.size)
@@ -149,9 +149,9 @@ def _without_repeats(
 ) -> tuple[ColumnTable, FloatArray]:
     """Return a table in which no time is repeated, and its times, s after ``start``.
 
-    Rows that are a copy of the one above, ``is_copy`` (samples,), are left out. Others of the same
-    time go on or back to times where samples are missing, as a logger writes them that is late, or
-    are left out.
+    Rows that copy the one above, ``is_copy`` (samples,), are left out. Other rows of the same time
+    move on or back to times where samples are missing, as if a late logger had written them, or are
+    left out.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def _without_repeats(
     Warns
     -----
     InputWarning
-        In any case.
+        Always.
     """
     steps = np.diff(elapsed)
     is_repeat = np.append(False, steps == 0)
@@ -171,7 +171,7 @@ def _without_repeats(
     interval = float(np.median(steps[steps > 0]))
     room = np.rint(np.diff(times) / interval)
     is_late = np.append(room, np.inf) < counts
-    # Where the sample before was not repeated, which may need the same time.
+    # Move back only where the sample before was not repeated: it may need the same time.
     is_early = is_late & (np.append(0, np.where(counts[:-1] > 1, 0, room)) >= counts)
     rank = np.arange(rows.size) - first[of]
     shift = np.where(is_late[of], 0, rank) - np.where(is_early[of], counts[of] - 1 - rank, 0)
@@ -200,7 +200,7 @@ def _uniform_interval(
     positions: IntArray,
     rounding: float,
 ) -> float | None:
-    """Return the interval, s, of a grid on which samples are at these positions, if they are."""
+    """Return the interval, s, of a uniform grid with samples at these positions, or None."""
     interval = float(elapsed[-1] / positions[-1])
     # A time may be off the grid by 1% of the interval, or by what printing rounds off, which moves
     # a time and the grid's ends by half a unit of the last decimal each. A whole unit is already an
@@ -221,7 +221,7 @@ def _uniform_interval(
 
 
 def _stated_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
-    """Return the interval, s, of the rate that a file states, if all times as printed are on it."""
+    """Return the interval, s, of a file's stated rate, if all printed times agree, or None."""
     column, rate = table.columns["time"], table.source.stated_rate()
     half = _half_units(np.asarray(column.values, dtype=np.float64))
     if not rate or half is None or "interval_s" in table.notes:
@@ -234,10 +234,10 @@ def _stated_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArra
 def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArray) -> float | None:
     """Return the interval, s, of a uniform grid whose times have a fixed number of digits in print.
 
-    Unlike with a fixed number of decimals, a later time is rounded to a coarser unit. All times are
-    within half a unit of their last digit, or 1% of the interval, along a line. Where late units
-    are longer than 0.8 intervals, early ones have to be short, as coarse times alone would hide
-    missing samples.
+    With a fixed number of digits, unlike decimals, a later time is rounded to a coarser unit. All
+    times lie within half a unit of their last digit, or 1% of the interval, of a line. Where late
+    units are longer than 0.8 intervals, early ones have to be short, as coarse times alone would
+    hide missing samples.
     """
     column = table.columns["time"]
     half = _half_units(np.asarray(column.values, dtype=np.float64))
@@ -259,7 +259,7 @@ def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArr
 
 
 def _half_units(values: FloatArray) -> FloatArray | None:
-    """Return half a unit of the last significant digit of each number, if they have at most 12."""
+    """Return half a unit of each number's last significant digit, if none has more than 12."""
     # Below the smallest normal numbers there are no digits to count.
     size = np.where(np.abs(values) < 1e-290, 0.0, np.abs(values))
     exponent = np.floor(np.log10(np.where(size > 0, size, 1.0)))
@@ -276,8 +276,8 @@ def _slopes_between(
 ) -> tuple[float, float] | None:
     """Return the least and the largest slope of the lines between bounds, if there are any.
 
-    From a slope at either end of what the first and the last bounds allow: as long as two bounds
-    exclude it, these two give the next.
+    The search starts from the slopes at either end of the range that the first and the last bounds
+    allow; while two bounds exclude a slope, these two give the next one.
     """
     slopes = []
     for sign, end in (-1, lower[-1] - upper[0]), (1, upper[-1] - lower[0]):
@@ -309,7 +309,8 @@ def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
     counts = steps / tick
     samples = np.arange(elapsed.size)
     _, interval = np.polynomial.polynomial.polyfit(samples, elapsed, 1)
-    # About the line that is nearest to them all: another one may be a tenth of a tick wider.
+    # Measure about the line nearest to all times: about another one they may be a tenth of a tick
+    # wider.
     margin = tick / samples.size
     width = scipy.optimize.minimize_scalar(
         lambda trial: np.ptp(elapsed - trial * samples),
@@ -332,9 +333,9 @@ def _rounded_interval(table: ColumnTable, elapsed: FloatArray) -> float | None:
 def _nearest_grid(
     table: ColumnTable, elapsed: FloatArray, positions: IntArray, start: float, time_offset: float
 ) -> Grid:
-    """Return the grid that lies nearest to times that are on none, s after the first of them.
+    """Return the uniform grid nearest to irregular times, s after the first of them.
 
-    ``positions`` (samples,) on it are right but for a few.
+    All but a few of the ``positions`` (samples,) on the grid are right.
     """
     sources = np.arange(elapsed.size)
     first, interval = np.polynomial.polynomial.polyfit(positions, elapsed, 1)
@@ -347,7 +348,7 @@ def _nearest_grid(
         positions, index = np.unique(nearest[order], return_index=True)
         sources = order[index]
     scatter = float(away.max())
-    # As exact as three standard errors of the line's slope.
+    # The interval is as exact as three standard errors of the line's slope.
     unsure = 1.5 * scatter / math.sqrt(elapsed.size)
     interval = _exact_interval(table, interval, scatter, unsure, int(np.ptp(positions)))
     remark = f"irregular sampling: samples are moved by up to {scatter:.2g} s onto a uniform grid"
@@ -355,7 +356,7 @@ def _nearest_grid(
         remark += f"; {shared} are left out, where another is nearer to the same time"
     remark = str(table.error(remark, "time", int(np.argmax(away))))
     warnings.warn(remark, InputWarning, stacklevel=6)
-    # No more digits than tell a hundredth of an interval.
+    # Round to the digits that resolve a hundredth of an interval.
     begin = round(float(first + interval * positions[0]), decimals_of(interval) + 2)
     moved = elapsed + first - begin
     positions = positions - positions[0]
@@ -363,9 +364,9 @@ def _nearest_grid(
 
 
 def _with_gaps(table: ColumnTable, steps: FloatArray) -> IntArray:
-    """Return where samples are that follow one another by these steps, s, if some are missing."""
+    """Return the positions of samples separated by these steps, s, some of which may be gaps."""
     gaps = steps > 1.5 * np.median(steps)
-    # The mean of the other steps, as the rounding of the times goes to nothing in it.
+    # Divide by the mean of the other steps, in which the rounding of the times averages out.
     counts = np.where(gaps, np.rint(steps / steps[~gaps].mean()), 1.0)
     if counts.sum() >= MAXIMUM_SAMPLES:
         sample = int(np.argmax(steps))
@@ -385,14 +386,14 @@ def _exact_interval(
 ) -> float:
     """Return the interval that the file declares, if its times agree, or else the roundest one.
 
-    That of a round rate may count as round too.
+    With ``or_rate``, the interval of a round rate counts as round, too.
     """
     text = table.notes.get("interval_s")
     if text is None:
         rate = table.source.stated_rate()
         if rate and abs(1 / rate - measured) <= tolerance / steps:
             return 1 / rate
-        # The digits after these are the rounding of the times.
+        # Digits beyond this uncertainty come from the rounding of the times.
         unsure = max(2 * rounding / steps, 5e-13 * measured)
         rounded = []
         for digits in range(1, 13):
@@ -410,9 +411,10 @@ def _exact_interval(
 
 
 def is_smooth(values: FloatArray, positions: IntArray, missing: int) -> bool:
-    """Tell whether a polynomial across so many values is right where none are missing.
+    """Tell whether a polynomial across ``missing`` values is right where none are missing.
 
-    To 1% of their range, in the middle; it is fitted to as many on either side, and one more.
+    The polynomial is fitted to as many values on either side, and one more; it is right if its
+    error in the middle is at most 1% of the range.
     """
     width = 3 * missing + 2
     if width > values.size:

@@ -43,12 +43,12 @@ from bwbayes.record.record import Record
 
 # Attributes with the names, or units, of a matrix's columns.
 _NAMES = re.compile("column|channel|field|header|^names?$|^labels?$|^unit")
-# Attributes that may scale or shift raw numbers, nobody knows how, and what changes nothing.
+# Attributes that may scale or shift raw numbers in an unknown way, and their neutral values.
 _FACTORS = {
     **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
     **dict.fromkeys(("sensitivity", "offset", "bias"), (0.0,)),
 }
-# What netCDF stores in a dimension that has no numbers, in its attribute NAME.
+# Beginning of the attribute NAME of a netCDF dimension that has no numbers.
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -82,14 +82,14 @@ def write_hdf5(record: Record, path: Path) -> None:
         for name, value in record_notes(record).items():
             # Text of fixed length: HDF5 can loop for ever over damaged text of variable length.
             file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
-    # Not a view of it: one that the traceback of an error holds can crash Python.
+    # Write a copy, not a view: a view that the traceback of an error holds can crash Python.
     path.write_bytes(content.getvalue())
 
 
 def record_arrays(record: Record) -> dict[str, Any]:
     """Return the arrays of a record by the names that they have in files.
 
-    Those of other quantities are input and output, whose unit the notes have.
+    Arrays of other quantities are named input and output; the notes hold their units.
     """
     quantities = record.quantities
     arrays = {
@@ -102,7 +102,7 @@ def record_arrays(record: Record) -> dict[str, Any]:
 
 
 def record_notes(record: Record) -> dict[str, str | float]:
-    """Return what a file says of a record beside its arrays, by the names of `NOTES`."""
+    """Return the notes of a record that a file holds beside its arrays, by the names in `NOTES`."""
     notes: dict[str, str | float] = {
         "voltage_is": record.voltage_is,
         "origin": record.origin,
@@ -128,8 +128,9 @@ def _series(
 ) -> Iterator[Series]:
     """Yield the series of a group and of those below it, each once; collect notes and texts.
 
-    Links to other files, and numbers stored in other files, are passed over unopened: a stranger's
-    file could name any file or device of this machine. So is what MATLAB keeps for itself (``#``).
+    Links to other files, and numbers stored in other files, are skipped unopened: a stranger's
+    file could name any file or device of this machine. MATLAB's internal groups (``#``) are skipped
+    as well.
     """
     passed.add(h5py.h5o.get_info(group.id).addr)
     prefix = group.name.strip("/") + "/" * (group.name != "/")
@@ -176,8 +177,8 @@ def _columns(
 ) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
     """Return names and units of a matrix's columns, or of those in a table's fields, if stated.
 
-    As many words as columns are names: an attribute, or a dataset beside the matrix, as netCDF and
-    pandas have it. Units are the attribute that is called so.
+    The names are as many words as there are columns, in an attribute or in a dataset beside the
+    matrix, as netCDF and pandas write them. The units are in the attribute with that name.
     """
     leaf = dataset.name.rpartition("/")[2]
     if dataset.dtype.names:  # PyTables' list of words, as a text
@@ -211,14 +212,14 @@ def _is_text(kind: Any) -> bool:
 
 
 def _note(attributes: Any, name: str) -> str:
-    """Read an attribute; not a list, which is no note, and damaged ends the process in HDF5."""
+    """Read an attribute, but no list: it is no note, and a damaged one ends the process in HDF5."""
     kind = attributes.get_id(name).dtype
     is_list = kind.kind == "O" and h5py.check_string_dtype(kind) is None
     return "" if is_list else note(attributes[name])
 
 
 def _open(path: Path, *, remark: bool = False) -> Any:
-    """Open a file to read it, even while another program writes it, as far as that is possible.
+    """Open a file for reading, if possible even while another program writes it.
 
     Raises
     ------
@@ -263,7 +264,7 @@ def _loaded(path: Path, name: str) -> Any:
 def _unpacked(values: Any, attributes: Any) -> Any:
     """Return packed numbers by the CF conventions: ``scale_factor * values + add_offset``.
 
-    Those equal to ``_FillValue`` or ``missing_value`` are nan. Source: CF 1.11, 2.5.1 and 8.1.
+    Numbers equal to ``_FillValue`` or ``missing_value`` become nan. Source: CF 1.11, 2.5.1 and 8.1.
     """
     if values.dtype.kind not in "iuf":
         return values
@@ -284,7 +285,8 @@ def _unpacked(values: Any, attributes: Any) -> Any:
 
 
 def _is_circle(data: mmap.mmap, base: int, heap: int) -> bool:
-    # Behind the heap's own size: its first free block, and where its blocks are; 1 ends the list.
+    # The heap's size is followed by its first free block and the address of its blocks; 1 ends the
+    # list.
     block, address = struct.unpack_from("<QQ", data, heap + 16)
     passed = set()
     while block != 1 and base + address + block <= len(data) - 8:
@@ -300,7 +302,7 @@ def _stands_still(data: mmap.mmap, _: int, collection: int) -> bool:
     at, end = collection + 16, min(collection + size, len(data))
     while at + 16 <= end:
         number, length = struct.unpack_from("<H6xQ", data, at)
-        # Number 0 is what is free, and its length includes these 16 bytes.
+        # Number 0 is the free space, and its length includes these 16 bytes.
         step = 16 + (length + 7) // 8 * 8 if number else length
         if not 0 < step <= end - at:
             return True

@@ -39,7 +39,7 @@ def plain_lvm(path: Path, text: str) -> tuple[str, dict[int, Clock]]:
         raise InputError(f"{path}: no segment of samples in it; export it again")
     keys, lines = _keys(parts[0], separator), [""] * f"{head}{parts[0]}".count("\n")
     stride = 2 if x_columns == "Multi" else 1
-    # Where there are several columns of times, their cells in a header are empty, or left out.
+    # With several columns of times, the header's cells above them are empty or left out.
     stated = next((keys[key] for key in ("Samples", "Delta_X", "Y_Unit_Label") if key in keys), [])
     cells = [i for i, cell in enumerate(stated) if cell]
     channels = {
@@ -55,13 +55,13 @@ def plain_lvm(path: Path, text: str) -> tuple[str, dict[int, Clock]]:
                 units[0] = "s"
             columns = names.split(separator)
             named = [f"{n} [{units[i]}]" if units.get(i) else n for i, n in enumerate(columns)]
-            # Of several columns of times the first one counts.
+            # The first of several columns of times counts; the others get another name.
             for i in range(2, len(named) - 1, 2) if x_columns == "Multi" else ():
                 named[i] += f" {i + 1}"
             lines += ["", separator.join(named)]
         lines += samples
     clocks = {i: clock for i, channel in channels.items() if (clock := _clock(channel, time_pref))}
-    if x_columns == "No":  # the column of times is there, and empty
+    if x_columns == "No":  # the file has an empty column of times
         lines = [line.partition(separator)[2] for line in lines]
         clocks = {i - 1: clock for i, clock in clocks.items()}
     return "\n".join(lines) + "\n" * text.endswith("\n"), clocks

@@ -1,4 +1,4 @@
-"""How the numbers stand in a text: between which separators, from which line on, below which names.
+"""Layout of the numbers in a text: their separator, their first line, and the names above them.
 
 Commas, semicolons, tabs, bars or blanks separate the columns, if there are several. The line above
 the numbers names the columns; a second line may hold their units.
@@ -37,7 +37,7 @@ EXAMPLE = "time_s,voltage_V,displacement_um"
 
 
 class Layout(NamedTuple):
-    """How the numbers stand in a text: separator, fields of a line, and the first line's index.
+    """Layout of the numbers in a text: separator, fields of a line, index of the first line.
 
     ``empty`` are the fields of the first line without a value.
     """
@@ -56,7 +56,7 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 
 def find_layout(path: Path, lines: Sequence[str]) -> Layout:
-    """Find how the numbers stand in a text: most lines in its middle and at its end are such."""
+    """Find the layout of the numbers in a text, from the lines in its middle and at its end."""
     center, sample = len(lines) // 2, 60
     probed = [*lines[center : center + sample], *lines[-sample:]]
     rows = [line for line in probed if line.strip() and not line.startswith("#")]
@@ -71,7 +71,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
             continue
         full_rows = [row for row in split if len(row) == width]
         numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in full_rows])
-        # An empty cell speaks for no separator, nor against one.
+        # An empty cell counts neither for a separator nor against it.
         filled = sum(bool(cell) for row in full_rows for cell in row)
         share = float(numeric.sum()) / max(filled, 1) * len(full_rows) / len(split)
         numeric_columns = np.flatnonzero(numeric.mean(axis=0) > 0.5).tolist()
@@ -79,7 +79,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
             best, separator, fields, columns = share, candidate, width, numeric_columns
             whole_columns = np.flatnonzero(numeric.all(axis=0)).tolist()
             empty_columns = [i for i in range(width) if not any(row[i] for row in full_rows)]
-    # A column alone has no separator; as none of its cells has tabs, they are as good as any.
+    # A single column has no separator; a tab will do, since none of its cells holds one.
     alone = [_NUMBER.fullmatch(line.strip(' "')) is not None for line in rows]
     if not columns and np.mean([False, *alone]) > 0.5:
         separator, fields, columns = "\t", 1, [0]
@@ -105,7 +105,7 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
 
 
 def _is_one_with_decimals(rows: Sequence[list[str]]) -> bool:
-    """Tell whether commas are those of decimals in one column: no second number begins with 0."""
+    """Tell whether commas are decimal commas of a single column: no second number begins with 0."""
     pairs = [row for row in rows if len(row) == 2]
     return len(pairs) > 0.5 * len(rows) and any(re.fullmatch(r"0\d+", row[1]) for row in pairs)
 
@@ -113,8 +113,8 @@ def _is_one_with_decimals(rows: Sequence[list[str]]) -> bool:
 def _is_numbering(rows: Sequence[list[str]]) -> bool:
     """Tell whether the first of some rows numbers the columns, as pandas does without names.
 
-    That is if it counts from 0 or 1, and cannot be a sample: it has no decimals where all others
-    have as many, or its step to the next row is none that a column has further down.
+    Such a row counts from 0 or 1 and cannot be a sample: it has no decimals where all other rows
+    have equally many, or its step to the next row does not occur further down in the column.
     """
     first, *others = rows
     width = len(first)
@@ -170,10 +170,10 @@ def find_header(
             unit_row, units = len(rows), bare
             rows.append((index, bare))
         else:
-            # Another row of units; where they differ, it is open which is right.
+            # A second row of units leaves those open that differ.
             units = [_either(*pair) for pair in zip_longest(bare, units, fillvalue="")]
-    # From the numbers upwards: comments, units and names, or names alone.
-    # Below names with their units, more may be said of the columns, but with units of others.
+    # The rows go upwards from the numbers: comments, units and names, or names alone.
+    # Rows below the names with their units may describe the columns, with other units.
     stating = [sum(_states_unit(cell) for cell in cells) for _, cells in rows]
     best = stating.index(max(stating)) if rows else 0
     used = rows[best : best + 1]
@@ -197,7 +197,7 @@ def _states_unit(name: str) -> bool:
 
 
 def _either(unit: str, other: str) -> str:
-    """Return the unit that two texts state, or both of them, which is none, if they differ."""
+    """Return the unit that two texts state; if they differ, both together, which is no unit."""
     scales = [[scale_of(text, q) for q in QUANTITIES] for text in (unit, other)]
     is_same = unit == other or (scales[0] == scales[1] and any(scales[0]))
     return f"{unit} or {other}" if unit and other and not is_same else other or unit
@@ -207,7 +207,7 @@ def split_header(line: str, layout: Layout) -> list[str]:
     """Return the cells of a line, by any separator that gives as many as the numbers have.
 
     Where blanks separate them, names may have several words before a unit in parentheses. Settings
-    may stand above fields without numbers. A note that the package writes has none.
+    may stand above fields without numbers. A note that the package writes has no cells.
     """
     if line.startswith("# ") and line[2:].partition(":")[0] in NOTES:
         return []

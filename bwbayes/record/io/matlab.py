@@ -75,7 +75,7 @@ def read_mat(path: Path) -> Source:
         if struct.unpack_from(f"{order}I", flags[1])[0] & 0xFF == _OPAQUE:
             name, _, class_name = (text.decode("latin-1") for _, text in inner[:3])
             pass_over_object(path, name, class_name)
-        elif inner[1][1]:  # without a name is what MATLAB keeps of its objects
+        elif inner[1][1]:  # MATLAB's own data about its objects has no name
             series += _series("", matrix, order, texts)
     notes = {name: text for name, text in texts.items() if name in NOTES}
     return Source(path, with_units_beside(series, texts), {"": notes})
@@ -93,7 +93,7 @@ def write_mat(record: Record, path: Path, version: MatVersion = "5") -> None:
     content = BytesIO()  # in memory first: HDF5 does not survive a disk that is full
     with h5py.File(content, "w", userblock_size=512) as file:
         for name, values in arrays.items():
-            # MATLAB counts dimensions the other way round: (1, samples) here is a column there.
+            # MATLAB stores dimensions in the reverse order: (1, samples) here is a column there.
             dataset = file.create_dataset(name, data=values[np.newaxis, :])
             dataset.attrs["MATLAB_class"] = np.bytes_("double")
         for name, text in texts.items():

@@ -33,7 +33,7 @@ def read_netcdf(path: Path) -> Source:
         dimensions = {name: v.dimensions for name, v in file.variables.items()}
     series: list[Series] = []
     for name, values in variables.items():
-        # A matrix's columns may have names: a variable of words along the same dimension.
+        # A variable of words along the same dimension names the columns of a matrix.
         words = [
             [str(word).strip() for word in others]
             for other, others in variables.items()

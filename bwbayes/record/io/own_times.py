@@ -1,7 +1,7 @@
-"""Series that have times of their own beside them, as each channel of some programs has.
+"""Series with a column of times each, as some programs write their channels.
 
-They stand in the series' group of the file or, in a text, in the last column of times before it.
-Where those of voltage and displacement differ, each has a clock, by which they are put together.
+The times are in the series' group of the file or, in a text, in the last column of times before it.
+Where the times of voltage and displacement differ, each gets a clock, by which they are aligned.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def with_own_times(
     read = {q: chosen[q] for q in ("voltage", "displacement") if q in chosen}
     own_times = {q: times for q, series in read.items() if (times := _beside(source, series))}
     seconds = {q: _seconds(times, naming) for q, times in own_times.items()}
-    # One column of times for both, or one that cannot be understood, is the matter of others.
+    # Other functions handle one column of times for both, or one that cannot be understood.
     is_known = len({times.name for times in own_times.values()}) == 2
     is_known &= all(times.size > 1 for times in seconds.values())
     if naming.fs is not None or not is_known:
@@ -67,7 +67,7 @@ def with_own_times(
 
 
 def _beside(source: Source, series: Series) -> Series | None:
-    """Return the times of a series alone; None where all series have the same, or none."""
+    """Return the times of one series; None if all series share their times or there are none."""
     times = [
         s
         for s in source.series
@@ -81,7 +81,7 @@ def _beside(source: Source, series: Series) -> Series | None:
 
 
 def _seconds(times: Series, naming: Naming) -> FloatArray:
-    """Return times, s, up to where they end; none of what does not rise, or has no unit."""
+    """Return times, s, up to their end; None if they do not rise or have no unit."""
     unit = naming.units.get("time") or unit_of(times.label, times.unit, "time")
     scale = scale_of(unit or "", "time")
     values = times.numbers("", readings=True).astype(np.float64)

@@ -25,14 +25,14 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
     ColumnsError
         A column or unit of either file that is not known; all of both.
     InputError
-        As of one file; or the files have not as many samples, or not the same times.
+        As for one file; or the files differ in their numbers of samples or in their times.
     """
     tables: dict[str, ColumnTable] = {}
     errors: list[ColumnsError] = []
     for quantity in ("displacement", "voltage"):
         source = sources[quantity]
         own_naming = _own(source, naming, quantity)
-        # Of the file with the voltage times are asked for, unless the other one has them.
+        # The file with the voltage must have times, unless the other one has them.
         is_asked = quantity == "voltage" and not any("time" in t.columns for t in tables.values())
         may_have_times = len(source.series) > 1 and any(map(rises, source.series))
         needed = ["time"] * (is_asked or may_have_times) + [quantity]
@@ -56,7 +56,7 @@ def select_pair(sources: Mapping[str, Source], naming: Naming) -> ColumnTable:
 
 
 def _own(source: Source, naming: Naming, quantity: str) -> Naming:
-    """Return what a naming says of the file with a quantity, whose only column it is, but times."""
+    """Return the naming for one file; its only column besides times holds the quantity."""
     columns = {q: c for q, c in naming.columns.items() if q in ("time", quantity)}
     if len(source.series) == 1:
         columns.pop("time", None)

@@ -1,4 +1,4 @@
-"""What instruments write above the numbers of a text: notes, units, the rate, settings."""
+"""Lines that instruments write above the numbers of a text: notes, units, rate, settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bwbayes.record.io.units import QUANTITIES, unit_in
 
 
 def stated_above(lines: Sequence[str]) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Return the notes in the lines above a header, and what they state of each channel."""
+    """Return the notes in the lines above a header, and the values they list for each channel."""
     notes: dict[str, str] = {}
     preamble: dict[str, list[str]] = {}
     for line in lines:
@@ -28,7 +28,7 @@ def stated_above(lines: Sequence[str]) -> tuple[dict[str, str], dict[str, list[s
 def clock_above(
     notes: Mapping[str, str], preamble: Mapping[str, list[str]], n_samples: int
 ) -> Clock | None:
-    """Return the clock of a stated rate, if the number of samples is stated too, and right."""
+    """Return the clock of a stated rate, if the stated number of samples is right, or None."""
     rate = Source(Path(), (), {"": notes}).stated_rate()
     is_confirmed = preamble.get("record_length", [""])[0] == str(n_samples)
     return Clock(1 / rate) if rate and is_confirmed else None
@@ -40,7 +40,7 @@ def with_units(
     """Return the columns' units, with those that an oscilloscope's preamble states for channels.
 
     The time stands before the channels, if there is one column more than units. A name that stands
-    twice gets a number behind its unit, which is taken here.
+    twice gets a number behind its unit; the unit without that number is returned.
     """
     units = [
         unit or next((u for q in QUANTITIES if (u := unit_in(name, q))), "")
@@ -57,9 +57,9 @@ def with_units(
 
 
 def settings_in(names: Sequence[str], units: Sequence[str]) -> tuple[Clock | None, dict[str, str]]:
-    """Return the clock that oscilloscopes write into the header, if they do, and such numbers.
+    """Return the clock that an oscilloscope writes into the header, or None, and all settings.
 
-    As a number below its name, ``Increment``, or behind it, ``tInc = 1e-6``.
+    A setting is a number below its name, ``Increment``, or behind it, ``tInc = 1e-6``.
     """
     settings = {}
     for name, unit in zip(names, units, strict=True):

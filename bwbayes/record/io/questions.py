@@ -1,4 +1,4 @@
-"""What is open of a file's columns and units, asked at once, with a guess of the answers."""
+"""Questions about a file's columns and units, asked all at once, with a guess of the answers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def columns_error(
     missing: Sequence[str],
     unknown: Sequence[str],
 ) -> InputError:
-    """Return the error that names all that is open, and guesses it."""
+    """Return the error that lists all unknown columns and units, with a guess for each."""
     where = str(source.path)
     if source.lines and source.lines[0] > 1:
         where += f":{source.lines[0] - 1}"
@@ -101,7 +101,7 @@ def _candidates(
 ) -> list[Series]:
     """Return the series that a missing quantity may be: as long as those chosen, and moving.
 
-    Neither those that number the samples, nor settings in columns beside the first numbers.
+    Series that number the samples are left out, and so are settings beside the first numbers.
     """
     others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
     if chosen:
@@ -121,7 +121,7 @@ def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[
     for quantity, series in proposed.items():
         guess = _guess(series.label, quantity)
         foreign = foreign_unit(series, quantity)
-        if foreign and quantity not in units:  # as of a sensor's volts
+        if foreign and quantity not in units:  # for instance volts of a sensor
             questions.append(f"how many {guess} is 1 {foreign} of {series.name!r}")
             guess = f"? {guess}"
         units.setdefault(quantity, guess)
@@ -129,9 +129,9 @@ def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[
 
 
 def _guess(label: str, quantity: str) -> str:
-    """Return the unit that stands anywhere in a name, as in ``ms_since_midnight``, or the usual."""
+    """Return the unit anywhere in a name, as in ``ms_since_midnight``, or the usual unit."""
     *words, last = re.split(r"[\W_]+", label)
-    # An inch or a minute, as opposed to a word, only at the end.
+    # Only at the end of a name is "in" or "min" an inch or a minute instead of a word.
     units = [word for word in words if power_of(word, quantity) is not None]
     units += [last] if unit_scale(last, quantity) else []
     return units[0] if units else COMMON_UNITS[quantity][0]

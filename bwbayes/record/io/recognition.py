@@ -1,4 +1,4 @@
-"""What a series of a file can be: time, voltage or displacement, by its name, unit and numbers."""
+"""Recognition of the quantity of a file's series by its name, unit and numbers."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from bwbayes.errors import InputError, InputWarning
 from bwbayes.record.io.series import Series, Source
 from bwbayes.record.io.units import QUANTITIES, factor_in, unit_in, unit_in_brackets, unit_scale
 
-# In the names of displacements that are asked for, not measured.
+# Words in the names of displacements that are commanded, not measured.
 _DEMANDS = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
-# What other people call the quantities, in lower case and without a unit.
+# Common names of the quantities, in lower case and without a unit.
 WORDS = {
     "time": (
         *("t", "time", "timestamp", "sec", "seconds", "elapsed time", "x_value"),
@@ -61,7 +61,7 @@ def bare_name(label: str, quantity: str) -> str:
 
 
 def is_demand(series: Series) -> bool:
-    """Tell whether a name is that of a displacement that is asked for, not measured."""
+    """Tell whether a series is, by its name, a commanded displacement, not a measured one."""
     return re.search(_DEMANDS, series.label.lower()) is not None
 
 
@@ -78,16 +78,16 @@ def counts_samples(series: Series) -> bool:
 
 
 def foreign_unit(series: Series, quantity: str) -> str:
-    """Return the unit that a file states for a series, if it is none of the quantity."""
+    """Return the unit that a file states for a series, if the quantity cannot have it, or ""."""
     stated = series.unit or unit_in_brackets(series.label) or factor_in(series.label)
     others = [unit for q in QUANTITIES if (unit := unit_of(series.label, series.unit, q))]
-    # A number in brackets is that of a matrix's column.
+    # A number in brackets is the index of a matrix's column.
     stated = "" if stated.isdecimal() else stated
     return "" if unit_of(series.label, series.unit, quantity) else next(iter(others), stated)
 
 
 def beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Series]:
-    """Keep the series that stand beside those that are chosen, and are as long, if any do."""
+    """Keep the series in the group of the first chosen one, and of its length, if there are any."""
     first = next(iter(chosen.values()), None)
     for key in ("group", "size") if first else ():
         alike = [s for s in candidates if getattr(s, key) == getattr(first, key)]
@@ -96,7 +96,7 @@ def beside(candidates: list[Series], chosen: Mapping[str, Series]) -> list[Serie
 
 
 def unit_of(label: str, unit: str, quantity: str) -> str | None:
-    """Return the unit that a file states for a series, if it is one of the quantity, and sure."""
+    """Return the unit that a file states for a series, if it is unambiguous and the quantity's."""
     named = unit_in(label, quantity)
     scale = unit_scale(unit, quantity)
     if factor_in(label) or (named and scale and unit_scale(named, quantity) != scale):
@@ -105,7 +105,7 @@ def unit_of(label: str, unit: str, quantity: str) -> str | None:
 
 
 def finite(series: Series) -> FloatArray:
-    """Return the finite numbers of a series; none of one that has something else but words."""
+    """Return the finite numbers of a series; none if cells are neither numbers nor words."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
@@ -116,7 +116,7 @@ def finite(series: Series) -> FloatArray:
 
 
 def ranges_of(series: Sequence[Series]) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest number of each series of numbers, of the first forty."""
+    """Return the least and the largest number of each of the first forty series with numbers."""
     values = {s.name: finite(s) for s in series[:40]}
     return {name: (v.min(), v.max()) for name, v in values.items() if v.size}
 
@@ -157,10 +157,10 @@ def series_named(source: Source, name: str | int, quantity: str) -> Series:
 
 
 def _span(low: float, high: float) -> str:
-    """Write a range with digits that tell its ends apart, if they differ."""
+    """Write a range with enough digits to distinguish its ends, if they differ."""
     digits = 4
     while low != high and float(f"{low:.{digits}g}") == float(f"{high:.{digits}g}"):
         digits += 1
-    # Two more: how long a record is, not only that it has a length.
+    # Two more digits show how long a record is, not only that its ends differ.
     digits += 2 * (digits > 4)
     return f"{low:.{digits}g} to {high:.{digits}g}"

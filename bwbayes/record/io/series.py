@@ -1,8 +1,8 @@
-"""What a file or a table in memory holds: named series of numbers.
+"""Named series of numbers: the content of a file or of a table in memory.
 
-A reader of a format is a function of a path that returns a :class:`Source`; which of its series are
-time, voltage and displacement is the matter of :mod:`bwbayes.record.io.columns`. Numbers are loaded
-when they are needed, since a file may hold much else.
+A reader of a format is a function of a path that returns a :class:`Source`;
+:mod:`bwbayes.record.io.columns` chooses its series of time, voltage and displacement. Numbers are
+loaded when they are needed, since a file may hold much else.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from bwbayes.errors import InputError, InputWarning, one_line
 
 MAXIMUM_SAMPLES = 10**8
-# Of the instruments, in the order of their fields.
+# Keys of the instruments' uncertainties, in the order of the fields of `Instruments`.
 INSTRUMENT_NOTES = ("sensor_scale_sd", "amplifier_gain_sd", "sensor_linearity")
-# What a file may say beside its numbers.
+# Keys that a file may hold beside its numbers.
 NOTES = (
     *("voltage_is", "origin", "interval_s", "time_offset_s", "covariates"),
     *("input_is", "output_is"),
     *INSTRUMENT_NOTES,
 )
-# What a number beside the series is called, in lower case, that is their rate, Hz, or the interval,
-# s: the power of it that is the rate.
+# Names, in lower case, of a number beside the series that is their sampling rate, Hz, or interval,
+# s, with the power of that number that is the rate.
 RATES = {
     **dict.fromkeys(("fs", "rate", "sample_rate", "samplerate", "sampling_rate"), 1),
     **dict.fromkeys(("dt", "ts", "interval", "interval_s", "sample_time", "sample_interval"), -1),
@@ -39,7 +39,7 @@ RATES = {
 
 
 class Clock(NamedTuple):
-    """When a series without a time column was sampled: every ``interval`` s, first at ``start``.
+    """Clock of a series without a time column: a sample every ``interval`` s from ``start`` on.
 
     The ``start``, s, counts from the file's own zero or, where the file states one, from ``zero``.
     """
@@ -49,7 +49,7 @@ class Clock(NamedTuple):
     zero: np.datetime64 | None = None
 
     def delay(self, other: Clock) -> float:
-        """Return how much later than another series this one starts, s."""
+        """Return the delay of this series' start after that of another one, s."""
         delay = self.start - other.start
         if self.zero is not None and other.zero is not None:
             delay += float((self.zero - other.zero) / np.timedelta64(1, "ns")) / 1e9
@@ -58,12 +58,12 @@ class Clock(NamedTuple):
 
 @dataclass(frozen=True)
 class Series:
-    """A row of numbers: its path in the file, which begins with its group, and how to load it.
+    """A series of numbers: its path in the file, which begins with its group, and its loader.
 
-    ``unit`` is what the file states beside the name; ``load`` returns its ``size`` values, and
-    ``load_readings``, if it is given, the same of which some may be missing: words are nan. A
-    ``clock`` is what the file states in place of a time column. An ``alias`` takes the place of the
-    name where a quantity is recognized by it.
+    ``unit`` is the unit that the file states beside the name; ``load`` returns the ``size`` values,
+    and ``load_readings``, if it is given, the same with nan in place of words, for missing
+    readings. ``clock`` is stated by the file in place of a time column. ``alias`` replaces the name
+    in the recognition of quantities.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Series:
         return self.alias or self.name.removeprefix(self.group)
 
     def numbers(self, where: object, *, readings: bool = False) -> NDArray[Any]:
-        """Load the numbers, (size,), of a series in the file ``where``; of ``readings`` some.
+        """Load the numbers, (size,), of a series in the file ``where``; ``readings`` may be nan.
 
         Raises
         ------
@@ -106,10 +106,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Source:
-    """What a file holds.
+    """Content of a file: its series and its notes.
 
-    ``notes`` are what it says in words (`NOTES`), by the group of the series that they are of.
-    ``lines`` are those of the samples in a text file, from 1 on.
+    ``notes`` are the file's notes (`NOTES`), by the group of the series that they belong to.
+    ``lines`` are the line numbers of the samples in a text file, from 1 on.
     """
 
     path: Path
@@ -126,7 +126,7 @@ class Source:
                     texts[series.label.lower()] = str(series.numbers("")[0])
         for name, power in RATES.items():
             with suppress(ValueError):
-                # Of kHz and ms no number is left.
+                # A number of kHz or ms is not used.
                 text = texts.get(name, "").strip(" ,;\t").removesuffix("Hz").removesuffix("s")
                 if 0 < float(text) < np.inf:
                     return float(float(text) ** power)
@@ -149,10 +149,10 @@ def vectors(
     group, leaf
         The path of the array, with a separator at its end, and its name.
     shape, dtype
-        Those of the array that ``load()`` returns. Without a shape, too large, or with more than
-        64 columns (a picture, or samples in another order) it is passed over.
+        Shape and type of the array that ``load()`` returns. An array without a shape, too large,
+        or with more than 64 columns (a picture, or samples in another order) is skipped.
     unit
-        Of its numbers, if that is stated.
+        Unit of the array's numbers, if it is stated.
     columns
         Names and units of the columns, by the name of the array or the table's field, where as many
         are stated; else columns are numbered.
@@ -184,9 +184,9 @@ def vectors(
 def with_units_beside(series: Sequence[Series], texts: Mapping[str, str]) -> tuple[Series, ...]:
     """Return the series of a MATLAB file with the units that texts beside them state.
 
-    The texts are by their paths. Fields of a struct with one series, but for its times, state the
-    unit of that: ``units`` or, as a timeseries saved as a struct, ``DataInfo.Units``; ``TimeInfo``
-    has that of ``Time``.
+    ``texts`` are given by their paths. In a struct with one series besides its times, the field
+    ``units`` or, in a timeseries saved as a struct, ``DataInfo.Units`` states the unit of that
+    series; ``TimeInfo`` states the unit of ``Time``.
     """
     by_path = {path.replace("/", ".").lower(): text for path, text in texts.items()}
     described = []
@@ -202,22 +202,22 @@ def with_units_beside(series: Sequence[Series], texts: Mapping[str, str]) -> tup
 
 
 def note(value: Any) -> str:
-    """Return what a file says in words as text, whatever type it has there."""
+    """Return a note of a file as text, whatever type it has there."""
     first = np.ravel(value)[0] if np.size(value) else ""
     if isinstance(first, bytes):
         return first.decode("utf-8", errors="replace")
-    # By its own digits: those of a number of 32 bits are fewer.
+    # Write a number with the digits of its own type: one of 32 bits has fewer.
     return repr(float(str(first))) if np.asarray(first).dtype.kind in "iuf" else str(first)
 
 
 def notes_of(value: Any) -> list[str]:
-    """Return each of several notes as text, those in one text by the commas between them."""
+    """Return each of several notes as text; split a single text at its commas."""
     texts = [note(item).strip() for item in np.ravel(value)]
     return [text.strip() for text in texts[0].split(",")] if len(texts) == 1 else texts
 
 
 def pass_over_object(path: Path, name: str, kind: str) -> None:
-    """Say that a MATLAB object, as a table or a timeseries, is not read, and how to save it."""
+    """Warn that a MATLAB object, such as a timeseries, is not read, and say how to save it."""
     struct = "s = table2struct({}, 'ToScalar', true)"
     ways = {
         "timeseries": f"s.Time = {name}.Time; s.Data = {name}.Data",
@@ -243,7 +243,7 @@ def in_seconds(times: Any) -> NDArray[Any]:
 
 
 def damaged(where: object, error: Exception) -> InputError:
-    """Return the error of a file that a reader stumbled over, in whatever way it did."""
+    """Return the error for a damaged file, from any exception that its reader raised."""
     reason = " ".join(str(error).split())[:80] or type(error).__name__
     return InputError(f"{where}: damaged or cut off ({reason}); write it again")
 
@@ -307,7 +307,7 @@ def frame_source(frame: Any, origin: str) -> Source:
 
 
 def _vector(values: Any, origin: str, name: str) -> NDArray[Any]:
-    """Return numbers, in s if they are dates or durations, or say whose they are not."""
+    """Return numbers, in s if they are dates or durations, or raise an error that names them."""
     if np.ma.isMaskedArray(values):
         values = np.ma.filled(values.astype(np.float64), np.nan)
     try:

@@ -1,6 +1,6 @@
-"""Columns of quantities that a user or a file states: ``H (A/m)`` and ``B (T)``.
+"""Columns of quantities that a user or a file states, such as ``H (A/m)`` and ``B (T)``.
 
-They are found by their name or their unit, converted to the stated unit by pint, and from then on
+They are found by their name or their unit, and pint converts them to the stated unit. Then they are
 read as the voltage and the displacement of any other file.
 """
 
@@ -31,7 +31,7 @@ type Conversion = Callable[[FloatArray], FloatArray]
 
 
 def conversion(unit: str, to: str) -> Conversion | None:
-    """Return what turns numbers in a unit into another one; None if they are of different kinds.
+    """Return a function that converts numbers between two units; None if their kinds differ.
 
     A number before the unit is what 1 stands for, a minus turns the sign: ``-0.35 mT``. Units are
     those of pint; one that it does not know converts to itself.
@@ -61,10 +61,10 @@ def conversion(unit: str, to: str) -> Conversion | None:
 
 
 def _spelled(unit: str) -> tuple[Any, float]:
-    """Return a unit as pint reads it, and how many of it one is.
+    """Return a unit in pint's spelling, and the factor from the given unit to it.
 
-    Powers behind a letter, ``uC/cm2``, are meant as such. Gauss and oersted, which are of another
-    system there, are numbers of tesla and A/m.
+    A number behind a letter, as in ``uC/cm2``, is a power. Gauss and oersted, which belong to
+    another system in pint, become factors of tesla and A/m.
     """
     text = normalize("NFKC", unit)
     if match := re.fullmatch("([mk]?)(?:(G|gauss)|Oe|oersted)", text):
@@ -75,10 +75,10 @@ def _spelled(unit: str) -> tuple[Any, float]:
 def in_stated_quantities(
     source: Source, naming: Naming, needed: Collection[str]
 ) -> tuple[Source, Naming, Quantities]:
-    """Return a file whose voltage and displacement are the quantities that are stated, and these.
+    """Return a source with the stated quantities as voltage and displacement, and these.
 
-    Either the naming states them, or the file, as those that the package writes. A file without
-    anything that could be its time has a sample for its clock.
+    The naming states them, or the file does, as those that the package writes. In a file without
+    any possible time, the samples themselves are the clock.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def in_stated_quantities(
 
 
 def _noted(source: Source) -> tuple[str | None, str | None]:
-    """Return the quantities that a file states as this package does."""
+    """Return the quantities that a file's notes state in the form that this package writes."""
     notes = source.notes.get("", {})
     stated = notes.get("input_is"), notes.get("output_is")
     with suppress(InputError):
@@ -144,7 +144,7 @@ def _parts(series: Series, quantity: Quantity) -> tuple[str, str]:
 def _series_of(
     source: Source, naming: Naming, key: str, quantity: Quantity, taken: list[Series]
 ) -> Series | None:
-    """Return the series of a stated quantity: the one that is named, by its word or its unit."""
+    """Return the series of a stated quantity: the named one, or the one with its word or unit."""
     if key in naming.columns:
         return series_named(source, naming.columns[key], quantity.name)
     others = [s for s in source.series if s not in taken and s.size > 1]

@@ -1,4 +1,4 @@
-"""Several tables of numbers in one file: where they are in a text, and which one is meant."""
+"""Several tables of numbers in one file: their places in a text, and the choice of one."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _NUMBER = r"[+-]?(?:nan|inf|[.,]?\d[\d.,]*(?:[eEdD][+-]?\d+)?)"
 # A row begins with a number, a date, or an empty cell before one.
 _ROW = re.compile(rf"[\s\"',;|]*(?:[+-]?[.,]?\d|{_NUMBER}(?![^\s\"',;|]))", re.IGNORECASE)
 _CELL = re.compile(_NUMBER, re.IGNORECASE)
-# Fewer rows below a header are no table.
+# Smallest number of rows of a table below its header.
 _FEWEST = 3
 
 
 class TextTable(NamedTuple):
-    """Where a table is in a text, the lines above its header included, its title and its header."""
+    """A table in a text: its lines, with those above its header, its title and its header."""
 
     lines: range
     title: str
@@ -33,8 +33,8 @@ def tables_of(lines: Sequence[str]) -> list[TextTable]:
 
     A table ends where a header follows its rows: a line of words, as many as the cells of the
     three rows or more below it. The same header once more, as after a pause of the logger, ends it
-    only if the first column does not go on. So does an empty line below which a first column that
-    rose all the way begins again where it began, or before.
+    only if the first column does not go on. An empty line ends a table, too, if a first column that
+    rose all the way begins again below it where it began, or before.
     """
     tables: list[tuple[int, str, str]] = []
     between: list[int] = []
@@ -71,7 +71,7 @@ def tables_of(lines: Sequence[str]) -> list[TextTable]:
 
 
 def described(tables: Sequence[TextTable], lines: Sequence[str]) -> list[str]:
-    """Say of each of several tables how many rows are below which header."""
+    """Describe each of several tables by its number of rows and its header."""
     rows = [sum(map(bool, map(_ROW.match, lines[t.lines.start : t.lines.stop]))) for t in tables]
     heads = [f" below {t.header[:60]!r}" * (t.header not in ("", t.title)) for t in tables]
     return [f" ({n} rows{head})" for n, head in zip(rows, heads, strict=True)]
@@ -82,7 +82,7 @@ def index_of(
 ) -> int:
     """Return the index of the table that is meant, by its number from 1 on or its title.
 
-    What is ``said`` of each is listed behind its title.
+    The error lists the tables with their titles and descriptions, ``said``.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def _separator(row: str) -> str:
 
 
 def _begins_again(rows: Sequence[str], row: str) -> bool:
-    """Tell whether a row's first cell is none above that of rows whose first cells all rise."""
+    """Tell whether a row's first cell is at most that of the first of rows that all rise."""
     mark = _separator(row)
     rows = [line for line in rows if _ROW.match(line)]
     if mark == " " and mark not in row.strip():  # a column alone

@@ -2,12 +2,12 @@
 
 Commas, semicolons, tabs, bars or blanks separate the columns; where it is not a comma, numbers may
 have decimal commas. The whole may be packed by gzip. The numbers are looked for, and the line above
-them names the columns; a second line may hold their units. What stands above the header is skipped
-with a remark, as are empty lines, comments and headers among the numbers, and words or a line that
-is cut off below them. Of lines ``# key: value`` above them ``voltage`` (command or output),
-``origin``, ``interval_s`` and ``time_offset_s`` are understood, and of any a sampling rate or
-interval, as a guess. An empty cell or ``nan`` in the displacement is a missing reading. A line that
-cannot be read is named with its number.
+them names the columns; a second line may hold their units. Lines above the header are skipped with
+a remark, as are empty lines, comments and headers among the numbers, and words or a line that
+is cut off below them. Lines ``# key: value`` above them may hold ``voltage`` (command or output),
+``origin``, ``interval_s`` and ``time_offset_s``; a sampling rate or interval in any line above them
+counts as a guess. An empty cell or ``nan`` in the displacement is a missing reading. An error names
+the number of a line that cannot be read.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from bwbayes.record.io.tables import described, index_of, tables_of
 from bwbayes.record.record import Record
 
 type Marks = tuple[str, str | None]
-"""The mark of decimals in numbers, and that of thousands, if there is one."""
+"""The decimal mark of numbers, and their thousands separator or None."""
 
 _OTHER_MARKS = "['\u2019\u00a0\u2009\u202f]"
 _BLANKS = r"[+-]?[1-9]\d{0,2}(?: \d{3})+(?:[.,]\d*)?"
@@ -71,7 +71,7 @@ def read_text(path: Path, table: int | str | None = None) -> Source:
 def text_source(
     path: Path, text: str, table: int | str | None = None, *, is_whole: bool = False
 ) -> Source:
-    """Return the columns of a text that was read from a file; one that ``is_whole`` was not cut.
+    """Return the columns of a text from a file; ``is_whole`` means that its end is not cut off.
 
     Raises and warns as :func:`read_text` does.
     """
@@ -79,7 +79,7 @@ def text_source(
     if text.startswith("LabVIEW Measurement"):
         text, clocks = plain_lvm(path, text)
     lines = text.split("\n")
-    # What programs write below the numbers is no sample, and shows that the last one is whole.
+    # Lines that programs write below the numbers are no samples, and show that the last is whole.
     while len(lines) > 1 and (not lines[-1].strip(' \t,;|"') or lines[-1].startswith(("#", "%"))):
         lines.pop()
         is_whole = True
@@ -89,8 +89,8 @@ def text_source(
     descriptions = described(tables, lines) if tables[1:] else ()
     chosen, _, shared = tables[index_of(path, [t.title for t in tables], table, descriptions)]
     is_whole |= chosen.stop < len(lines)
-    # Empty lines in place of the tables above, so that the others keep their numbers; a block below
-    # an empty line has the header of the one above.
+    # Replace the tables above by empty lines, so that the other lines keep their numbers; a block
+    # below an empty line has the header of the one above.
     has_own = shared in lines[chosen.start : chosen.stop]
     above_it = ["" if has_own else shared][: chosen.start]
     lines = [""] * (chosen.start - 1) + above_it + lines[chosen.start : chosen.stop]
@@ -103,7 +103,7 @@ def text_source(
     units = with_units(names, units, preamble)
     scope_clock, settings = settings_in(names, units)
     notes |= settings
-    # As data recorders of PI write them.
+    # Data recorders of PI state names of columns in this way.
     names = [notes.get(f"name{i}", name) for i, name in enumerate(names)]
     skipped = sum(bool(line.strip()) and not line.startswith("#") for line in above)
     if skipped:
@@ -131,7 +131,7 @@ def text_source(
     for column, (name, unit) in enumerate(zip(names, units, strict=True)):
         if column >= layout.fields:
             break
-        # Dates, times of day and durations as MATLAB's 0.5 sec have no unit, and become seconds.
+        # Dates, times of day and durations such as MATLAB's 0.5 sec have no unit; they become s.
         cell = str(frame[column].iloc[0])
         is_clock = bool(re.match(r".*\d:\d\d|[\d.]+ (sec|min|hr)$", cell))
         stated = "s" if is_clock else unit
@@ -147,7 +147,7 @@ def text_source(
 
 
 def _different(path: Path, names: Sequence[str], frame: pd.DataFrame) -> list[str]:
-    """Return names of which none stands twice; of columns with equal numbers the first keeps its.
+    """Return names without repeats; the first of several columns with equal numbers keeps its name.
 
     Warns
     -----
@@ -186,7 +186,7 @@ def _decoded(path: Path) -> str:
     """Return a file's text with line ends as on Unix, whatever its encoding is."""
     with path.open("rb") as file:
         is_packed = file.read(2) == b"\x1f\x8b"
-    # No more of what is packed than can be a record.
+    # Unpack no more than a record can hold.
     with gzip.open(path) if is_packed else path.open("rb") as file:
         data = file.read(2**31)
     if not data.strip():
@@ -201,7 +201,7 @@ def _decoded(path: Path) -> str:
         begin = data[:4000]
         encodings = ["cp1252", "cp932", "gb18030", "cp1251", "utf_16_le", "utf_16_be"]
         best = from_bytes(begin, cp_isolation=encodings).best()
-        # As Windows writes a micro sign before a unit.
+        # Windows writes a micro sign before a unit as this byte.
         is_windows = re.search(rb"\xb5[msV]", begin) is not None
         encoding = "cp1252" if is_windows else best.encoding if best else "ascii"
         text = data.decode(encoding, errors="replace")
@@ -210,12 +210,13 @@ def _decoded(path: Path) -> str:
                 f"{path}: neither text nor HDF5, MATLAB or TDMS; export it as CSV"
             ) from None
     text = text.replace("\ufeff", "").replace("\r\n", "\n").replace("\r", "\n")
-    # What C writes where there is no number, and marks of thousands but points and commas.
+    # Replace C's marks of missing numbers, and thousands separators other than points and commas.
     text = re.sub(r"-?1\.#(INF|IND|QNAN|SNAN)\d*", "nan", text)
-    # The minus of typesetting, and milliseconds behind a colon as data loggers of Keysight's.
+    # Replace typographic minus signs, and the colon that Keysight's loggers set before ms.
     text = re.sub(r"(?<![\w.])[\u2010-\u2013\u2212\uff0d](?=[\d.,])", "-", text)
     text = re.sub(r"(?<=\d:\d\d:\d\d):(?=\d{3}(?!\d))", ".", text)
-    # A blank is such a mark where semicolons or tabs separate the cells, and one is a number by it.
+    # A blank separates thousands if semicolons or tabs separate the cells, and it makes one of them
+    # a number.
     if re.search(rf"{_BLANKS}[;\t]|[;\t]{_BLANKS}(?![^\n])", text):
         cell = rf"(?<![^;\t\n]){_BLANKS}(?![^;\t\n])"
         text = re.sub(cell, lambda number: number[0].replace(" ", ""), text)
@@ -233,11 +234,11 @@ def _samples(
     *,
     is_whole: bool,
 ) -> list[tuple[int, str]]:
-    """Return the lines of samples, with their numbers, without what is no sample at the end.
+    """Return the lines of samples, with their numbers, without lines at the end that are none.
 
-    That is lines of words, lines of one cell, as times alone, and a last line that is cut off: with
-    fewer fields than the others, or, unless the text ``is_whole``, without its last number or with
-    fewer decimals in it than all those above have alike.
+    These are lines of words, lines of one cell, such as a time alone, and a last line that is cut
+    off: with fewer fields than the others, or, unless the text ``is_whole``, without its last
+    number or with fewer decimals in it than all lines above have alike.
 
     Raises
     ------
@@ -277,7 +278,7 @@ def _samples(
 
 
 def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFrame, Marks]:
-    """Return the cells, as numbers where a whole column is, and the marks in them."""
+    """Return the cells, as numbers in columns that hold numbers alone, and their marks."""
     # Fortran writes 1.5D+00.
     text = re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", "\n".join(body))
 
@@ -306,7 +307,7 @@ def _parsed(path: Path, body: Sequence[str], layout: Layout) -> tuple[pd.DataFra
     return max(frames, key=lambda frame: frame[0].select_dtypes("number").shape[1])
 
 
-# Whole numbers with a mark between thousands, which may be decimals as well.
+# Whole numbers whose thousands separator may be a decimal mark as well.
 _GROUPED = r"[+-]?[1-9]\d{{0,2}}(?:\{0}\d{{3}})+"
 
 
@@ -343,12 +344,12 @@ def _likely_marks(path: Path, cells: pd.DataFrame, separator: str) -> list[Marks
     """Return the decimal mark and that of thousands of numbers that show none.
 
     Decimals do not always have three digits: if a column has numbers below 1,000 without a mark,
-    and none above, the mark is that of thousands. Else it is that of decimals, as usual.
+    and none above, the mark separates thousands. Otherwise it is the decimal mark, as usual.
 
     Warns
     -----
     InputWarning
-        Of what a number is read as, but for decimal points beside commas that separate columns.
+        How a number is read, except for decimal points beside commas that separate columns.
     """
     columns = [column.dropna().str.strip() for _, column in cells.items()]
     read: tuple[str, str] | None = None
@@ -415,7 +416,7 @@ def _numbers(
             period = 3600.0 if is_short else 86_400.0
             turns = np.cumsum(np.diff(times, prepend=times[:1]) < -period / 2)
             return np.asarray(times + period * turns)
-        # Days come before months or behind them: as is no jump at midnight.
+        # Days come before months or behind them: take the order without a jump at midnight.
         dates = []
         for is_day_first in (False, True):
             with suppress(ValueError, OverflowError):
@@ -429,7 +430,7 @@ def _numbers(
     # A number with something behind it, as 1.5V, is mistyped; what begins otherwise is a word.
     is_number = text.iloc[wrong].str.contains(r"^[^\w#<>*]*\d|\0")
     if words and 2 * wrong.size < column.size and not is_number.any():
-        # As loggers and spreadsheets write where there is nothing to read: OVERLOAD, #DIV/0!, ---.
+        # Loggers and spreadsheets write words where there is no reading: OVERLOAD, #DIV/0!, ---.
         cells = f"{wrong.size} cell{'s' * (wrong.size > 1)} without a number"
         warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
         return np.asarray(numbers, dtype=np.float64)

@@ -1,6 +1,6 @@
-"""Units of columns: those of the SI with any prefix, some others, and numbers of them.
+"""Units of columns: SI units with any prefix, some others, and multiples of them.
 
-Such a number is a sensor's sensitivity.
+A multiple of a unit is a sensor's sensitivity.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FACTOR = re.compile(
     r"(?<![\w.])(?:10\s*\^|10[\u207b\u207a\u2070\u00b9\u00b2\u00b3\u2074-\u2079]|10?[eE][-+]?\d)"
     r"|(?<![\d.:])1:\d+(?![\d:])|(?:(?<!\w)[xX*]|[\u00d7\u00b7/*])\s*10+(?!\d|\s*[\w.])"
 )
-# What else stands where units do, in lower case.
+# Other words in the place of a unit, in lower case.
 _FOREIGN = (
     *("%", "-", "1", "#", "a.u.", "count", "counts", "digit", "digits", "lsb", "bit", "bits"),
     *("sequence", "sample", "samples", "index", "no", "no.", "n/a", "hz", "khz", "db", "g"),
@@ -48,27 +48,27 @@ _FOREIGN = (
 
 
 def unit_scale(unit: str, quantity: str) -> tuple[float, int] | None:
-    """Return the factor and the power of ten from a unit to s, V or um; None if it is none."""
+    """Return the factor and the power of ten from a unit to s, V or um; None if it is unknown."""
     if (power := power_of(unit, quantity)) is not None:
         return 1.0, power
-    # The sign of the unit Angstrom is the letter, lowered.
+    # In lower case, the Angstrom sign is the letter.
     factor = _OTHERS.get(quantity, {}).get(unit.lower())
     return None if factor is None else (factor, 0)
 
 
 def is_other_unit(text: str) -> bool:
-    """Tell whether a text is a unit of none of the quantities, or stands for having none."""
+    """Tell whether a text is a unit of another quantity, or means that there is no unit."""
     return text.lower().replace("\u03bc", "\u00b5") in _FOREIGN
 
 
 def is_time_form(text: str) -> bool:
-    """Tell whether a text is the form of times of day, in place of a unit."""
+    """Tell whether a text is a format of times of day, in place of a unit."""
     return re.fullmatch("h+:m+(:s+)?([.,]f+)?", text.lower()) is not None
 
 
 def power_of(unit: str, quantity: str) -> int | None:
-    """Return the power of ten that leads from a unit to s, V or um; None if it is none."""
-    # As voltmeters and potentiostats write, and in one character, as some alphabets have units.
+    """Return the power of ten from a unit to s, V or um; None if it is unknown."""
+    # Remove what voltmeters and potentiostats add; some alphabets have a unit in one character.
     unit = re.sub("(?<=V) ?(?:DC|dc|vs\\.? .*)$", "", normalize("NFKC", unit))
     base_names = "(secs?|seconds?)|(volts?)|(met(?:er|re)s?)|(microns?)"
     written = re.fullmatch(f"(pico|nano|micro|milli|kilo|)(?:{base_names})", unit, re.IGNORECASE)
@@ -83,11 +83,11 @@ def power_of(unit: str, quantity: str) -> int | None:
 
 
 def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
-    """Return the factor and the power of ten that lead from a user's unit to s, V or um, or None.
+    """Return the factor and the power of ten from a user's unit to s, V or um, or None.
 
-    A number before it is what 1 in the column stands for, a minus turns the sign: ``-0.35 um``. As
-    data sheets write a sensitivity, that is ``0.35 um/V`` or ``2.9 V/um``, or with counts, digits
-    or LSB. A voltage per V is none, as it may be an amplifier's gain or its monitor's.
+    A number before it is what 1 in the column stands for, a minus turns the sign: ``-0.35 um``. A
+    sensitivity may be written as in data sheets, ``0.35 um/V`` or ``2.9 V/um``, or with counts,
+    digits or LSB. A voltage per V is refused: it may be an amplifier's gain or its monitor's.
     """
     if (plain := unit_scale(unit.strip(), quantity)) is not None:
         return plain
@@ -109,9 +109,9 @@ def scale_of(unit: str, quantity: str) -> tuple[float, int] | None:
 def unit_in(name: str, quantity: str) -> str | None:
     """Return the unit at the end of a column's name, if it is one of the quantity.
 
-    In brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``, ``U / mV``;
-    also ``pos_nm_``, as MATLAB writes brackets. Others than those of the SI stand in brackets or
-    after a slash, as ``U_in`` is an input and ``x_min`` a minimum.
+    It stands in brackets or after a blank, a slash or an underscore: ``t [ms]``, ``pos (nm)``,
+    ``U / mV``; also ``pos_nm_``, as MATLAB writes brackets. Units other than those of the SI must
+    stand in brackets or after a slash, as ``U_in`` is an input and ``x_min`` a minimum.
     """
     if (unit := unit_in_brackets(name)) is None:
         ending = re.search(r"([\s_/.-])([^][()\s_/.-]+)_?\s*$", name)
@@ -123,16 +123,17 @@ def unit_in(name: str, quantity: str) -> str | None:
 
 
 def factor_in(name: str) -> str:
-    """Return a factor in a column's name, which may be of its unit or of its numbers, or "".
+    """Return a factor in a column's name, which may belong to its unit or its numbers, or "".
 
-    As ``x / 10⁻⁶ m``, ``U x10 (V)``, ``monitor 1:100 [V]``: what 1 in it stands for is open.
+    Names such as ``x / 10⁻⁶ m``, ``U x10 (V)`` or ``monitor 1:100 [V]`` do not tell what 1 in the
+    column stands for.
     """
     factor = _FACTOR.search(name)
     return factor[0].strip() if factor else ""
 
 
 def unit_in_brackets(name: str) -> str | None:
-    """Return what stands in brackets at the end of a column's name, if it is no number of it."""
+    """Return the text in brackets at the end of a column's name, if it is not its number."""
     ending = re.search(r"(?:\[(?!\d+\])([^]]*)\]|\((?!column \d+\))([^)]*)\))\s*$", name)
     return next(group for group in ending.groups() if group is not None).strip() if ending else None
 
@@ -140,7 +141,7 @@ def unit_in_brackets(name: str) -> str | None:
 def epoch_unit(name: str, times: FloatArray) -> str | None:
     """Return the unit in which times (samples,) count from 1970, if the column's name says so.
 
-    It is the only one in which they all are between 1980 and 2200; None if none is.
+    In this unit alone all times are between 1980 and 2200; None if there is no such unit.
     """
     if not times.size or not re.search("unix|epoch|posix", name.lower()):
         return None
@@ -151,9 +152,9 @@ def epoch_unit(name: str, times: FloatArray) -> str | None:
 
 
 def rates_by_unit(samples: int, extent: float) -> str:
-    """Say which sampling rate and duration times have in each unit; a wrong one shows nowhere else.
+    """State the sampling rate and the duration in each unit; a wrong one shows nowhere else.
 
-    ``extent`` is how far the last time is from the first.
+    ``extent`` is the difference of the last and the first time.
     """
     durations = {u: extent * 10.0 ** (power_of(u, "time") or 0) for u in COMMON_UNITS["time"]}
     rates = [f"{(samples - 1) / t:.6g} Hz for {t:.6g} s in {u}" for u, t in durations.items()]

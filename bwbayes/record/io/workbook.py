@@ -1,4 +1,4 @@
-"""Excel's workbooks (``.xlsx``): a sheet's cells are read as the rows of a text are."""
+"""Excel's workbooks (``.xlsx``), whose sheets are read as the rows of a text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bwbayes.record.io.text import text_source
 
 
 def read_workbook(path: Path, table: int | str | None = None) -> Source:
-    """Return the columns of the sheet that has columns of numbers, of several that of ``table``.
+    """Return the columns of the sheet with columns of numbers, or of ``table`` if several have.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def read_workbook(path: Path, table: int | str | None = None) -> Source:
 
 
 class _Times(NamedTuple):
-    """What days count from, and the styles of cells with dates, times of day and durations."""
+    """Day zero, and the styles of cells with dates or times of day and with durations."""
 
     epoch: datetime
     styles: Collection[int]
@@ -74,19 +74,19 @@ class _Times(NamedTuple):
 
 def _texts(book: Any) -> dict[str, str]:
     """Return the sheets of a workbook as text, and close it."""
-    # Its numbers in place of times, which openpyxl rounds to milliseconds.
+    # Read the numbers behind times, since openpyxl rounds times to milliseconds.
     times = _Times(book.epoch, book._date_formats, book._timedelta_formats)
     book._date_formats = set()
     texts = {}
     for sheet in book.worksheets:
-        sheet.reset_dimensions()  # what programs write of them may be wrong
+        sheet.reset_dimensions()  # the dimensions that programs write may be wrong
         texts[sheet.title] = _text(sheet, times)
     book.close()
     return texts
 
 
 def _text(sheet: Any, times: _Times) -> str:
-    """Return a sheet's rows as text, of as many cells each."""
+    """Return a sheet's rows as text, with equally many cells in each row."""
     cells = [[_cell(cell, times) for cell in row] for row in sheet.iter_rows()]
     width = max(map(len, cells), default=0)
     text = StringIO()
@@ -96,9 +96,9 @@ def _text(sheet: Any, times: _Times) -> str:
 
 
 def _cell(cell: Any, times: _Times) -> str:
-    """Return a cell's text; of a time a date, or hours, minutes and seconds.
+    """Return a cell's text; a time becomes a date, or hours, minutes and seconds.
 
-    Excel keeps 15 digits of days: of a date of today 10 us, of what is less than a day 1 ns.
+    Excel keeps 15 digits of days: 10 us for a date of today, 1 ns for less than a day.
     """
     value = cell.value
     if value is None:
