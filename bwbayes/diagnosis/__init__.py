@@ -1,1 +1,1 @@
-"""Diagnosis: what is wrong with a record, a fit or its bands, and what to do about it."""
+"""Diagnosis of a record, a fit or its bands: defects and their fixes."""

@@ -1,10 +1,10 @@
-"""Why bands fail on readings that were not fitted: shapes in the residuals, by evidence.
+"""Causes of bands that fail on readings that were not fitted: shapes in the residuals, by evidence.
 
 Given the bands, residuals are jointly normal: the parameters' error, the discrepancy, the sensor's
 noise. Each cause adds shapes of unknown size (a constant, a trend, a decay at the start, the mean
 itself, ...) with a normal prior, so that its evidence is exact and costs one pass of the noise's
-filter. Where residuals are too large, a cause has to bring most of that back. What was fitted has
-:mod:`bwbayes.diagnosis.explanations` instead.
+filter. Where residuals are too large, a cause has to explain most of the excess. For readings that
+were fitted, :mod:`bwbayes.diagnosis.explanations` finds the causes.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from bwbayes.model.reversals import rate
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.record.io.grid import clock
 
-# A lead-in whose test says less than this does not fit.
+# A lead-in whose test has a smaller p value than this does not fit.
 LEAD_IN_ALARM = 0.002
 
 # Time constants of a bad start, as fractions of the record, evenly probable.
 DECAYS = (1 / 3, 1 / 10, 1 / 30, 1 / 100)
 
-# Of a training record, whose explanations are fitted; causes other than outliers compare with it.
+# Cause of a failing training record without a fitted explanation, unless its cause is outliers.
 UNEXPLAINED = Finding(
     "unknown",
     "unknown (no explanation takes most of the error away)",
@@ -41,7 +41,7 @@ UNEXPLAINED = Finding(
 
 
 def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Finding:
-    """Return the likely cause of bands that fail, or that there is none among those that are known.
+    """Return the likely cause of bands that fail, or the finding that no known cause explains it.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
     memory
         Correlation time of the discrepancy, s.
     beyond
-        In what the drive leaves training.
+        Respects in which the drive goes beyond that of training.
     """
     ranked = sorted(
         _explanations(bands, np.flatnonzero(bands.scored(bands.measured)), memory),
@@ -84,7 +84,7 @@ def cause(bands: Bands, memory: float, beyond: Sequence[Finding] = ()) -> Findin
 def _explanations(  # noqa: PLR0915  # a cause after the other
     bands: Bands, rows: IntArray, memory: float
 ) -> list[Finding]:
-    """Weigh all causes by the readings at ``rows`` (readings,), with nats against none."""
+    """Compare each cause with none by the readings at ``rows`` (readings,), in nats."""
     assert bands.measured is not None
     mean, time, interval = bands.mean[rows], bands.time[rows], bands.interval
     residual = bands.measured[rows] - mean
@@ -98,7 +98,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
         np.maximum([total_variance - slow, slow - parameter_variance if memory > 0 else 0.0], floor)
     )
     noise = np.array([[*sds, max(memory, interval)]])
-    # The parameters' errors, each of an independent standard normal size.
+    # Each of the parameters' errors has an independent standard normal size.
     varying = np.sqrt(max(parameter_variance - bands.common_sd**2, 0.0)) * (mean - np.mean(mean))
     errors = np.stack([np.full(rows.size, bands.common_sd), varying / (np.std(mean) or 1.0)])
     skipped = np.concatenate([[0.0], np.diff(rows) - 1.0])
@@ -108,8 +108,8 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     ) -> tuple[float, FloatArray, FloatArray, float]:
         """Explain a residual by shapes (shapes, readings) of standard normal sizes.
 
-        Returns its log density, up to what is the same for all shapes, the innovations (readings,)
-        less what the shapes explain, in sds, the sizes (shapes,), and the mean square of what
+        Returns its log density up to a constant that all shapes share, the innovations (readings,)
+        that the shapes leave, in sds, the sizes (shapes,), and the mean square of the residual that
         shapes and parameters leave, um².
         """
         series = np.concatenate([[residual], errors, added])
@@ -129,7 +129,7 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     weighed = {kind: weigh(added) for kind, added in shapes.items()}
     nats = {kind: fit[0] - plain for kind, fit in weighed.items()}
     unexplained = {kind: fit[-1] for kind, fit in weighed.items()}
-    # Twice the mean to the readings: then they are its opposite.
+    # Add twice the mean: readings of the opposite sign are the mean then.
     log_density, _, _, unexplained["sign"] = weigh(shapes["offset"], residual + 2 * mean)
     nats["sign"] = log_density - plain
     decays = [weigh(3 * shapes["offset"] * np.exp(-along / decay)) for decay in DECAYS]
@@ -140,8 +140,8 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     outlying = np.abs(white) > 5 * max(scatter(white), 1.0)
     unexplained["outliers"] = float(np.mean(np.where(outlying, 0.0, residual) ** 2))
     size = float(shapes["offset"][0, 0])
-    # At the largest innovation or, where nothing is remembered, where the means before and from
-    # there on are farthest apart.
+    # Try a step at the largest innovation and, for a discrepancy without memory, at the sample
+    # where the means before and after it are farthest apart.
     order = np.arange(white.size)
     parted = np.cumsum(white) - white - np.mean(white) * order
     contrast = parted**2 / np.maximum(order * (white.size - order), 1)
@@ -177,8 +177,8 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
     return [
         Finding(kind, text.format(**words), fix.format(**words), nats=nats[kind])
         for kind, (text, fix) in ((kind, DEFECTS[kind].in_bands) for kind in nats)
-        # What is named takes away most of what the bands do not allow, if that is much. Of a model
-        # that is too simple these loops are a sign, and no full account.
+        # A named cause removes most of the excess over the bands, if that is large. Loops only
+        # indicate a model that is too simple; they need not explain the excess.
         if kind == "loop"
         or missed < ODDS * total_variance
         or unexplained[kind] - total_variance < 0.5 * (missed - total_variance)
@@ -186,10 +186,10 @@ def _explanations(  # noqa: PLR0915  # a cause after the other
 
 
 def _shapes(bands: Bands, rows: IntArray, along: FloatArray) -> dict[str, FloatArray]:
-    """Shapes (shapes, readings) that may be added to the mean, by kind, um.
+    """Return the shapes (shapes, readings) that may be added to the mean, by kind, um.
 
-    ``along`` (readings,) goes from 0 to 1. Prior sds: a tenth of the mean's range; of a gain 0.3;
-    of a delay 0.3 of the time in which the mean changes by its sd.
+    ``along`` (readings,) goes from 0 to 1. Prior sds are a tenth of the mean's range; 0.3 for a
+    gain; 0.3 of the time in which the mean changes by its sd for a delay.
     """
     mean, voltage = bands.mean[rows], bands.voltage[rows]
     slope = np.gradient(bands.mean, bands.interval)[rows]

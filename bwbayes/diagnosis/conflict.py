@@ -1,8 +1,8 @@
-"""Priors and posterior: where they disagree, press against a bound, or differ in unit.
+"""Conflicts of priors and posterior: disagreement, pressure against a bound, another unit.
 
 A finding's kind is the parameter, and its fix a line of config. The same findings come from the
 point fit, before any sampling, by :func:`around`, and from the posterior's draws. The score of a
-parameter that its prior describes is beyond three once in 400 times, and less where the posterior
+parameter that its prior describes exceeds three once in 400 times, and more rarely if the posterior
 is wide; a posterior that is flat between its bounds or has its peak inside does not press.
 """
 
@@ -18,7 +18,7 @@ from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.distributions import Distribution
 
-# Draws that stand for a prior, or for a Gaussian posterior.
+# Number of draws that represent a prior, or a Gaussian posterior.
 DRAWS = 4000
 
 
@@ -45,14 +45,14 @@ def normal_scores(parameter: Parameter, values: FloatArray) -> FloatArray:
     """Return the normal scores of draws (draws,) under a parameter's own prior."""
     assert parameter.prior is not None
     low, high = (np.asarray(end) for end in parameter.support)
-    # Beyond 37 there is no probability that a float can hold.
+    # A float cannot hold the probability beyond a score of 37.
     return np.clip(parameter.prior.to_normal(values, low, high), -37.0, 37.0)
 
 
 def conflicts(
     prior: JointPrior, draws: FloatArray, defaults: Mapping[str, Distribution]
 ) -> list[Finding]:
-    """Return where priors and posterior do not go together.
+    """Return the conflicts of priors and posterior.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def conflicts(
 
 
 def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None:
-    """Find that a positive parameter's scale is far from what the record's ranges suggest."""
+    """Find a positive parameter whose scale is far from the one the record's ranges suggest."""
     if not parameter.positive or parameter.prior == default:
         return None
     low, expected, high = default.frozen.ppf([0.16, 0.5, 0.84]).tolist()
@@ -87,7 +87,7 @@ def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None
     if value is None or value <= 0:
         return None
     distance = float(np.log(value / expected))
-    # A factor of a hundred, which the default holds for unlikely, is another unit.
+    # A factor of a hundred that is unlikely under the default prior is another unit.
     if abs(distance) < max(np.log(100), 2.5 * sd):
         return None
     return Finding(
@@ -101,7 +101,7 @@ def _another_unit(parameter: Parameter, default: Distribution) -> Finding | None
 def _disagreement(
     parameter: Parameter, values: FloatArray, default: Distribution | None
 ) -> Finding | None:
-    """Find that the posterior's mean lies more than three sds from a parameter's prior."""
+    """Find a parameter whose posterior mean is more than three sds from its prior."""
     assert parameter.prior is not None
     score = float(np.mean(normal_scores(parameter, values)))
     if abs(score) <= 3:
@@ -115,19 +115,19 @@ def _disagreement(
         widths, stated = ("sd", "sigma", "scale"), parameter.prior
         double = {k: 2 * v if k in widths else v for k, v in stated.arguments.items()}
         wider = Distribution(stated.name, double)
-    if wider == parameter.prior:  # it ends at a bound, which is said where the posterior is near
+    if wider == parameter.prior:  # the prior ends at a bound; `_pressed` reports that
         return None
     return Finding(parameter.name, text, conflict_fix(parameter.name, wider))
 
 
 def conflict_fix(name: str, wider: Distribution) -> str:
-    """Return what to do where a record does not go together with a parameter's prior."""
+    """Return the fix for a record that conflicts with a parameter's prior."""
     line = _line(name, wider)
     return f"check the units of prior and record; if both are right, give {line}"
 
 
 def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[Finding]:
-    """Yield bounds that the posterior leans on: those of a parameter, and those others set."""
+    """Yield bounds that the posterior presses on: a parameter's own, and those others set."""
     fixed = {p.name: p.fixed for p in prior.parameters if p.fixed is not None}
     size = next(iter(columns.values())).size
     values = {**{n: np.full(size, v) for n, v in fixed.items()}, **columns}
@@ -154,8 +154,8 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
                 continue
             x = values[parameter.name]
             gap = (bound - x if side == "upper" else x - bound) / np.abs(bound)
-            # Beyond a bound that does not hold here nothing ends, and a ratio that the record
-            # hardly tells leans on it by chance.
+            # A bound that draws exceed does not hold here, and a ratio that the record hardly
+            # determines presses on its bound by chance.
             if float(np.min(gap)) >= 0 and np.std(gap) < 0.05 and _near(gap):
                 text = f"lies on its {side} bound of {declared.stated_bounds}"
                 yield Finding(parameter.name, text, advice)
@@ -164,9 +164,9 @@ def _pressed(prior: JointPrior, columns: Mapping[str, FloatArray]) -> Iterator[F
 def _near(gap: FloatArray) -> bool:
     """Tell whether draws (draws,) of the distance to a bound pile up at zero.
 
-    Where more than 0.3 of them lie within half a posterior sd of it: 0.14 do for a flat posterior,
-    0.24 for half a normal one with its peak on the bound, 0.30 for what a bound leaves of a normal
-    one a sd beyond it, 0.39 for an exponential one.
+    They do if more than 0.3 of them lie within half a posterior sd of it. That part is 0.14 for a
+    flat posterior, 0.24 for half a normal one with its peak on the bound, 0.30 for a normal one cut
+    off a sd from its peak beyond the bound, 0.39 for an exponential one.
     """
     sd = float(np.std(gap))
     return sd > 0 and float(np.mean(gap < 0.5 * sd)) > 0.3

@@ -1,23 +1,23 @@
-"""Whether records that were fitted jointly agree: each under the joint fit, and under its own.
+"""Consistency of jointly fitted records: each under the joint fit, and under a fit of its own.
 
-A joint fit takes its records for those of one actuator. If one of them was measured with another
-gain or another mounting, the joint posterior lies between them and fits none. So each record is
-fitted alone, from the joint fit's mode and with its noise. With m and C mean and covariance of its
-parameters given all records, m_r and C_r given record r alone, and ℓ its log likelihood,
+A joint fit assumes that all its records are of one actuator. If one of them was measured with
+another gain or mounting, the joint posterior lies between them and fits none. So each record is
+fitted alone, from the joint fit's mode and with its noise. With the mean m and the covariance C of
+its parameters given all records, m_r and C_r given record r alone, and its log likelihood ℓ,
 
     D = 2 [ℓ(m_r) − ℓ(m) + ∇ℓ(m_r)ᵀ (m − m_r)]
 
-is what the joint fit costs the record, less what the prior at m_r has cost it already. Were all
-normal, D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
+is the cost of the joint fit for the record, less the cost of the prior at m_r. If all were normal,
+D would be (m_r − m)ᵀ A (m_r − m), with the precision A that the record adds to its prior's.
 If all records are those of one actuator that the prior draws, m_r − m ~ N(0, C_r − C) (the law of
 total variance). So D is a sum of squares of standard normals, weighted by the eigenvalues of
 A (C_r − C), nearly a multiple of a χ² variable with its mean and variance (Satterthwaite,
 Biometrics Bulletin 2, 1946; at p = 1e-3 off by less than a factor of two). With
-(m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in Hausman's test, a bent posterior would pass for a
-disagreement: D is a difference of likelihoods, in whatever coordinates.
+(m_r − m)ᵀ (C_r − C)⁻¹ (m_r − m) alone, as in Hausman's test, a curved posterior would count as a
+disagreement: D is a difference of likelihoods, independent of the coordinates.
 
-Another noise shows elsewhere: the innovations of a record at the joint mode have a root mean square
-of 1 if the noise that the records share is its own.
+The innovations show whether a record has another noise: at the joint mode they have a root mean
+square of 1 if the shared noise is that of the record.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Consistency:
-    """How a record of a joint fit agrees with the others.
+    """Consistency of a record of a joint fit with the others.
 
     Parameters
     ----------
     joint_rms_um, single_rms_um
-        Root mean square of its residuals at the joint mode and at that of a fit of it alone, um.
+        Root mean square of its residuals at the joint mode and at the mode of its own fit, um.
     distance, degrees
         D in units in which it is a χ² variable, and its degrees of freedom; both zero if nothing
         can be compared.
     moved
-        The shared parameter that is farthest off, and by how many sds of the difference; empty if
-        nothing can be compared.
-    size
-        Root mean square of its innovations at the joint mode, and ``readings`` how many there are.
+        The shared parameter that is farthest off, and its distance in sds of the difference; empty
+        if nothing can be compared.
+    size, readings
+        Root mean square of its innovations at the joint mode, and their number.
     time, joint, own
         (readings,) in s and um: the residuals, thinned.
     """
@@ -79,12 +79,12 @@ class Consistency:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the record does not go with the others, beyond chance and so that it matters."""
+        """True if the record differs from the others, beyond chance and by a relevant amount."""
         return self.p_value < ALARM and self.joint_rms_um > 1.02 * self.single_rms_um
 
     @property
     def noisier(self) -> bool:
-        """Whether its noise is another one than the records share, beyond chance and by much.
+        """True if its noise differs from the shared noise, beyond chance and by a relevant amount.
 
         The discrepancy of a short record may be a fifth smaller or larger by chance.
         """
@@ -93,7 +93,7 @@ class Consistency:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it."""
+        """Numbers for ``summary.json``."""
         return {
             "residual_joint_um": self.joint_rms_um,
             "residual_own_um": self.single_rms_um,
@@ -113,7 +113,7 @@ def agreements(
     begin: Mapping[str, float] | None = None,
     watch: Watch = unwatched,
 ) -> dict[str, Consistency]:
-    """Compare each record of a joint posterior with all of them; nothing, if there is one alone.
+    """Compare each record of a joint posterior with all of them; return {} for a single record.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def agreements(
     free, _ = posterior.prior.constrain(point.mode[np.newaxis])
     compared = {}
     for name, single, joint_free in watched([*posterior.each(free)], watch):
-        # Its noise is known, as that of the joint fit.
+        # Fix its noise at that of the joint fit.
         theta, physical = single.prior.theta(joint_free)[0], single.table.physical
         parameters = (
             p if p.name in physical else replace(p, prior=None, fixed=float(value))
@@ -146,7 +146,7 @@ def agreements(
         joint_rms_um, single_rms_um, size = (
             float(np.sqrt(np.mean(x**2))) for x in (series.residual, own_residual, series.white)
         )
-        # Residuals are for pictures, some 2,000 of them.
+        # Keep some 2,000 residuals, for pictures.
         step = slice(None, None, -(-series.time.size // 2000))
         compared[name] = Consistency(
             joint_rms_um,
@@ -170,12 +170,12 @@ def _distance(
     """
     physical = [i for i, name in enumerate(posterior.names) if name in posterior.table.physical]
     rows = [physical.index(column) for column in columns]
-    # The covariance given the noise, as that of the record's own fit is.
+    # Condition the covariance on the noise, as in the record's own fit.
     precision = scipy.linalg.inv(point.covariance)[np.ix_(physical, physical)]
     taken = own_fit.covariance - scipy.linalg.inv(precision)[np.ix_(rows, rows)]
     added = scipy.linalg.inv(own_fit.covariance) - np.eye(len(rows))
     weights = np.maximum(scipy.linalg.eigvals(added @ taken).real, 0.0)
-    # What a record tells by itself alone differs by rounding: then nothing can be compared.
+    # Parameters that only one record determines differ by rounding alone: nothing can be compared.
     smallest = 0.05
     if not weights.sum() > smallest:
         return 0.0, 0.0, ("", 0.0)
@@ -200,14 +200,14 @@ def _distance(
     )
     _, log_prior = own_fit.posterior.prior.constrain(places)
     log_likelihood = own_fit.posterior.log_density(places[:2]) - log_prior[:2]
-    # At the mode, the likelihood's slope is the prior's turned round.
+    # At the mode, the gradients of likelihood and prior add up to zero.
     slope = (log_prior[3] - log_prior[2]) / (2 * fraction)
     cost = max(float(2 * (log_likelihood[0] - log_likelihood[1] + slope)), 0.0)
     return cost / unit, float(np.sum(weights)) / unit, (farthest, shifts[farthest])
 
 
 def disagreements(compared: Mapping[str, Consistency]) -> Iterator[Finding]:
-    """Yield the records that do not go with the others."""
+    """Yield a finding for each record that is inconsistent with the others or has another noise."""
     for name, record in compared.items():
         parameter, away = record.moved
         if record.disagrees:

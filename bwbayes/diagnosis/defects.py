@@ -1,9 +1,9 @@
-"""The catalogue of defects: what can be wrong with a record, its readings or its bands, one by one.
+"""Catalog of the possible defects of a record, its readings or its bands.
 
-A :class:`Defect` has one name. It knows the finding that a record check has of it, the stage of the
-model that it is, from where that is fitted, and what to say and to do about it: where a fit has it,
-and where bands have it that fail (:mod:`bwbayes.diagnosis.causes`). Each stage of the registry is
-one, so that a new stage is looked for by itself.
+A :class:`Defect` has one name. It holds the kind of finding of the record check, the stage of the
+model that describes it, the starting points of that stage's fit, and its text and fix: for a fit
+with the defect, and for failing bands with it (:mod:`bwbayes.diagnosis.causes`). Each stage of the
+registry has a defect, so that new stages are tried without further code.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Defect:
     finding
         Kind of the finding that a record check has of it.
     in_bands
-        What to say and what to do where bands have it that fail, with gaps to fill in.
+        Text and fix for failing bands with the defect, with fields to fill in.
     """
 
     kind: str
@@ -70,11 +70,11 @@ class Defect:
                 yield replace(explanation, spec=None) if sighting.named_only else explanation
 
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
-        """Yield from where to fit the stage."""
+        """Yield the starting points for a fit of the stage."""
         yield Sighting(starts=STAGES[self.stage]().starts)
 
     def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:  # noqa: ARG002
-        """Return what to say and what to do, of the parameters' values by name."""
+        """Return the text and the fix for the parameters' values by name."""
         stage = STAGES[self.stage]()
         return stage.describe(values), stage.advice
 
@@ -91,9 +91,10 @@ class _Transient(Defect):
 
 class _Step(Defect):
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
-        """Yield the time of the largest innovation, whose choice is paid for.
+        """Yield the time of the largest innovation; its choice among the readings has a cost.
 
-        Where readings before it were not fitted, the largest of theirs says when it was.
+        If readings just before it were not fitted, the largest innovation among these gives the
+        time.
         """
         rows = scene.posterior.single_record.readings.rows
         white = np.abs(scene.innovations)
@@ -115,9 +116,9 @@ class _Step(Defect):
 
 class _Oscillation(Defect):
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
-        """Yield the innovations' strongest frequency that the drive has not, to its resolution.
+        """Yield the innovations' strongest frequency that the drive lacks, to its resolution.
 
-        No model has one that swells with the drive, which may be the actuator's own.
+        An oscillation that grows with the drive may be the actuator's own: it is only named.
         """
         rows = scene.posterior.single_record.readings.rows
         line = strongest_line(scene.innovations, scene.voltage[rows], rows, scene.interval)
@@ -143,16 +144,16 @@ class _Sign(Defect):
 
 class _Delay(Defect):
     def words(self, scene: ResidualAnalysis, values: Mapping[str, float]) -> tuple[str, str]:
-        """Say which column to move."""
+        """Return the text, and the column to move as the fix."""
         fix = late_fix(values["delay"], scene.interval / scene.stride)
         return super().words(scene, values)[0], fix
 
 
 class _LongDelay(_Delay):
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:
-        """Yield a delay up to a quarter of a period, which is told by loops.
+        """Yield a delay up to a quarter of a period, estimated by a fit of loops.
 
-        With the modes of the readings as they are without it.
+        The fits start from the modes for readings that are moved back by it.
         """
         record = scene.posterior.single_record
         limit = min(0.55 * scene.turn_time, 0.2 * scene.duration)
@@ -167,12 +168,12 @@ class _LongDelay(_Delay):
         windows = (slice(0, kept.size),)
         moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
         places = map_estimate.local_minima(moved, scene.generator)
-        # By its prior, which is as wide as a quarter of the time between two reversals.
+        # The score of the delay, as its prior's sd is a quarter of the time between two reversals.
         yield Sighting(starts=[{"delay": 4 * late / scene.turn_time}], places=places)
 
 
 def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:
-    """Return the line that leaves a start of ``settled`` samples out, unless it is too dear.
+    """Return the fix that leaves out a start of ``settled`` samples, unless it is too long.
 
     A start that holds more than a twentieth of the drive's path is not left out.
     """
@@ -183,7 +184,7 @@ def settle_fix(voltage: FloatArray, settled: int, leave_out: str) -> str:
 
 
 def late_fix(delay: float, interval: float) -> str:
-    """Return what to do where the displacement comes ``delay`` s after what the voltage does."""
+    """Return the fix for a displacement that follows the voltage ``delay`` s late."""
     rows = max(round(abs(delay) / interval), 1)
     name = "displacement" if delay > 0 else "voltage"
     return f"move the {name}'s column up by {rows} row{'s' * (rows > 1)} in the file"
@@ -191,7 +192,7 @@ def late_fix(delay: float, interval: float) -> str:
 
 REFIT = "fit this record itself, with the same config"
 
-# Those that a good fit refuses at once, in the order in which they are tried.
+# Defects that a good fit rules out at once, in the order in which they are tried.
 QUICK = (
     _Transient("transient", "transient", foreign=True, removes=True, finding="switch-on transient"),
     Defect(
@@ -244,7 +245,7 @@ SLOW = tuple(
     for name in STAGES
     if name not in [defect.stage for defect in QUICK]
 )
-# Those that no stage is, of bands alone.
+# Defects of bands that no stage describes.
 OF_BANDS = (
     Defect(
         "outliers",

@@ -1,9 +1,9 @@
-"""How readings may depart from their bands: too few covered, too far off, to one side, too near.
+"""Departures of readings from their bands: coverage, size of the residuals, bias, excess width.
 
-What luck alone may do to a mean of many readings depends on how many independent ones they are
-worth, far fewer than there are: a discrepancy forgets slowly, and the parameters' error is one and
-the same all along. The bands themselves say how large each part is. Where luck may do it too, a
-departure comes with the chance of that on a record that the fitted model describes.
+The chance variation of a mean of many readings depends on their effective sample size, which is far
+below their number: a discrepancy has a long correlation time, and the parameters' error is the same
+all along. The sizes of these parts follow from the bands. A departure that chance may explain has
+the probability of that on a record that the fitted model describes.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import rounded
 
-# False alarms of each of the tests of coverage, size and bias: some ten of them look at a record.
-# Above the first a failure may be luck, and below the second a success may be none.
+# Probabilities of a false alarm of each test of coverage, size and bias, some ten for a record: a
+# departure below the first fails, and one between both leaves the validation inconclusive.
 ALARM, DOUBT = 2e-4, 0.01
 
-# Coverage counts as off only where its odds are off by this factor: 95% is not 92.6%, but 94.
+# Coverage counts as off only if its odds are off by this factor: 92.6% instead of 95%, but not 94%.
 ODDS = 1.5
 
 
 @dataclass(frozen=True)
 class StandardizedResiduals:
-    """Scored readings against their bands, and how many independent ones they are worth.
+    """Standardized residuals of the scored readings, and their effective sample sizes.
 
     ``z`` (readings,) are residuals over the sensor band's sd; ``mean_size`` and ``square_size`` are
-    how many independent readings the record is worth to the mean of z and to that of z².
-    ``varying`` is z about its mean, scaled to a variance of one, worth ``varying_size`` readings to
-    that of its square; ``common`` is the part of the band's variance that all readings share, such
-    as an offset's. ``noise_log_sd`` is the sd of the logarithm of the noise's sd.
+    the effective sample sizes of the record for the mean of z and for that of z². ``varying`` is z
+    about its mean, scaled to a variance of one, and ``varying_size`` the effective sample size for
+    the mean of its square; ``common`` is the part of the band's variance that all readings share,
+    such as an offset's. ``noise_log_sd`` is the sd of the logarithm of the noise's sd.
     """
 
     bands: Bands
@@ -52,11 +52,11 @@ class StandardizedResiduals:
 
     @classmethod
     def of(cls, bands: Bands, memory: float, noise_log_sd: float) -> StandardizedResiduals:
-        """Take the residuals over their sd, and work out how many independent ones they are worth.
+        """Divide the residuals by their sd, and work out their effective sample sizes.
 
-        With c, p, q and w the shares of a common error, of parameters, discrepancy and sensor in
-        the variance, z at two samples t apart has the correlation c + p + q exp(-t/τ), and z² that
-        squared. About its mean the common error drops out. ``memory`` is τ, s.
+        With the shares c, p, q and w of a common error, of parameters, discrepancy and sensor in
+        the variance, z at two samples t apart has the correlation c + p + q exp(-t/τ), and z² its
+        square. The common error drops out of z about its mean. ``memory`` is τ, s.
         """
         assert bands.measured is not None
 
@@ -81,12 +81,12 @@ class StandardizedResiduals:
         common = min(bands.common_sd**2 / total, p)
 
         def of_squares(p: float, q: float) -> float:
-            """Mean correlation of all pairs of squares."""
+            """Return the mean correlation of all pairs of squares."""
             return p**2 + 2 * p * q * once + q**2 * twice + (1 - (p + q) ** 2) * single
 
         mean = p + q * once + (1 - p - q) * single
         shared = (p - common) + q * (1 - once) + (1 - p - q) * (1 - single)
-        # A common error may be all that the bands allow for, or the reading the only one.
+        # The bands may hold nothing but a common error, or there may be a single reading.
         shared = max(shared, float(np.finfo(float).eps))
         varying = of_squares(min((p - common) / shared, 1.0), min(q * (1 - once) / shared, 1.0))
         return cls(
@@ -103,18 +103,18 @@ class StandardizedResiduals:
 
     @property
     def noise_size(self) -> float:
-        """Independent readings that would tell the noise's sd as well as the fit has done."""
+        """Number of independent readings that would determine the noise's sd as well as the fit."""
         return 1 / max(2 * self.noise_log_sd**2, 1e-9)
 
     @property
     def effective_size(self) -> float:
-        """Independent readings, about their mean, that record and fit together are worth."""
+        """Effective sample size, about the mean, of record and fit together."""
         return 1 / (1 / self.varying_size + 1 / self.noise_size)
 
     def chances(self) -> list[tuple[str, float]]:
-        """Return what is off in coverage, size and bias, with the chance that luck does it.
+        """Return departures in coverage, size and bias, with their probabilities by chance.
 
-        Of each the least likely, if its chance is below ``DOUBT``.
+        Each has its least likely departure in the list, if that probability is below ``DOUBT``.
         """
         sizes = []
         for z, size, about in (
@@ -127,12 +127,12 @@ class StandardizedResiduals:
                 text = f"the residuals are {ratio} as the sensor band predicts"
                 sizes.append((text, float(scipy.stats.f.sf(square, size, self.noise_size))))
         biases, mean = [], float(np.mean(self.z))
-        # A smaller one cannot be seen in the coverage.
+        # A smaller bias does not show in the coverage.
         if abs(mean) >= 0.5:
             errors = abs(mean) * np.sqrt(self.mean_size)
             offset = f"{float(np.mean(self._residual)):+.3g} um off the mean"
             text = f"the readings lie {offset}, {errors:.2g} of its standard errors"
-            # As sure as the size of the noise is.
+            # The size of the noise is uncertain: take a t distribution.
             biases.append((text, 2 * float(scipy.stats.t.sf(errors, self.noise_size))))
         departures = (self._coverage(), sizes, biases)
         rarest = [
@@ -142,22 +142,22 @@ class StandardizedResiduals:
         return [(text, chance) for text, chance in rarest if chance < DOUBT]
 
     def reasons(self, span: tuple[float, float], extent: float) -> list[str]:
-        """Return why validation fails; nothing if it does not.
+        """Return the reasons for a failure of the validation; none if it does not fail.
 
         ``span`` are the lowest and the highest voltage of training, V, ``extent`` is the range of
         its readings, um.
         """
-        # A band that misses most of the readings has failed, unless they are off by so little that
-        # luck may do it if all of them are worth one independent reading.
+        # A band that misses most of the readings has failed, unless chance may explain their
+        # residuals even if all of them together are worth one independent reading.
         single = scipy.stats.f.sf(np.mean(self.z**2), 1, self.noise_size)
         limit = DOUBT if self._covered(95) < 0.5 and single < DOUBT else ALARM
         reasons = [
             *self._reversed(span),
             *(text for text, chance in self.chances() if chance < limit),
         ]
-        # Five readings six sds off, so that a bad start or spikes are not lost in a long record: a
-        # good one has them once in five hundred million. A noise whose size is hardly known may
-        # well be larger here.
+        # Test for five readings six sds off, so that a long record does not hide a bad start or
+        # spikes: a good reading is so far off once in five hundred million. If the noise's size is
+        # uncertain, it may well be larger here.
         rows = np.flatnonzero(np.abs(self.z) > 6 * np.exp(2 * self.noise_log_sd))
         if rows.size >= 5:
             first = clock(self.bands.time[self.scored][rows[0]], self.bands.interval)
@@ -166,9 +166,9 @@ class StandardizedResiduals:
                 f"farthest {np.max(np.abs(self.z)):.2g} SDs"
             )
         if self.bands.training:
-            # A fit that misses its own readings by more than a sensor's noise would, by 5% of the
-            # range: a Bouc-Wen model misses one or two percent of an actuator's displacement. The
-            # range is that of all that was fitted: a short window's may be small.
+            # A fit fails if its residual exceeds the sensor's noise and 5% of the range: that of a
+            # Bouc-Wen model is one or two percent of an actuator's displacement. The range is that
+            # of all fitted readings: a short window's may be small.
             assert self.bands.measured is not None
             extent = max(extent, float(np.ptp(self.bands.measured[self.scored])))
             steps = np.diff(self._residual)
@@ -176,12 +176,12 @@ class StandardizedResiduals:
             fast = float(np.sqrt(np.median(steps**2) / (2 * 0.4549))) if steps.size else 0.0
             rms = float(np.sqrt(np.mean(self._residual**2)))
             fast = max(fast, rounding_sd(self.bands.measured[self.scored]))
-            # Of a sensor's noise, which no model follows, nothing is the model's fault.
+            # Subtract the sensor's noise, which no model follows.
             slow = np.sqrt(max(rms**2 - fast**2, 0.0))
             if slow > max(0.05 * extent, fast) and extent:
                 reasons.append(f"NRMSE {percent(rms / extent)} on the training readings")
         square = float(np.mean(self.z**2))
-        # A model that follows rounded readings exactly misses less than rounding would.
+        # A model that follows rounded readings exactly has a residual below that of rounding.
         assert self.bands.measured is not None
         if rounding := rounding_sd(self.bands.measured[self.scored]):
             widths = np.maximum(self.bands.sd("sensor")[self.scored], rounding)
@@ -194,7 +194,7 @@ class StandardizedResiduals:
 
     @property
     def idle(self) -> str:
-        """That the readings decide nothing: any model covers a motion smaller than its band."""
+        """Note that the motion is smaller than the band, which any model would cover, or ""."""
         width = float(np.mean((self.bands.upper["sensor", 95] - self.bands.mean)[self.scored])) * 2
         motion = float(np.ptp(self.bands.mean[self.scored]))
         if motion >= width:
@@ -206,9 +206,10 @@ class StandardizedResiduals:
 
     @property
     def excess_width(self) -> str:
-        """That the band is many times as wide as the sensor's noise; three are nine tenths of it.
+        """Note that the band is at least three times as wide as the sensor's noise, or "".
 
-        Such a band covers nearly anything that the drive of training does.
+        The model's error is nine tenths of such a band's variance, and the band covers nearly any
+        response to the drive of training.
         """
         total, displacement = (
             float(np.mean(self.bands.read_sd(kind)[self.scored] ** 2))
@@ -224,7 +225,7 @@ class StandardizedResiduals:
 
     @property
     def offset_advice(self) -> str:
-        """A large share of the offset in the variance, and the lead-in that makes it small."""
+        """Note of a large share of the offset in the variance, with the lead-in to reduce it."""
         lead, small = self.bands.lead_in, 0.15
         if lead is None or self.common <= small:
             return ""
@@ -248,13 +249,13 @@ class StandardizedResiduals:
         return residual
 
     def _covered(self, level: int) -> float:
-        """Part of the readings in a sensor band."""
+        """Return the part of the readings in a sensor band."""
         assert self.bands.measured is not None
         return float(np.mean(self.bands.covers("sensor", level, self.bands.measured)[self.scored]))
 
     def _coverage(self) -> Iterator[tuple[str, float]]:
         """Find levels at which fewer readings lie in the sensor band than stated."""
-        # Factors on the noise's sd, evenly probable, that the fit allows.
+        # Equally probable factors on the noise's sd, within the fit's uncertainty.
         scales = np.empty(0)
         for level in reversed(LEVELS):
             covered, nominal = self._covered(level), level / 100
@@ -272,9 +273,9 @@ class StandardizedResiduals:
             yield text, float(np.mean(chances))
 
     def _reversed(self, span: tuple[float, float]) -> Iterator[str]:
-        """Find readings that go against the voltage, where it goes up and down by enough.
+        """Find readings that go against the voltage, if it goes up and down by enough.
 
-        A lag of many seconds and a gain beyond all reason can follow even these.
+        A model with a lag of many seconds and an absurd gain can follow even these.
         """
         bands, scored = self.bands, self.scored
         assert bands.measured is not None

@@ -1,12 +1,12 @@
-"""Whether what a model misses follows the drive: then another drive may be missed by more.
+"""Test whether the residual follows the drive: then its size on another drive may be larger.
 
-A disturbance of the sensor or of the room does not know the voltage; what a wrong model misses does
-comes back wherever the drive does the same again. Each residual, less its mean over a period of the
-drive, is held against the mean of those where the drive was most alike, at other times. The
+A disturbance of the sensor or of the room is independent of the voltage; the residual of a wrong
+model comes back wherever the drive repeats itself. Each residual, less its mean over a period of
+the drive, is compared with the mean of those at other times where the drive was most alike. The
 correlation of both is compared with that of residuals drawn from the fitted noise, which has the
-residual's size and memory and knows nothing of the drive. Where a drive hardly comes back, one part
-of the record tells as much of another: what plays, powers and lags of the voltage explain of the
-whitened residual in all parts but one is held against that one.
+residual's size and correlation time and is independent of the drive. For drives that hardly repeat,
+a second test predicts parts of the record from others: plays, powers and lags of the voltage are
+fitted to the whitened residual in all parts but one, and their prediction is tested on that one.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import root
 from bwbayes.model.reversals import monotone_stretches, rate, time_between_turns, turning_points
 
-# Probability of a false alarm, of a residual that does not follow the drive; and the correlation,
-# or the part of its variance beyond the sensor's noise, from which on it matters.
+# Probability of a false alarm for a residual that does not follow the drive; and the smallest
+# relevant correlation, or part of its variance beyond the sensor's noise.
 ALARM, MATTERS = 0.02, 0.1
 
-# Nearest states of the drive that a residual is compared with, and readings that are looked at.
+# Number of the nearest states of the drive to compare a residual with, and of the readings used.
 NEIGHBORS, READINGS = 4, 1_500
 
 # Times over which the voltage is averaged, in parts of the time between reversals.
 AVERAGES = (0.2, 0.6)
 
-# Residuals that are drawn; draws whose mean is what the model does.
+# Number of residuals to draw, and of draws whose mean is the model's displacement.
 DRAWN, MEAN_OF = 200, 40
 
-# Thresholds of plays in parts of half the range, times of lags in those between reversals, and
-# parts of a record of which each is predicted from the others.
+# Thresholds of plays in parts of half the range, times of lags in parts of the time between
+# reversals, and the number of parts of a record, each of which is predicted from the others.
 PLAYS, LAGS, PARTS = (0.05, 0.1, 0.2, 0.4, 0.7), (0.1, 0.3, 1.0, 3.0, 10.0, 30.0), 8
 
 
 @dataclass(frozen=True)
 class DriveLock:
-    """How the residual goes with that at like states of the drive: correlation, and p value.
+    """Correlation of the residual with that at like states of the drive, and its p value.
 
-    ``p_value`` is the probability that noise which knows nothing of the drive has it as large, or
-    lets as much of one part be told from the others; ``share`` the part of the residual's variance
-    that is not the sensor's noise.
+    ``p_value`` is the probability that noise independent of the drive has as large a correlation,
+    or lets as much of one part be predicted from the others; ``share`` is the part of the
+    residual's variance that is not the sensor's noise.
     """
 
     correlation: float
@@ -56,12 +56,12 @@ class DriveLock:
 
     @property
     def locked(self) -> bool:
-        """Whether the residual follows the drive."""
+        """True if the residual follows the drive."""
         return self.p_value < ALARM and max(self.share, self.correlation) > MATTERS
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it."""
+        """Numbers for ``summary.json``."""
         return {
             "correlation": self.correlation,
             "p_value": self.p_value,
@@ -70,7 +70,7 @@ class DriveLock:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What to know, and to do, of a residual that follows the drive."""
+        """A finding if the residual follows the drive."""
         if not self.locked:
             return ()
         text = (
@@ -84,27 +84,27 @@ class DriveLock:
 def drive_locks(
     posterior: Posterior, draws: FloatArray, rng: np.random.Generator
 ) -> dict[str, DriveLock]:
-    """Tell of each record of a posterior whether what the model misses follows the drive."""
+    """Test for each record of a posterior whether the residual follows the drive."""
     views = posterior.each(draws)
     return {name: drive_lock(alone, own_draws, rng) for name, alone, own_draws in views}
 
 
 def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator) -> DriveLock:
-    """Tell whether what the model of a posterior of one record misses follows the drive.
+    """Test whether the residual of the model of a single-record posterior follows the drive.
 
-    Of ``draws`` (draws, free), parameters in their own units, some hundred are used, and of long
-    records some thousand readings.
+    It uses some hundred of the ``draws`` (draws, free), parameters in their own units, and some
+    thousand readings of a long record.
     """
     record, readings = posterior.single_record, posterior.single_record.readings
     if readings.rows.size <= 10 * NEIGHBORS:
-        return DriveLock(0.0, 1.0)  # they tell nothing
+        return DriveLock(0.0, 1.0)  # too few readings for a test
     theta = posterior.prior.theta(draws[rng.integers(len(draws), size=DRAWN)])
     missed = readings.values - np.mean(posterior.simulate(theta[:MEAN_OF], readings.rows), axis=0)
     if float(np.std(missed)) < rounding_sd(readings.values):
-        return DriveLock(0.0, 1.0)  # it rounds, which follows the drive as well
+        return DriveLock(0.0, 1.0)  # the residual is rounding, which follows the drive as well
     stride = -(-missed.size // READINGS)
     rows, parameters = readings.rows[::stride], record.table.noise(theta)
-    # On a grid as coarse as the readings.
+    # Draw the noise on a grid as coarse as the readings.
     step = int(np.gcd.reduce(np.diff(rows)))
     places = (rows - rows[0]) // step
     noise = record.noise.at(step * record.actuator.interval)
@@ -123,14 +123,14 @@ def drive_lock(posterior: Posterior, draws: FloatArray, rng: np.random.Generator
 def compare(
     residual: FloatArray, drawn: FloatArray, voltage: FloatArray, rows: IntArray
 ) -> DriveLock:
-    """Compare how a residual (readings,) goes with like states of the drive with what chance does.
+    """Compare a residual's correlation with that at like states of the drive with chance.
 
     Parameters
     ----------
     residual
-        Residual of the model, um.
+        Residual (readings,) of the model, um.
     drawn
-        Residuals (draws, readings) of noise that knows nothing of the drive.
+        Residuals (draws, readings) of noise that is independent of the drive.
     voltage
         The drive (samples,), V.
     rows
@@ -139,7 +139,7 @@ def compare(
     turn_time = time_between_turns(voltage[: rows[-1] + 1], 1.0)
     like = like_states(voltage, rows, turn_time)
     series = np.concatenate([residual[np.newaxis], drawn])
-    # What is slower than a period of the drive may be a drift, and hides the rest.
+    # Subtract the part slower than a period of the drive, which may be a drift and hides the rest.
     first = np.searchsorted(rows, rows - turn_time)
     last = np.searchsorted(rows, rows + turn_time, side="right")
     sums = np.cumsum(np.pad(series, ((0, 0), (1, 0))), axis=1)
@@ -156,8 +156,8 @@ def compare(
 def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArray:
     """Return the readings (readings, neighbors) where the drive was most alike.
 
-    The drive's state is the voltage, its means over some times before, and its last reversal. They
-    are at least the time between two reversals, in samples, away.
+    The drive's state is the voltage, its means over some times before, and its last reversal. The
+    returned readings are at least ``turn_time``, in samples, away.
     """
     sums = np.concatenate([[0.0], np.cumsum(voltage)])
     columns = [voltage[rows]]
@@ -174,7 +174,10 @@ def like_states(voltage: FloatArray, rows: IntArray, turn_time: float) -> IntArr
 
 
 def drive_features(voltage: FloatArray) -> FloatArray:
-    """Return what a misfit may follow: 1, powers, plays and lags (features, samples) of a drive."""
+    """Return functions of a drive that a residual may follow, (features, samples).
+
+    These are 1, powers, plays and lags.
+    """
     turn_time, center = time_between_turns(voltage, 1.0), (voltage.max() + voltage.min()) / 2
     level = (voltage - center) / max(float(np.ptp(voltage)) / 2, 1e-300)
     thresholds = np.array(PLAYS)[:, np.newaxis]
@@ -193,10 +196,10 @@ def drive_features(voltage: FloatArray) -> FloatArray:
 
 
 def predictability(white: FloatArray, features: FloatArray, rng: np.random.Generator) -> float:
-    """Return the p value of what features predict of parts of a residual from all the others.
+    """Return the p value of the prediction of parts of a residual from all the others.
 
-    By ridge regression of the whitened residual (readings,) on whitened ``features`` (features,
-    readings); chance is that of independent normal numbers.
+    The prediction is a ridge regression of the whitened residual (readings,) on whitened
+    ``features`` (features, readings), compared with that of independent normal numbers.
     """
     basis, sizes, _ = np.linalg.svd(features.T, full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
@@ -208,7 +211,7 @@ def predictability(white: FloatArray, features: FloatArray, rng: np.random.Gener
     drawn = np.einsum("pji,dpj->dpi", root(inside), scores)
     samples = np.concatenate([products[np.newaxis], drawn])
     others = samples.sum(axis=1, keepdims=True) - samples
-    # The ridge is worth a part of the record.
+    # The ridge has the weight of one part of the record.
     ridge = (1 + 1 / PARTS) * np.eye(basis.shape[1])
     weights = np.einsum("pij,dpj->dpi", np.linalg.inv(ridge - inside), others)
     spread = np.sqrt(np.einsum("dpi,pij,dpj->d", weights, inside, weights))

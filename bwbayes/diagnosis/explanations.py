@@ -1,9 +1,9 @@
-"""Why bands fail: every extension of the fitted model that there is, ranked by evidence.
+"""Explanations of failing bands: all extensions of the fitted model, ranked by evidence.
 
-An explanation is a small extension of the fitted model, fitted from the mode that there is. It is
-worth what the log evidence rises by, nats. The likely cause is the best one, if it is worth more
-than :data:`LIMIT`; two that tie are both named. A fix that leaves readings out must beat all that
-keep them.
+An explanation is a small extension of the fitted model, fitted from the known mode. It is worth the
+rise of the log evidence, nats. The likely cause is the best one, if it is worth more than
+:data:`LIMIT`; two that tie are both named. A cause whose fix leaves readings out is named only if
+none ties with it whose fix keeps them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.watching import Watch, unwatched
 
-# Each yields what it finds of a fit. The first are small additions, which a good fit refuses at
-# once; the others explain what the discrepancy takes up.
+# Functions that yield explanations of a fit. The first are small additions, which a good fit rules
+# out at once; the others explain the part of the readings that the discrepancy takes up.
 ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     *(defect.explanations for defect in QUICK),
     model.prior,
@@ -41,10 +41,10 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.smooth,
 )
 
-# Those that a record without a clock does not have, besides stages that count time.
+# Functions for records with a clock only, besides stages that depend on time.
 TIMED = (model.growing_noise, model.creep, model.dynamics, model.hold, model.smooth)
 
-# Of a good record no ratio of evidences exceeds k with a probability above 1/k (Markov's
+# On a good record a ratio of evidences exceeds k with a probability of at most 1/k (Markov's
 # inequality), so that at most one good record in a hundred gets a cause, whatever the priors are.
 LIMIT = float(np.log(100 * len(ADDITIONS + CHANGES)))
 
@@ -57,18 +57,18 @@ def explain(
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
-    Only the first of them where the discrepancy takes up too little for any other to be worth more
-    than :data:`LIMIT`, unless one of these is, so that all compete where a cause is named. Where
-    the discrepancy is smooth, they are fitted beside a rough one first, then those beside the
-    smooth one that are worth more than the limit there; each counts as the better fit. Other models
+    Only the additions are fitted if the discrepancy takes up too little for any other explanation
+    to be worth more than :data:`LIMIT`, unless an addition is worth that: then all compete. If the
+    discrepancy is smooth, all are first fitted with a rough one; those worth more than the limit
+    are fitted with the smooth one as well, and each has the worth of its better fit. Other models
     are fitted to the beginning of a record that is too long. ``watch`` is called with the share
-    that is done. No other one is begun after ``until`` s of the process's CPU time.
+    that is done. No fit begins after ``until`` s of the process's CPU time.
     """
     best: dict[str, Explanation] = {}
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
     looked_at, rough = scene, scene.with_rough_noise()
-    # What the actuator is, several records say together.
+    # With several records, the model of the actuator is a matter of all of them.
     kinds = (*ADDITIONS, *(CHANGES if scene.alone else CHANGES[:1]))
     if not scene.posterior.single_record.inputs.quantities.has_clock:
         kinds = tuple(kind for kind in kinds if kind not in TIMED)
@@ -92,7 +92,7 @@ def explain(
             best[explanation.kind] = max(previous, explanation, key=lambda either: either.nats)
         watch((number + 1) / len(kinds))
     ranked = _ranked(best.values())
-    # A long record was looked at in parts: what leads has to lead on all of it.
+    # Only parts of a long record were fitted: confirm the leading explanations on all of it.
     noises = [explanation for explanation in ranked if explanation.noise]
     for explanation in (*better_models(ranked), *likely_causes(noises)):
         best[explanation.kind] = scene.confirmed(explanation)
@@ -101,7 +101,7 @@ def explain(
 
 
 def _in_time(explanations: Iterator[Explanation], until: float) -> Iterator[Explanation]:
-    """Yield explanations as long as the process's CPU time is not over."""
+    """Yield explanations while the process's CPU time is below ``until`` s."""
     while time.process_time() < until:
         explanation = next(explanations, None)
         if explanation is None:
@@ -114,7 +114,7 @@ def _ranked(explanations: Iterable[Explanation]) -> tuple[Explanation, ...]:
 
 
 def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
-    """Return the best of ranked explanations and those that tie with it; none below the limit."""
+    """Return the best of ranked explanations above the limit, and those that tie with it."""
     leading = [
         explanation
         for explanation in ranked
@@ -125,20 +125,19 @@ def likely_causes[Cause: Finding](ranked: Sequence[Cause]) -> tuple[Cause, ...]:
 
 
 def better_models(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
-    """Return the likely causes that would change what is predicted of the next drive.
+    """Return the likely causes that would change the prediction for the next drive.
 
-    Not noise of another kind, as heavy tails: the bands have its size already, and where that
-    matters to their coverage, they fail. Nor what misleads.
+    Noise of another kind, such as heavy tails, is left out: the bands include its size already, and
+    they fail where their coverage suffers. Misleading explanations are left out as well.
     """
     return likely_causes([one for one in ranked if not (one.noise or one.misleads)])
 
 
 def followed_causes(ranked: Sequence[Explanation]) -> tuple[Explanation, ...]:
-    """Return what a fit may have followed although the actuator has not done it.
+    """Return foreign effects, not of the actuator, that a fit may have followed.
 
-    A likely cause is enough by itself: parameters that followed it need not find back. Where there
-    is none, even odds are enough if a parameter moves by three sds as well: a good fit hardly has
-    both.
+    A likely cause is enough by itself: parameters that followed it need not return. Without one,
+    even odds are enough if a parameter also moves by three sds: a good fit hardly ever has both.
     """
     near = likely_causes(ranked) or [
         explanation for explanation in ranked if explanation.nats > max(0.0, ranked[0].nats - TIED)

@@ -1,9 +1,9 @@
-"""For which drives bands were tested, and where a prediction leaves those.
+"""Range of the drives for which bands were tested, and the predictions that leave it.
 
-In voltage, speed, reversals, slowness or duration. There the bands know how sure the parameters
-are, and of what else the actuator does only the creep after slower drives, by its prior
-(:mod:`bwbayes.inference.prior_creep`): it saturates at higher voltages, lags behind faster ones,
-and drifts.
+A prediction leaves it in voltage, speed, reversals, slowness or duration. There the bands include
+the uncertainty of the parameters, and of the actuator's other effects only the creep after slower
+drives, by its prior (:mod:`bwbayes.inference.prior_creep`): an actuator saturates at higher
+voltages, lags behind faster ones, and drifts.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
 
-# Part of the time between turning points over which a speed is taken: a sine's peak speed is then
-# 0.4% too low, and noise of 1% of its range adds a tenth.
+# Part of the time between turning points over which a speed is averaged: a sine's peak speed is
+# then 0.4% too low, and noise of 1% of its range adds a tenth.
 PART = 0.1
 
-# Times that are longer than the fitted ones by more than this factor leave creep that the record
-# does not show. Creep goes with the logarithm of the time, by one or two percent of a change each
-# decade: half a decade is half of the one or two percent that a model misses anyway.
+# Times that exceed the fitted ones by more than this factor add creep that the record does not
+# show. Creep grows with the logarithm of the time, by one or two percent of a change each decade:
+# half a decade is half of the usual model error of one or two percent.
 LONGER = 3.0
 
 # Mean distance of a drive's voltages and last reversals from those of training, in parts of the
-# range: of drives alike it is at most 0.02, of others at least 0.03.
+# range: it is at most 0.02 for similar drives, and at least 0.03 for others.
 ALIKE = 0.025
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What training drove the actuator with: all that a validation on its readings speaks for.
+    """Range of the training drive: a validation on its readings is valid for this range alone.
 
     Attributes
     ----------
@@ -87,11 +87,11 @@ def beyond_training(
     inputs: Inputs,
     window: slice = slice(None),
 ) -> list[Finding]:
-    """Return in what a drive leaves those that the model was fitted to.
+    """Return the respects in which a drive leaves those that the model was fitted to.
 
-    Findings of kind "range" and "speed" leave what any model knows, as does "covariate",
-    and "reversals" the loops on which this one was tested; "slow" and "duration" leave room for
-    creep and drift, which may be as small as the bands allow.
+    Findings of kind "range", "speed" and "covariate" are beyond the knowledge of any model, and
+    "reversals" beyond the loops on which this one was tested; with "slow" and "duration" there may
+    be creep and drift, which may be as small as the bands allow.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def beyond_training(
     inputs
         The drive from its first sample on.
     window
-        The samples that are predicted; those before are what the actuator went through.
+        The samples that are predicted; those before are the actuator's history.
     """
     voltage, interval = inputs.voltage, inputs.interval
     low, high = _fitted_range(posterior)
@@ -121,9 +121,9 @@ def beyond_training(
         over = PART * min(fitted_turn_time, turn_time)
         fitted = fastest(dataset.voltage, dataset.actuator.interval, over, dataset.training)
         speeds.append((fastest(planned, interval, over), fitted))
-    # Of several records the one that comes nearest to the drive.
+    # Compare with the record that comes nearest to the drive.
     speed, slower = min(speeds, key=lambda pair: pair[0] / max(pair[1], 1e-300))
-    # Noise and the sampling change a speed by a tenth or so.
+    # Noise and sampling change a speed by about a tenth.
     if speed > 1.5 * slower:
         text = (
             f"voltage speed of up to {speed:.3g} V/s exceeds the {slower:.3g} V/s of training; the "
@@ -151,18 +151,18 @@ def beyond_training(
     return findings
 
 
-# What a drive excites in an actuator that its training record did not, by a finding's kind.
+# Excitations that the training record lacks, by the kind of the finding.
 UNEXCITED = {"speed": "fast edges", "slow": "slow holds"}
 
 
 def unexcited(findings: Iterable[Finding]) -> str:
-    """Say what a drive excites that the training record did not; nothing if that is not known."""
+    """Name a drive's excitations that the training record lacks; return "" without any."""
     kinds = [UNEXCITED[finding.kind] for finding in findings if finding.kind in UNEXCITED]
     return f"this drive excites what the record did not ({', '.join(kinds)})" if kinds else ""
 
 
 def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator[Finding]:
-    """Hold what parts of the model see beside the voltage against what they saw in training."""
+    """Compare the covariates that stages of the model use with their ranges in training."""
     seen_names = {stage.sees for stage in posterior.datasets[0].actuator.stages}
     for name in sorted(seen_names & {*inputs.covariates}):
         ranges = [data.inputs.range_of(name, data.training) for data in posterior.datasets]
@@ -178,7 +178,7 @@ def _covariates(posterior: Posterior, inputs: Inputs, window: slice) -> Iterator
 
 
 def _fitted_range(posterior: Posterior) -> tuple[float, float]:
-    """Lowest and highest voltage that was fitted, V."""
+    """Return the lowest and the highest voltage that was fitted, V."""
     windows = [
         data.voltage[training_window]
         for data in posterior.datasets
@@ -190,9 +190,9 @@ def _fitted_range(posterior: Posterior) -> tuple[float, float]:
 def _distance(
     posterior: Posterior, span: tuple[float, float], voltage: FloatArray, window: slice
 ) -> float:
-    """Mean distance of a drive's loops from the nearest ones of training, in parts of the range.
+    """Return the mean distance of a drive's loops from those of training, in parts of the range.
 
-    Rate-independent memory goes along a branch that begins at the last reversal.
+    Rate-independent hysteresis follows a branch that begins at the last reversal.
     """
     extent = span[1] - span[0]
     fitted = np.concatenate(
@@ -202,7 +202,7 @@ def _distance(
             for training_window in data.training
         ]
     )
-    # What is beyond the range is said by itself; a drive without a reversal has no loop.
+    # Another finding covers voltages beyond the range; a drive without a reversal has no loop.
     planned = _branches(np.clip(voltage, *span), window, RETURN * extent)
     if not (fitted.size and planned.size):
         return 0.0
@@ -211,7 +211,7 @@ def _distance(
 
 
 def _branches(voltage: FloatArray, window: slice, threshold: float) -> FloatArray:
-    """Voltage and last reversal (samples, 2), V, of some thousand samples after a reversal."""
+    """Return voltage and last reversal (samples, 2), V, at some thousand samples."""
     turns = turning_points(voltage[: window.stop], threshold)
     rows = np.arange(voltage.size)[window]
     rows = rows[:: max(rows.size // 5_000, 1)]
@@ -228,14 +228,14 @@ def _slow(
     interval: float,
     window: slice,
 ) -> Iterator[Finding]:
-    """Hold the voltage's means over some times T against those of training.
+    """Compare the voltage's means over some times T with those of training.
 
-    Creep with the time T follows the mean over T. The creep that training does not show is as large
-    as ∫ (mean now − mean then) d log T, where means go beyond those of training.
+    Creep with the time T follows the mean over T. The creep that training does not show has the
+    size ∫ (mean now − mean then) d log T over the times whose means exceed those of training.
     """
     low, high = span
-    a_decade, sides = 8, np.array([[-1.0], [1.0]])  # times, and where a mean may go
-    # What is beyond the range is said by itself.
+    a_decade, sides = 8, np.array([[-1.0], [1.0]])  # number of times, and sides of the range
+    # Another finding covers voltages beyond the range.
     inside = np.clip(voltage[: window.stop], low, high)
     longest = inside.size * interval
     decades = max(math.log10(longest / (PART * turn_time)), 0.0)
@@ -245,13 +245,13 @@ def _slow(
     for dataset in posterior.datasets:
         interval = dataset.actuator.interval
         means = sides * _slow_means(dataset.voltage, interval, times, dataset.training)
-        # What is longer than the record is taken for the longest time that is not.
+        # For times longer than the record, take the means over its longest time.
         finite = np.flatnonzero(np.isfinite(means[0]))
         fitted.append(means[:, finite[np.searchsorted(finite, np.arange(times.size))]])
-    # A mean over a longer time is that over a shorter one somewhere.
+    # A mean over a longer time is reached by the mean over a shorter one somewhere.
     before = np.maximum.accumulate(np.max(fitted, axis=0), axis=1)
     excess = np.maximum(np.nan_to_num(sides * planned - before), 0.0)
-    # In volts times decades of time; a sine over the whole range has half the range to either side.
+    # The unit is volts times decades of time; a sine over the whole range has half of it per side.
     unknown = np.sum(excess, axis=1) / a_decade
     if unknown.max() > math.log10(LONGER) * (high - low) / 2:
         side = int(np.argmax(unknown))
@@ -269,15 +269,15 @@ def _slow_means(
 ) -> FloatArray:
     """Return the lowest and the highest mean voltage over some times, (2, times), V.
 
-    The mean over the time T before a sample is what creep with that time follows, of all samples in
-    the windows that have so much before them; nan, if none has.
+    Creep with the time T follows the mean over the time T before a sample. All samples in the
+    windows count that have so much time before them; the result is nan if none has.
     """
     spans = [window.indices(voltage.size)[:2] for window in windows]
     total = np.concatenate([[0.0], np.cumsum(voltage[: spans[-1][1]])])
     extremes = np.full((2, times.size), np.nan)
     for i, length in enumerate(np.maximum(np.rint(times / interval), 1).astype(np.int64).tolist()):
         for start, stop in spans:
-            # Means over many samples change slowly: the last one, and one in a fiftieth of them.
+            # Means over many samples change slowly: take the last one, and one each fiftieth of T.
             ends = np.arange(stop, max(start, length - 1), -max(length // 50, 1))
             if ends.size:
                 means = (total[ends] - total[ends - length]) / length

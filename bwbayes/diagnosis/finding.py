@@ -1,4 +1,4 @@
-"""One thing that is wrong: what it is, where, how sure that is, and what to do about it."""
+"""A defect found in a record, a fit or its bands: its kind, place, evidence and fix."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bwbayes.shown import brief
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong with a record, a fit or its bands.
+    """A defect of a record, a fit or its bands.
 
     Parameters
     ----------
@@ -21,11 +21,11 @@ class Finding:
     text : str
         Observation, in one line.
     fix : str
-        Remedy: a line of config, or a change of the file or the measurement.
+        Fix: a line of config, or a change of the file or the measurement.
     start, stop : float, s
-        Where it is: start <= time < stop; by default everywhere.
+        Its place in the record: start <= time < stop; by default everywhere.
     nats : float
-        How sure it is: the log of its odds against nothing being wrong; nan where that is plain.
+        Evidence: the log of its odds against no defect; nan if it is obvious.
     removes : bool
         The fix leaves readings out.
     """
@@ -45,12 +45,12 @@ class Finding:
 
     @property
     def note(self) -> str:
-        """What was seen, and what to do."""
+        """Observation and fix."""
         return f"{self.text}. Fix: {self.fix}."
 
     @property
     def error(self) -> str:
-        """The same as a part of an error's line."""
+        """Kind, observation and fix, as a part of an error's line."""
         return f"{self.kind}: {self.text}; {self.fix}"
 
     @property
@@ -59,7 +59,7 @@ class Finding:
         return f"Likely cause: {self.note}"
 
 
-# What shows a wrong model, and which drive that would be.
+# Fix for a model that may be wrong: a drive that would show it.
 TELLING_DRIVE = (
     "train on a record with reversals at all voltages, such as a multisine; `bwbayes design FOLDER "
     "--validate` finds one"
@@ -67,7 +67,7 @@ TELLING_DRIVE = (
 
 
 def join_findings(findings: Sequence[Finding]) -> Finding | None:
-    """Return findings that cannot be told apart as one; None if there is none."""
+    """Join findings that are tied into one; return None without any."""
     if not findings:
         return None
     return Finding(

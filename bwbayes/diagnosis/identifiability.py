@@ -1,16 +1,16 @@
 """Parameters and combinations that a record does not identify, before and after sampling.
 
 Before, by Fisher's information at a point fit (:func:`undetermined`). Every fit leaves a
-discrepancy of a percent of the range or so, and it comes back whenever the voltage takes the same
-way again: a hundred periods of one sine show one loop, not a hundred. So each distinct branch of
-the voltage counts once, under a discrepancy of that percent. The posterior itself, which trusts the
-noise model, may look surer.
+discrepancy of about a percent of the range, which comes back whenever the voltage repeats itself: a
+hundred periods of one sine show one loop, not a hundred. So each distinct branch of the voltage
+counts once, under a discrepancy of that percent. The posterior itself, which assumes that the noise
+model is right, may be narrower.
 
 After, by the draws (:func:`information_gain`). The contraction 1 − (posterior sd / prior sd)² is
-near one where the record decided and near zero where it told nothing. Both are of the effective
-prior: γ, which lies within β, is held against the β that the record has. Scaling the power of the
-prior, or of the likelihood, by a little shows which of them a posterior hangs on: one that moves
-with the prior and not with the likelihood is what was put in.
+near one where the record determines a parameter and near zero where it does not. Both checks use
+the effective prior: γ, which lies within β, is compared with the β of the record. Scaling the power
+of the prior, or of the likelihood, by a little shows which of them a posterior depends on: one that
+moves with the prior and not with the likelihood repeats the prior.
 """
 
 # mypy: allow-untyped-calls
@@ -35,7 +35,7 @@ from bwbayes.model.reversals import monotone_stretches, turning_points
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 
-# The discrepancy that every fit leaves, as a part of the range, and what that is called.
+# The discrepancy that every fit leaves, as a part of the range, and its description.
 USUAL_ERROR = 0.01
 IF_OFF = f"if the model is off by {USUAL_ERROR:.0%} of the range"
 
@@ -46,8 +46,8 @@ LEFT_OPEN = 1 / 3
 def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     """Yield the combinations of loop parameters that the record determines least, two at most.
 
-    Each leaves more of the prior's sd at a point fit than a third, and says how much and what to
-    measure; the second says how many more there are.
+    For each, more than a third of the prior's sd is left at a point fit; the finding says how much,
+    and what to measure. The second one says how many more there are.
     """
     names = [posterior.names[i] for i in _columns(posterior, posterior.table.loop)]
     if not names:
@@ -56,7 +56,7 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
     count = int(np.count_nonzero(parts > LEFT_OPEN))
     if not count:
         return
-    # What to measure instead.
+    # Choose the advice on what to measure.
     windows = [data.voltage[window] for data in posterior.datasets for window in data.training]
     half = max(float(np.ptp(voltage)) / 2 for voltage in windows)
     swings = np.concatenate([np.abs(np.diff(v[turning_points(v)])) for v in windows])
@@ -80,20 +80,20 @@ def undetermined(posterior: Posterior, point: MAPEstimate) -> Iterator[Finding]:
 
 
 def percent(share: float) -> str:
-    """Write the part of a prior's sd that is left; a posterior may be wider than its prior."""
+    """Write the remaining part of a prior's sd, "all" even if a posterior is wider."""
     return "all" if share >= 0.995 else f"{share:.0%}"
 
 
 def remaining(share: float) -> str:
-    """Say what part of a prior's sd is left after the constraints and the record."""
+    """Write the part of a prior's sd that is left after the constraints and the record."""
     return f"{percent(share)} of the effective prior's SD remains"
 
 
 def spectrum(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:
     """Return the part of the prior sd that is left along each principal direction of the loop.
 
-    The parts (loop parameters,), the largest first, and the directions as columns, in units of
-    each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
+    Returns the parts (loop parameters,), the largest first, and the directions as columns, in units
+    of each parameter's prior sd: relative to its value for a positive one, to its bounds for γ.
     """
     prior, columns = posterior.prior, _columns(posterior, posterior.table.physical)
     free, _ = prior.constrain(point.mode[np.newaxis])
@@ -119,7 +119,7 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
     columns = {name: np.array([value]) for name, value in values.items()}
     lower, upper = parameter.declared.limits(prior.values_for_record(columns, parameter.record))
     if np.isfinite(lower).all() and np.isfinite(upper).all():
-        # What the bounds leave to a parameter of which nothing else is known.
+        # The sd of a uniform distribution between the bounds.
         return float(np.max(upper) - np.min(lower)) / float(np.sqrt(12))
     # Half of the central 68 % stands for the sd: some distributions have none.
     low, high = (float(v) for v in parameter.distribution.frozen.ppf([0.16, 0.84]))
@@ -131,9 +131,9 @@ def _prior_sd(prior: JointPrior, parameter: Parameter, values: dict[str, float])
 def _information(
     posterior: Posterior, dataset: Dataset, free: FloatArray, sds: FloatArray
 ) -> FloatArray:
-    """Fisher information (physical, physical) of a record, each distinct branch counted once.
+    """Return a record's Fisher information (physical, physical); each distinct branch counts once.
 
-    Of moves by ``sds`` (physical, free) from ``free`` (1, free).
+    The derivatives are along steps ``sds`` (physical, free) from ``free`` (1, free).
     """
 
     def simulate(scores: FloatArray) -> FloatArray:
@@ -145,7 +145,7 @@ def _information(
     _, sensor = dataset.noise.marginal_sd(noise_parameters)
     rows = np.concatenate([np.arange(w.start, w.stop) for w in dataset.training])
     weights, duration = stretches_once(dataset.voltage, rows)
-    # It changes along the path: over about half a branch.
+    # The discrepancy changes along the path, over about half a branch.
     noise = DiscrepancyNoise(1.0)
     values = np.array([[sensor[0], USUAL_ERROR * dataset.extent, duration / 2]])
     total = np.zeros((len(slopes), len(slopes)))
@@ -156,10 +156,11 @@ def _information(
 
 
 def stretches_once(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, float]:
-    """Weight of each sample, one over how often ``rows`` have its branch; mean samples a branch.
+    """Return a weight for each sample, and the mean number of samples in a branch.
 
-    Branches of one direction are the same if they start within a percent of the voltage's range.
-    One that ends early, as a record's last one, counts as a part.
+    The weight is one over the number of times that ``rows`` hold the sample's branch. Branches of
+    one direction are the same if they start within a percent of the voltage's range. A branch that
+    ends early, such as a record's last one, counts as a part.
     """
     stretches = list(monotone_stretches(voltage))
     starts = np.array([[voltage[s.first], s.direction] for s in stretches])
@@ -192,10 +193,10 @@ def combined(direction: FloatArray, names: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class ParameterInformation:
-    """What is known of one parameter after a record.
+    """Information about one parameter from a record.
 
-    ``contraction`` as above, in the joint prior's coordinates, so that it is the same for a
-    parameter and its logarithm; below zero where the posterior is wider than the prior.
+    ``contraction`` is defined as above, in the joint prior's coordinates, so that it is the same
+    for a parameter and its logarithm; it is below zero if the posterior is wider than the prior.
     ``prior`` and ``likelihood`` are the power-scaling sensitivities.
     """
 
@@ -205,13 +206,13 @@ class ParameterInformation:
 
     @property
     def prior_decides(self) -> bool:
-        """Whether it moves with the prior, and not with the likelihood."""
+        """True if the posterior moves with the prior, and not with the likelihood."""
         small = 0.05  # Kallioinen and others, section 4
         return self.prior >= small > self.likelihood
 
     @property
     def numbers(self) -> dict[str, float | bool]:
-        """What ``summary.json`` has of it."""
+        """Numbers for ``summary.json``."""
         return {
             "contraction": self.contraction,
             "prior_sensitivity": self.prior,
@@ -222,10 +223,10 @@ class ParameterInformation:
 
 @dataclass(frozen=True)
 class InformationGain:
-    """What a record taught, by parameter.
+    """Information gain from a record, by parameter.
 
-    ``combinations`` are the parameters, in words, that were determined together worst, the worst
-    first, and the part of the prior's sd that is left of each.
+    ``combinations`` are the combinations of parameters, in words, that the record determines least,
+    the worst first, and the part of the prior's sd that is left of each.
     """
 
     __repr__ = brief
@@ -254,7 +255,7 @@ class InformationGain:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it, as ``identifiability``."""
+        """Numbers for ``identifiability`` in ``summary.json``."""
         return {
             "parameters": {name: taught.numbers for name, taught in self.parameters.items()},
             "combinations": [
@@ -271,7 +272,7 @@ def information_gain(
     generator: np.random.Generator,
     watch: Watch = unwatched,
 ) -> InformationGain:
-    """Hold the posterior against the prior.
+    """Compare the posterior with the prior.
 
     Parameters
     ----------
@@ -294,14 +295,14 @@ def information_gain(
     import arviz_base  # noqa: PLC0415  # slow to load
     from arviz_stats import psense  # noqa: PLC0415
 
-    count = 4000  # draws of the prior, and of the posterior, that are looked at
+    count = 4000  # number of draws of the prior, and of the posterior, that are used
     step = max(log_density.size // count, 1)
     thin = draws.reshape(-1, draws.shape[-1])[::step]
     before, after = (prior.unconstrain(sample) for sample in (prior.draw(generator, count), thin))
     log_likelihood = log_density.ravel()[::step] - prior.constrain(after)[1]
     contraction = 1 - np.var(after, axis=0) / np.var(before, axis=0)
     watch(0.5)
-    # The draws are taken as one chain: weights depend on no order.
+    # Take the draws as one chain: weights do not depend on their order.
     tree = arviz_base.from_dict(
         {
             "posterior": {name: thin[np.newaxis, :, i] for i, name in enumerate(prior.free_names)},
@@ -328,7 +329,7 @@ def information_gain(
     for i in range(len(variances) - 1, max(len(variances) - 4, -1), -1):
         sd = float(np.sqrt(max(variances[i], 0.0)))
         if sd >= LEFT_OPEN:
-            # How the scores move together along it, and not what picks it out.
+            # Name the joint move of the scores along the direction, not the direction's weights.
             combinations.append(
                 (combined(posterior_covariance @ directions[:, i], prior.free_names), sd)
             )

@@ -1,6 +1,6 @@
-"""Innovations: what each reading adds to those before it, and whether that is pure chance.
+"""Innovations: normalized one-step residuals of the readings, and tests whether they are white.
 
-Where model and noise model are right, a residual less what the readings before it predict, over
+If model and noise model are right, a residual less its prediction from the readings before it, over
 its standard deviation, is an independent standard normal number. Two things show in these
 innovations that the residuals hide: whether they are white, and whether their mean depends on the
 voltage (its rate, its level, its direction). A departure is reported where it is both beyond chance
@@ -24,7 +24,7 @@ from bwbayes.shown import brief
 # Probability of a false alarm of each of the tests, of which there are about ten.
 ALARM = 1e-4
 
-# What to do about a departure.
+# Fix for a departure.
 EXPLAIN = "give the model what explains it better, if anything is named; else expect wider errors"
 
 
@@ -34,8 +34,8 @@ class Innovations:
 
     All arrays are (readings,): ``time`` in s, ``white`` in sds, ``voltage`` in V, ``rate`` in V/s,
     ``residual`` in um. ``interval`` is that between readings, s; some may be missing. ``noise`` is
-    the noise model for that interval, and ``parameters`` (parameters,) are its own. ``followed``
-    tells that the residual is no larger than that of rounding, and shows nothing.
+    the noise model for that interval, and ``parameters`` (parameters,) are its parameters.
+    ``followed`` is True if the residual is no larger than that of rounding, and shows nothing.
     """
 
     __repr__ = brief
@@ -57,8 +57,8 @@ class Innovations:
     def residual_density(self) -> tuple[FloatArray, FloatArray]:
         """Return frequencies (frequencies,), Hz, and the residual's density there, um/√Hz.
 
-        One-sided, by Welch's method with four segments, of 2¹⁴ samples at most; missing readings
-        count as zero.
+        The density is one-sided, by Welch's method with four segments, of 2¹⁴ samples at most;
+        missing readings count as zero.
         """
         rows = np.rint((self.time - self.time[0]) / self.interval).astype(np.int64)
         samples = int(rows[-1]) + 1
@@ -79,12 +79,13 @@ class Innovations:
     def octaves(self) -> tuple[FloatArray, FloatArray, float]:
         """Return the edges (octaves + 1,) of octaves, Hz, the innovations' power, and a p value.
 
-        The power (octaves,) is over what white innovations of the same variance have. The p value
-        is that of Bartlett's test: how likely chance makes powers so unequal; 1 of few readings.
+        The power (octaves,) is relative to white innovations of the same variance. The p value of
+        Bartlett's test is the probability of such unequal powers by chance; it is 1 for few
+        readings.
         """
         count = self.white.size
         amplitude = np.fft.rfft(self.white - np.mean(self.white))[1 : (count + 1) // 2]
-        # The lowest has eight frequencies; what is left at the top is part of the last one.
+        # The lowest octave has eight frequencies; the last one includes the rest at the top.
         octaves = max(int(np.log2(max(amplitude.size, 1) / 6)), 0)
         cuts = 8 * 2 ** np.arange(octaves)
         parts = np.split(np.stack([amplitude.real, amplitude.imag]), cuts, axis=1)
@@ -97,7 +98,7 @@ class Innovations:
     def by(self, quantity: str) -> tuple[tuple[str, FloatArray], ...]:
         """Return innovations by the voltage's "rate", "voltage" or "direction", each with a name.
 
-        By its direction there are two groups, else three of equal size.
+        The direction gives two groups, the others give three of equal size.
         """
         if quantity == "direction":
             groups = self.rate < 0, self.rate > 0
@@ -114,7 +115,7 @@ class Innovations:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of the innovations."""
+        """Numbers for ``summary.json``."""
         correlation = self.correlation
         largest = correlation[np.argmax(np.abs(correlation))] if correlation.size else None
         return {
@@ -159,11 +160,11 @@ def innovations(posterior: Posterior, free: FloatArray, begin: float = 0.0) -> I
 
 
 def departures(series: Innovations) -> tuple[Finding, ...]:
-    """Return where the innovations depart from what the noise model assumes."""
-    if series.white.size < 100 or series.followed:  # these show nothing
+    """Return findings where the innovations depart from the assumptions of the noise model."""
+    if series.white.size < 100 or series.followed:  # such innovations show nothing
         return ()
     findings = []
-    # The octave that tells most against white innovations, if its power is off by a fifth.
+    # Report the octave with most evidence against white noise, if its power is off by a fifth.
     frequency, power, p = series.octaves()
     octave = int(np.argmax(np.diff(frequency) * (power - 1 - np.log(power))))
     if p < ALARM and not 0.8 < power[octave] < 1.25:
@@ -178,7 +179,7 @@ def departures(series: Innovations) -> tuple[Finding, ...]:
         groups = [(name, white) for name, white in series.by(quantity) if white.size >= 33]
         if len(groups) < 2:
             continue
-        # The group with the surest mean, if it is large enough.
+        # Report the group whose mean is most significant, if that is large enough.
         means = [float(np.mean(white)) for _, white in groups]
         errors = [max(float(np.std(w)), 1e-300) / np.sqrt(w.size) for _, w in groups]
         scores = np.abs(np.divide(means, errors))

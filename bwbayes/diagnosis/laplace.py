@@ -45,25 +45,25 @@ class LocalFit:
 
     @property
     def rmse(self) -> float:
-        """Root mean square of readings less displacement, um."""
+        """Root mean square of the readings minus the displacement, um."""
         residual = self.posterior.single_record.readings.values - self.displacement
         return float(np.sqrt(np.mean(residual**2)))
 
     @property
     def follows(self) -> bool:
-        """Whether it misses less than a constant would: else the noise takes up the readings."""
+        """True if its RMSE is below that of a constant: else the noise takes up the readings."""
         return self.rmse < float(np.std(self.posterior.single_record.readings.values))
 
     def distinct(self, places: Iterable[FloatArray]) -> FloatArray:
-        """Return where it is, and those places (free,) where the displacement is another one.
+        """Return the fit's coordinates, and those places (free,) with another displacement.
 
-        To those of its noise alone a climb finds back.
+        Places that differ in the noise alone are left out: a climb returns from them.
         """
         physical = Target(self.posterior).physical
         return map_estimate.distinct([self.coordinates, *places], self.covariance, physical)
 
     def error(self, windows: Sequence[slice]) -> float:
-        """Root mean square, um, of what it misses of the readings in windows; nan of none."""
+        """Return the root mean square of the residual in windows, um; nan without any."""
         if not windows:
             return np.nan
         record = self.posterior.single_record
@@ -80,9 +80,9 @@ def climb(
     least: float = -np.inf,
     watch: Watch = unwatched,
 ) -> LocalFit:
-    """Fit from the best of coordinates (places, free) of a posterior of one record nearby.
+    """Fit a posterior of one record from the best of several places (places, free) nearby.
 
-    Two rounds from each of them, side by side, tell which one leads. The climb ends where it gains
+    Two rounds from each of them, side by side, choose the best one. The climb ends when it gains
     so little that it would never reach a log density of ``least``. ``watch`` is called with the
     share that is done.
     """

@@ -1,8 +1,8 @@
 """Regression of the displacement on the voltage alone, loops included.
 
 A displacement follows the voltage with a lag and along hysteresis loops. :func:`fit_loop` fits a
-sum of play operators of the lagged voltage (any loop that closes is one, nearly) by least squares:
-no physics to be had from it, but what it misses is what no actuator does by itself.
+sum of play operators of the lagged voltage, which approximates any closed loop, by least squares:
+the fit has no physical meaning, but its residual is more than an actuator does by itself.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from bwbayes.record.record import Record
 WIDTHS = np.array([0.04, 0.1, 0.2, 0.35, 0.5, 0.7])
 FREE_STARTS = slice(2, None, 2)
 
-# A decay that takes longer, as a fraction of the record, is a drift.
+# Longest time of a decay, as a fraction of the record; a longer one is a drift.
 LONG_DECAY = 0.13
 
 
 @dataclass(frozen=True)
 class LoopFit:
-    """What a record's displacement has to do with its voltage.
+    """Dependence of a record's displacement on its voltage.
 
     Parameters
     ----------
     rows : array (rows,)
-        The samples that were looked at, all with readings.
+        The samples used in the fit, all with readings.
     residual : array (rows,), um
         Residual of loops, decay and trend.
     gain : float, um/V
@@ -43,16 +43,16 @@ class LoopFit:
     decay, decay_time : float, um and s
         Transient that decays from the first reading on, whatever the voltage does.
     start : float, um
-        How far off the displacement starts in all: the decay, and what another state of the plays
-        would change.
+        Total deviation of the displacement at the start: the decay, and the effect of another state
+        of the plays.
     decay_left : float
         Part of the sum of squares without the decay that is left with it.
     decay_share : float
-        Part of the decay's variance that loops, creep and a trend do not imitate; with little
-        of it neither `decay` nor `start` means anything.
+        Part of the decay's variance that loops, creep and a trend do not imitate; if it is small,
+        neither `decay` nor `start` means anything.
     trend : float, um
-        How far the displacement goes from the first reading to the last at equal voltages: evenly,
-        and by a decay that takes longer than `LONG_DECAY`.
+        Change of the displacement from the first reading to the last at equal voltages: a linear
+        trend, and a decay that takes longer than `LONG_DECAY`.
     trend_share : float
         Part of the trend's variance that loops and creep do not imitate.
     explained : float
@@ -61,10 +61,10 @@ class LoopFit:
         Part of the displacement's variance that is neither explained nor white noise.
     without_loops : float
         Probability (F test, for white noise) that a curve and a lag leave so much more than loops
-        do if there are none.
+        do if there are no loops.
     driven_decay, driven_trend : float, um
-        How large a decay and a trend of other origin the voltage may drive: by creep, and by small
-        hysteresis loops that do not close.
+        Largest decay and trend that the voltage may cause, by creep and by small hysteresis loops
+        that do not close.
     """
 
     rows: IntArray
@@ -106,7 +106,7 @@ def fit_loop(record: Record) -> LoopFit:
     remainder, _, basis, lag = min(fits, key=lambda fit: fit[0])
     creep, slow = _slow(_lagged(record.voltage, lag / record.interval), rows[has_reading])
     design, which, coefficients = _with_creep(basis, creep, columns, among_columns)
-    # A gain and a half is creep of 7% a decade: what goes back, or further, is something else.
+    # A gain and a half is creep of 7% a decade: negative or larger creep is something else.
     slope = np.ptp(centered) / max(float(np.ptp(record.voltage)), 1e-300)
     if not 0 <= coefficients[1] < 1.5 * slope:
         nothing = np.zeros(creep.size)
@@ -124,13 +124,13 @@ def fit_loop(record: Record) -> LoopFit:
     lagged = basis[:, 1] - basis[:, 1].mean()
 
     def curved(samples: float) -> float:
-        """Return the sum of squares that a curve leaves behind a lag, and no loops."""
+        """Return the sum of squares that a curve without loops leaves behind a lag."""
         u = _lagged(record.voltage, samples)[rows[has_reading]]
         u = (u - u.mean()) / max(float(np.ptp(u)), 1e-300)
         curve = np.column_stack([np.ones(u.size), u, u**2, trend_shape])
         return _best_decay(curve, columns, among_columns)[0]
 
-    # Loops imitate what is left of a lag: it is found between those above.
+    # Loops imitate the remaining error of a lag: search for the lag between those above.
     samples = lags / record.interval
     nearest = int(np.argmin([curved(lag) for lag in samples]))
     between = samples[max(nearest - 1, 0)], samples[min(nearest + 1, samples.size - 1)]
@@ -177,10 +177,10 @@ def _lags(record: Record) -> FloatArray:
 
 
 def find_delay(record: Record, limit: float) -> tuple[float, float]:
-    """Return the delay, s, behind which loops of the voltage miss least, and what they miss, um².
+    """Return the delay, s, behind which loops of the voltage fit best, and their mean square, um².
 
-    Within ``limit`` s of either sign, behind no lag. Where the displacement falls with the voltage
-    all of it is missed: half a period of a sine is no delay but another sign.
+    The delay is within ``limit`` s of either sign; there is no lag. If the displacement falls with
+    the voltage, nothing of it is fitted: half a period of a sine is another sign, not a delay.
     """
     assert record.displacement is not None
     rows = _rows(record.voltage, np.flatnonzero(record.has_reading))
@@ -215,8 +215,8 @@ def _white(residual: FloatArray) -> float:
 
 
 def _rows(voltage: FloatArray, readings: IntArray) -> IntArray:
-    """Return the samples to look at: the voltage's extremes all along, and readings, more early."""
-    max_terms = 3000  # of each kind
+    """Return the samples to use: the voltage's extremes, and readings, more of the early ones."""
+    max_terms = 3000  # samples of each kind
     evenly = readings[:: -(-readings.size // max_terms)]
     early = readings[np.geomspace(1, readings.size, 400).astype(np.int64) - 1]
     size = -(-2 * voltage.size // max_terms)
@@ -242,25 +242,26 @@ def _bases(voltages: FloatArray, has_reading: BoolArray) -> Iterator[FloatArray]
     scaled = (voltages - ((low + high) / 2)[:, np.newaxis]) / half[:, np.newaxis]
     widths = np.concatenate([WIDTHS, WIDTHS[FREE_STARTS]])
     state = scaled[:, :1] + np.concatenate([np.zeros(WIDTHS.size), WIDTHS[FREE_STARTS]])
-    # One row after the other, all lags side by side.
+    # Go row by row, with all lags side by side.
     lower = scaled.T[:, :, np.newaxis] - widths
     upper = scaled.T[:, :, np.newaxis] + widths
     plays = np.empty((scaled.shape[1], *state.shape))
     for row in range(len(plays)):
         state = np.minimum(np.maximum(state, lower[row]), upper[row], out=plays[row])
     for outputs, x, size in zip(plays.swapaxes(0, 1), scaled, half, strict=True):
-        # What another state at the start would change, until the drive has wiped it out.
+        # The effect of another initial state, until the drive has erased it.
         unknown = outputs[:, WIDTHS.size :] - outputs[:, : WIDTHS.size][:, FREE_STARTS]
         shown = size * outputs[:, : WIDTHS.size]
         yield np.column_stack([np.ones(x.size), size * x, shown, x**2, unknown])[has_reading]
 
 
 def _slow(voltage: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return what a voltage (samples,) drives beside loops that close, at rows, for a gain of 1.
+    """Return slow responses to a voltage (samples,) beside closed loops, at rows, for a gain of 1.
 
-    Creep of 5% of the gain in each decade of the time from ten samples on, (rows,); and each decade
-    by itself, with the states of two Bouc-Wen models, h' = 0.4 u' - b (|u'| h + u' |h| / 2), whose
-    small loops do not close, and what starting at their largest changes, (rows, decades + 4).
+    Returns creep of 5% of the gain in each decade of the time from ten samples on, (rows,); and the
+    creep of each decade, with the states of two Bouc-Wen models, h' = 0.4 u' - b (|u'| h + u' |h| /
+    2), whose small loops do not close, and the effect of their largest initial state, (rows,
+    decades + 4).
     """
     times = 10.0 ** np.arange(1.0, max(np.log10(voltage.size), 1.1))
     decades = 0.05 * np.stack([_lagged(voltage, time)[rows] for time in times], axis=1)

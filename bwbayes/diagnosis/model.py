@@ -1,6 +1,6 @@
-"""What the model may lack: a key of [model], another prior, or noise of another kind.
+"""Possible changes of the model: a key of [model], another prior, or noise of another kind.
 
-Another model has its own evidence; noise may have heavy tails, or be more where the drive is.
+Another model has its own evidence; noise may have heavy tails, or grow with the drive.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from bwbayes.model.declaration import lognormal
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.registry import HYSTERESIS
 
-# An exponent that is not 1: in nearly all published fits it lies below 5.
+# Prior of an exponent that is not 1: in nearly all published fits it lies below 5.
 EXPONENT = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
 EXPONENT_STARTS = ({"exponent": -1.0}, {"exponent": 1.0})
 
@@ -65,7 +65,7 @@ def dynamics(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 
 def exponent(scene: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try another smoothness of the hysteresis's transition, where that is fixed at 1."""
+    """Try another exponent of the hysteresis's transition, if that is fixed at 1."""
     fixed = {parameter.name: parameter.fixed for parameter in scene.posterior.prior.parameters}
     if fixed.get("exponent") == 1.0:
         sighting = Sighting({"exponent": Stated(EXPONENT)}, EXPONENT_STARTS)
@@ -77,9 +77,9 @@ def _exponent_words(values: Mapping[str, float]) -> tuple[str, str]:
 
 
 def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanation]:
-    """Try the model without each of these stages: a gain says that it is not needed."""
+    """Try the model without each of these stages: a stage whose removal gains is not needed."""
     for name in names:
-        # Another operator, hold or noise has taken the place of one.
+        # An operator, hold or noise was replaced, not added: it cannot be removed.
         if name not in {*scene.study.spec.chain} - {*HYSTERESIS}:
             continue
         spec = scene.study.spec.without(name)
@@ -91,7 +91,7 @@ def without(scene: ResidualAnalysis, names: Sequence[str]) -> Iterator[Explanati
 
 
 def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try the other thing that the voltage may do between samples."""
+    """Try the other hold of the voltage between samples."""
     other = "first" if scene.whole.single_record.actuator.hold == "zero" else "zero"
     text = "voltage that is held between samples"
     if other == "first":
@@ -102,15 +102,14 @@ def hold(scene: ResidualAnalysis) -> Iterator[Explanation]:
 def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try other hysteresis operators."""
     present = type(scene.posterior.single_record.actuator.hysteresis)
-    # Compiled ones, each of another family, and plays of any weights, which follow loops that no
-    # formula has.
+    # Try a compiled operator of each family, and plays of any weights, for loops without a formula.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
         kind = f"operator {name}"
         if HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
         spec = scene.study.spec.with_stages(name)
         posterior = scene.rebuilt(scene.study.with_model(spec))
-        # One start finds the best place for nearly all records, in half of the time of five.
+        # One start finds the best mode of nearly all records, in half of the time of five.
         places = map_estimate.local_minima(posterior, scene.generator, 1)
         fit = scene.extended(posterior, places)
         text = f"another operator, {name}"
@@ -127,7 +126,7 @@ def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:
 def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
     """Try the default prior of each parameter that has another one.
 
-    Whether the fit has left the prior, or what else it has has made up for it.
+    The fit may have left the other prior, or further parameters may have compensated for it.
     """
     before, defaults = scene.posterior.prior, scene.study.defaults if scene.alone else {}
     for parameter in before.free:
@@ -156,7 +155,7 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
     others = (scene.posterior.single_record.readings.values - scene.fit.displacement)[~far]
     rmse = scene.without[0], float(np.sqrt(np.mean(others**2)))
     fix, spec, nats = "set outliers = true in [model]", None, tail_nats(white)
-    # Not where they are few and far off: tails that hold those would be too heavy for the others.
+    # Add no tails if outliers are few and far off: such tails would be too heavy for the others.
     before, tailed = scene.study.spec, scene.posterior.single_record.noise.tailed
     paced = scene.posterior.single_record.noise.paced
     if scene.alone and not (tailed or paced) and nats > isolated_nats(white):
@@ -175,7 +174,7 @@ def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 
 def tail_nats(white: FloatArray) -> float:
-    """Return by how many nats a t distribution explains innovations (readings,) better, in sds."""
+    """Return the gain of a t distribution over a normal one, nats, for innovations (readings,)."""
     densities, tried = [], (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)  # evenly probable
     for degrees in tried:
 
@@ -186,24 +185,25 @@ def tail_nats(white: FloatArray) -> float:
             -scipy.optimize.minimize_scalar(cost, bounds=(-5.0, 5.0), method="bounded").fun
         )
     normal = float(np.sum(scipy.stats.norm.logpdf(white)))
-    # The scale is paid for as its sd of a half over the root of the readings, of a prior's of one.
+    # The cost of the scale: its posterior sd is 1/√(2 n) for n readings, its prior's is one.
     cost_of_scale = 0.5 * np.log(2 * white.size)
     return float(scipy.special.logsumexp(densities) - np.log(len(tried)) - cost_of_scale) - normal
 
 
 def isolated_nats(white: FloatArray) -> float:
-    """Return the nats of normal innovations (readings,), in sds, of which some may be anything.
+    """Return the gain, nats, of normal innovations (readings,), in sds, with isolated outliers.
 
-    Each with the same probability, uniform over their range; beyond 6 sds of the others.
+    Each is an outlier with the same probability, uniform over their range; outliers are those
+    beyond 6 sds of the others.
     """
     far = np.abs(white) > LIMIT * min(1.0, np.median(np.abs(white)) / scipy.special.ndtri(0.75))
     others, share, size = white[~far], np.mean(far), white.size
     if share > MOST:
-        return -np.inf  # so many are not set aside
+        return -np.inf  # so many are not outliers
     density = float(np.sum(scipy.stats.norm.logpdf(others, 0, np.std(others))))
     density -= float(np.sum(scipy.stats.norm.logpdf(white)))
     density -= float(np.sum(far) * np.log(np.ptp(white)))
-    # Share and sd are paid for as the scale of `tail_nats` is.
+    # Share and sd have a cost as the scale in `tail_nats` has.
     cost = size * float(scipy.stats.bernoulli(share).entropy()) + float(np.log(2 * size))
     return density - cost
 
@@ -223,7 +223,7 @@ def growing_noise(scene: ResidualAnalysis) -> Iterator[Explanation]:
             logs = level + slope * growth
             return float(np.sum(logs + 0.5 * white**2 * np.exp(-2 * logs)) + 0.5 * slope**2)
 
-        # The nats that b adds, with b ~ N(0, 1); the level is as well known with it as without.
+        # Gain of b, nats, with b ~ N(0, 1); the level is as well known with it as without.
         optimum = scipy.optimize.minimize(cost, np.zeros(2), method="BFGS")
         level, slope = np.log(np.sqrt(np.mean(white**2))), optimum.x[1]
         nats = cost(np.array([level, 0.0])) - optimum.fun - 0.5 * np.log(1 + 2 * white.size)

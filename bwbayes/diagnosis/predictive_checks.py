@@ -1,9 +1,9 @@
-"""Does the record look like one that the model would make? Posterior predictive checks.
+"""Posterior predictive checks: a comparison of the record with records that the model replicates.
 
-Each of some posterior draws makes the readings anew, with its own noise. Whatever a picture shows
-of the real readings (how far they range, the area of their loops, how their residuals hang together
-from one to the next and over which times, where they lie in the band) is worked out from the made
-ones too. A number that hardly any of them reaches says what the model, noise included, does not do.
+Some posterior draws replicate the readings, each with its own noise. The statistics of the real
+readings (their range, the area of their loops, the correlation and the spectrum of their residuals,
+their place in the band) are worked out for the replicated ones, too. A statistic that hardly any
+replicated record reaches shows an effect that the model, noise included, lacks.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from bwbayes.model.reversals import rate
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
 
-# Samples of a long record that are made anew, after its voltage has been nearly everywhere.
+# Samples of a long record that are replicated, after its voltage has been nearly everywhere.
 SAMPLES = 100_000
 
-# What is looked at: title and unit for people.
+# Statistics that are compared: title and unit for people.
 STATISTICS: Mapping[str, tuple[str, str]] = {
     "range_um": ("Range of the readings", "um"),
     "loop_area_um_V": ("Area of the loops", "um V"),
@@ -41,10 +41,10 @@ STATISTICS: Mapping[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number of the real readings among those of the replicated ones.
+    """A statistic of the real readings, among those of the replicated ones.
 
-    ``lower`` and ``upper`` hold 95% of the replicated ones; ``p`` is the part of them that is
-    larger, equal ones counted half.
+    ``lower`` and ``upper`` enclose 95% of the replicated values; ``p`` is the part of them that is
+    larger, with equal ones counted half.
     """
 
     observed: float
@@ -54,19 +54,19 @@ class Statistic:
 
     @property
     def extreme(self) -> bool:
-        """Whether no more than one in a hundred replicated records has as much, or as little."""
+        """True if at most one in a hundred replicated records is as extreme, on either side."""
         return min(self.p, 1 - self.p) < 0.005
 
     @property
     def numbers(self) -> dict[str, float | bool]:
-        """What ``summary.json`` has of it."""
+        """Numbers for ``summary.json``."""
         edges = {"lower_95": self.lower, "upper_95": self.upper}
         return {"observed": self.observed} | edges | {"p": self.p, "odd": self.extreme}
 
 
 @dataclass(frozen=True)
 class PredictiveChecks:
-    """The statistics by name, and how many records were made."""
+    """The statistics by name, and the number of replicated records."""
 
     __repr__ = brief
 
@@ -75,7 +75,7 @@ class PredictiveChecks:
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it, as ``replicated``."""
+        """Numbers for ``replicated`` in ``summary.json``."""
         return {
             "records": self.records,
             "statistics": {name: statistic.numbers for name, statistic in self.statistics.items()},
@@ -91,7 +91,7 @@ def check_predictions(
 ) -> PredictiveChecks:
     """Check the training readings of a record against replicated ones.
 
-    Of a long record its beginning, see :func:`~bwbayes.inference.thinning.beginning`.
+    A long record's beginning is checked, see :func:`~bwbayes.inference.thinning.beginning`.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def check_predictions(
     generator
         Chooses draws, and draws their noise.
     record
-        The record's name; may be left out of one alone.
+        The record's name; it may be left out for a single record.
     watch
         Called with the share that is done.
     """
@@ -115,7 +115,7 @@ def check_predictions(
     theta = posterior.prior.theta(chosen)
     rows = dataset.readings.rows
     noise = dataset.table.noise(posterior.table.of(theta, dataset.name))
-    # Simulated twice, rather than to keep all: first for their mean and their spread about it.
+    # Simulate twice instead of keeping all: first for their mean and their spread about it.
     total, squares, origin = np.zeros(rows.size), np.zeros(rows.size), dataset.readings.values
     done = 0
     for simulated in posterior.simulations(theta, rows, record):
@@ -126,13 +126,13 @@ def check_predictions(
     away = total / count
     variance = np.mean(np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0))
     sd = np.sqrt(variance + np.maximum(squares / count - away**2, 0.0))
-    # Where readings are missing they are missing in all.
+    # Readings missing in the record are missing in all replicated ones.
     neighbors = np.flatnonzero(np.diff(rows) == dataset.readings.stride)
     work_out = partial(_statistics, dataset.voltage[rows], origin + away, sd, neighbors)
     speed = np.abs(rate(dataset.voltage, dataset.actuator.interval))[: int(rows[-1]) + 1]
     statistics, noises = [], iter(noise[:, np.newaxis])
     for simulated in posterior.simulations(theta, rows, record):
-        # A few at a time are looked at together.
+        # Process a few at a time.
         for batch in batches(len(simulated), rows.size, 1 << 18):
             readings = simulated[batch].copy()
             for i in range(len(readings)):

@@ -1,8 +1,8 @@
 """Issues of a record that the record itself shows.
 
-:func:`inspect` looks at a record before any model is fitted and returns a :class:`Finding` for
-everything that a fit would stumble over, with the line of config that deals with it. It says
-nothing about a good record.
+:func:`inspect` checks a record before any model is fitted and returns a :class:`Finding` for
+every issue that would harm a fit, with the line of config that solves it. It returns none for a
+good record.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from bwbayes.inference.defaults import rounding_sd
 from bwbayes.model.reversals import turning_points
 from bwbayes.record.record import Record
 
-# What a drive does not tell, and no fault of the readings.
+# Kinds of findings about what a drive cannot show, which are no fault of the readings.
 UNTOLD = ("no reversal", "one amplitude", "few readings", "no hysteresis")
 
 
 def inspect(record: Record) -> tuple[Finding, ...]:
-    """Return what is wrong with a record, in the order in which to deal with it.
+    """Return the issues of a record, in the order in which to solve them.
 
     Findings are "unlikely units", "no relation", "late voltage", "late displacement",
     "reversed sign", "swapped columns", "few readings", "coarse sampling", "no reversal",
     "one amplitude",
     "held readings", "repeated samples", "clipping", "coarse resolution", "jump", "spikes",
-    "switch-on transient", "drift", "no hysteresis" and "no noise". A planned voltage is looked at
-    for its own sake alone.
+    "switch-on transient", "drift", "no hysteresis" and "no noise". For a planned voltage, only the
+    voltage is checked.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     sudden, stuck = list[Finding](), list[Finding]()
     if record.displacement is not None and record.readings >= 3:
         stuck += _stuck(record)
-        # Readings that are held jump by themselves.
+        # Held readings have jumps of their own.
         held_up = {"held readings", "repeated samples"} & {finding.kind for finding in stuck}
         if not held_up and (jumped := offset_jumps(record)) is not None:
             sudden.append(jumped[0])
@@ -68,7 +68,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
             stop = float(times[-1]) + record.interval
             fix = "outliers = true under [model]"
             sudden.append(Finding("spikes", text, fix, float(times[0]), stop))
-        # All else is said of the others.
+        # All other checks leave the outliers out.
         record = record.without(outliers)
     findings = [*_plausibility(record)]
     if record.displacement is None or record.readings < 3:
@@ -76,7 +76,7 @@ def inspect(record: Record) -> tuple[Finding, ...]:
     loop = fit_loop(record)
     unlike = [*_relation(record, loop)]
     if {"few readings", "coarse sampling"} & {finding.kind for finding in findings}:
-        # Of so little only the most obvious can be said.
+        # With this little data, report only the obvious problems.
         obvious = [finding for finding in unlike if finding.kind == "no relation"]
         return (*findings, *obvious, *sudden)
     unlike += [*stuck, *_coarse(record)]
@@ -109,7 +109,7 @@ def _extent(values: FloatArray) -> float:
 
 
 def _plausibility(record: Record) -> Iterator[Finding]:
-    """Find what no piezo actuator does, and drives from which little is to be learnt."""
+    """Find values that are implausible for a piezo actuator, and drives that show little."""
     volts, span = float(np.abs(record.voltage).max()), float(np.ptp(record.voltage))
     text, likely = f"voltages of up to {volts:.3g} V", 0.05 <= volts <= 2000
     if record.displacement is not None:
@@ -147,9 +147,9 @@ def _plausibility(record: Record) -> Iterator[Finding]:
 def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
     """Return the samples whose readings are isolated outliers; none if they are more than 5%.
 
-    Ranges are measured anew without those that are found, until none is. With `ends` also a first
-    or last reading that may as well belong to a transient: one that is no more than twice the range
-    of all others away from their middle.
+    Ranges are measured again without the outliers found so far, until there are no more. With
+    `ends`, a first or last reading counts even if it may belong to a transient, being away from
+    the median of all others by at most twice their range.
     """
     rows, readings = np.flatnonzero(record.has_reading), _readings(record)
     is_kept = np.ones(rows.size, dtype=np.bool_)
@@ -167,14 +167,15 @@ def isolated_outliers(record: Record, *, ends: bool = False) -> IntArray:
 
 
 def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, float]:
-    """Return what a voltage (samples,) may do to the displacement, and the least that stands out.
+    """Return the possible effect of a voltage (samples,) on the displacement, and a threshold, um.
 
-    Both in um: a gain times the voltage, and a hundredth of the range or six steps of the sensor.
+    The effect is a gain times the voltage; the threshold of an outlier is a hundredth of the range
+    or six steps of the sensor.
     """
     extent, levels = _extent(displacement), np.unique(displacement)
     resolution = float(np.diff(levels).min()) if levels.size > 1 else 0.0
     gain, voltage_scatter = extent / max(float(np.ptp(voltage)), 1e-300), scatter(voltage)
-    if voltage_scatter > 0:  # no outlier makes this one larger
+    if voltage_scatter > 0:  # outliers do not increase this gain
         gain = min(gain, scatter(displacement) / voltage_scatter)
     return gain * voltage, max(0.01 * extent, 6 * resolution)
 
@@ -182,8 +183,8 @@ def _driven(displacement: FloatArray, voltage: FloatArray) -> tuple[FloatArray, 
 def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     """Find jumps of the offset, and the samples (samples,) on the sides that hold fewer readings.
 
-    Sides between jumps belong together if these add up to nothing, as those of a dropout do. Of
-    more than five windows none is left out.
+    Segments belong together if the jumps between them add up to zero, as at a dropout. If there are
+    more than five windows, none is left out.
     """
     rows, displacement = np.flatnonzero(record.has_reading), _readings(record)
     drive, threshold = _driven(displacement, record.voltage[rows])
@@ -191,7 +192,7 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
     at = lasting_jumps(displacement, drive, gaps <= np.median(gaps), threshold)
     if not at.size:
         return None
-    # Less what the voltage moves meanwhile.
+    # Subtract the effect of the voltage in the meantime.
     sizes = np.diff(displacement - drive)[at - 1]
     edges = np.array([0, *at, rows.size])
     level = np.rint(np.cumsum([0.0, *sizes]) / np.abs(sizes).min())
@@ -211,7 +212,7 @@ def offset_jumps(record: Record) -> tuple[Finding, BoolArray] | None:
 
 
 def _exclude(record: Record, rows: IntArray, stuck: FrozenRun) -> str:
-    """Return the line of config that leaves out runs of the readings at ``rows``."""
+    """Return the line of config that excludes runs of the readings at ``rows``."""
     starts = record.time[rows[stuck.first]]
     stops = record.time[rows[stuck.last]] + record.interval
     windows = [
@@ -228,7 +229,7 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
     if late is not None:
         yield late
         return
-    # Loops of another sign or sense imitate most of what moves by itself along with the drive.
+    # Loops of another sign or sense imitate most of a motion that only coincides with the drive.
     limit = 0.03 if leads or loop.gain < 0 else 0.3
     # Rounding to coarse steps is off by half a step at most.
     half_step = resolution(displacement) * np.ptp(displacement) / 2
@@ -253,8 +254,8 @@ def _relation(record: Record, loop: LoopFit) -> Iterator[Finding]:
 def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
     """Find a column that is late by up to a quarter of the drive's period.
 
-    A delay leaves so many times less variance than a lag and a decay do; columns that are swapped
-    lead behind any.
+    A delay has to leave ``gain`` times less variance than a lag and a decay do; swapped columns are
+    left out, which lead at any delay.
     """
     turns = turning_points(record.voltage, 0.1 * float(np.ptp(record.voltage)))
     quarter = 0.5 * record.interval * float(np.median(np.diff(turns))) if turns.size > 2 else 0.0
@@ -275,13 +276,13 @@ def _late(record: Record, loop: LoopFit, gain: float) -> Finding | None:
 
 
 def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a displacement that goes back as it came: 99 of 100 such, if their noise is white.
+    """Find a displacement without loops: 99 of 100 such records, if their noise is white.
 
-    Nothing is said where there are no turns, or where noise would hide loops of half a percent.
+    There is no finding without reversals, or if noise would hide loops of half a percent.
     """
     turns = turning_points(record.voltage, 0.2 * float(np.ptp(record.voltage)))
-    # A loop has a third of its opening for rms; the test of nine plays sees 30 times the square of
-    # what is uncertain in nine of ten. Some of it may look like a lag.
+    # The rms of a loop is a third of its opening; the test of nine plays detects 30 times the
+    # squared uncertainty in nine of ten records. A part of the loop may look like a lag.
     thinnest = 3 * np.sqrt(30 / loop.rows.size) * np.std(loop.residual) / _extent(_readings(record))
     if turns.size >= 3 and loop.without_loops > 0.01 and thinnest < 0.005:
         text = "a curve and a lag explain rising and falling voltage alike, over these volts"
@@ -290,7 +291,7 @@ def _no_hysteresis(record: Record, loop: LoopFit) -> Iterator[Finding]:
 
 
 def _no_noise(record: Record) -> Iterator[Finding]:
-    """Find readings without noise, as of a simulation or of a sensor coarser than its noise."""
+    """Find readings without noise, from a simulation or from a sensor coarser than its noise."""
     if sd := rounding_sd(_readings(record)):
         text = f"the readings show no noise but rounding, which has an SD of {sd:.2g} um"
         fix = "record with a finer resolution; add the sensor's noise to simulated readings"
@@ -300,12 +301,12 @@ def _no_noise(record: Record) -> Iterator[Finding]:
 def _leads(voltage: FloatArray, displacement: FloatArray) -> bool | None:
     """Tell whether the displacement leads the voltage, by the sense in which the loops run.
 
-    None if the record has no loops, or they are too thin or too uneven to tell.
+    Returns None if the record has no loops, or they are too thin or too uneven to tell.
     """
     turns = turning_points(voltage, 0.2 * float(np.ptp(voltage)))
     if turns.size < 3:
         return None
-    # From one turn to the next but one, twice the area between loop and chord.
+    # Twice the area between loop and chord, from each reversal to the next but one.
     area = []
     for first, last in zip(turns[:-2], turns[2:] + 1, strict=True):
         u, x = voltage[first:last], displacement[first:last]
@@ -353,10 +354,10 @@ def _stuck(record: Record) -> Iterator[Finding]:
 
 
 def _coarse(record: Record) -> Iterator[Finding]:
-    """Find a column recorded in steps that are too coarse, and no staircase.
+    """Find a column that is recorded in too coarse steps, except a staircase.
 
-    Rounding to steps has an sd of 1/√12 of one: here more than a percent of the range, which is
-    what a Bouc-Wen model misses of an actuator.
+    Rounding to steps has an sd of 1/√12 of a step. Steps are too coarse if that exceeds a percent
+    of the range, the usual error of a Bouc-Wen model of an actuator.
     """
     voltage, displacement = record.voltage[record.has_reading], _readings(record)
     fix = "record it with a finer resolution: a smaller range of the instrument, or more bits"
@@ -384,11 +385,11 @@ def _where(
 
 
 def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a displacement that comes from elsewhere at the start, whatever the voltage does.
+    """Find a transient of the displacement at the start that the voltage does not cause.
 
-    Loops would imitate 49 fiftieths of it at most: a drive of one swing shows the initial loading
-    alone, which no other one confirms. So it is with what has settled before the first reversal
-    and is less than the voltage moves meanwhile.
+    Loops may imitate at most 49 fiftieths of it: a drive of one swing shows nothing but the initial
+    loading, which no other swing confirms. The same holds for a transient that has settled before
+    the first reversal and is smaller than the response to the voltage in that time.
     """
     if loop.decay_share < 0.02:
         return
@@ -401,10 +402,10 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
             return
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     steps = np.abs(np.diff(record.voltage))
-    # A drive before the record leaves a decay too, as fast as the lag, of lag times velocity.
+    # A drive before the record leaves a decay, too, as fast as the lag, of lag times velocity.
     velocity = float(np.quantile(steps, 0.99)) / record.interval
     lagged = abs(loop.gain) * velocity * min(time, 1.5 * loop.lag) * (time < 10 * loop.lag)
-    # Another hysteretic state at the start, which steps of the voltage do not show, is less sure.
+    # The evidence for another initial hysteretic state, which voltage steps do not show, is weaker.
     moving, driven = np.count_nonzero(steps) > steps.size / 2, 2 * loop.driven_decay
     outside = abs(loop.start) > max(20 * spread, 0.24 * extent, driven)
     if outside and moving and abs(size) > spread:
@@ -414,10 +415,10 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
     ):
         return
     elif loop.decay_left > 0.1:
-        # It mends loops that no play follows, as those of an amplifier at its limits.
+        # The decay corrects loops that no play follows, such as an amplifier's at its limits.
         return
     begin = float(record.time[first])
-    # Until no more is to be seen of it than of the rest, or a thousandth of the range.
+    # It is over once it is half as large as the other residuals, or a thousandth of the range.
     over = begin + time * float(np.log(abs(size) / max(0.5 * spread, 0.001 * extent)))
     over = min(over, record.start + 0.9 * record.duration)
     text = (
@@ -430,7 +431,7 @@ def _transient(record: Record, loop: LoopFit) -> Iterator[Finding]:
 
 
 def _drift(record: Record, loop: LoopFit) -> Iterator[Finding]:
-    """Find a trend that the voltage does not drive: twice as large as what it might."""
+    """Find a trend at least twice as large as the voltage might cause."""
     spread, extent = scatter(loop.residual), _extent(_readings(record))
     size = loop.trend
     share = max(loop.trend_share, 1e-12)

@@ -1,4 +1,4 @@
-"""A fitted record as explanations see it: what was fitted, its scales, and how to fit more."""
+"""Analysis of a fitted record for explanations: the fit, its scales, and fits of other models."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import rounded
 
-# Readings that are looked at: an explanation takes some hundred passes over them, and what a model
-# misses shows in fewer.
+# Number of readings used: an explanation takes some hundred passes over them, and the residual of a
+# model shows in fewer.
 READINGS = 4_000
 
 
 class Sighting(NamedTuple):
-    """From where another model is fitted.
+    """Starting points for a fit of another model.
 
-    ``stated`` is said of its new parameters. They start at ``starts``, normal scores by name, and
-    the others at ``places`` (places, free), by default where the fit is. The choice costs ``cost``
-    nats; ``note`` is added to what is said. It is ``named_only`` where a run's model is not to
-    have it, whatever it is worth.
+    ``stated`` holds the priors of its new parameters. These start at ``starts``, normal scores by
+    name, and the others at ``places`` (places, free), by default at the fit. The choice costs
+    ``cost`` nats; ``note`` is appended to the text. If it is ``named_only``, the model is never
+    added to that of a run, whatever it is worth.
     """
 
     stated: Mapping[str, Stated] = {}
@@ -62,11 +62,12 @@ class Explanation(Finding):
     """An extension of a fitted model, worth ``nats`` of log evidence.
 
     ``rmse`` is the root mean square of the residual, um, without it and with it; ``held_out`` is
-    that of the readings that were held out, nan without any. ``shift`` is by how many sds of both
-    fits the actuator's parameter moves that moves most. What is ``foreign`` the actuator has not
-    done, so that a fit without it has followed it. What is ``noise`` leaves the displacement as it
-    is. ``spec`` is the model that it is a part of, ``stated`` what is stated of new parameters,
-    ``coordinates`` (free,) where that was fitted, and ``cost`` what its choice costs, nats.
+    that of the readings that were held out, nan without any. ``shift`` is the largest shift of a
+    parameter of the actuator, in sds of both fits. A ``foreign`` effect does not come from the
+    actuator, so that a fit without it has followed it. An explanation by ``noise`` leaves the
+    displacement as it is. ``spec`` is the model that it is a part of, ``stated`` holds the priors
+    of new parameters, ``coordinates`` (free,) are those of its fit, and ``cost`` is the cost of its
+    choice, nats.
     """
 
     rmse: tuple[float, float] = (np.nan, np.nan)
@@ -81,23 +82,23 @@ class Explanation(Finding):
 
     @property
     def mends(self) -> bool:
-        """Whether it takes away most of what the fit misses; also where that is not known."""
+        """True if it removes most of the fit's mean square residual, or if that is not known."""
         without, with_it = self.rmse
         return not with_it**2 > without**2 / 2
 
     @property
     def misleads(self) -> bool:
-        """Whether the model errs a tenth more with it on readings that were held out.
+        """True if it makes the error on held-out readings a tenth larger.
 
-        Where the noise is not what misfit is like, evidence is too sure, and takes up what helps
-        with the training readings alone.
+        If the noise model does not describe the discrepancy, the evidence is too large, and it
+        favors what helps with the training readings alone.
         """
         without, with_it = self.held_out
         return with_it > 1.1 * without
 
     @property
     def worth(self) -> str:
-        """What it is worth, in words: nats, and errors with it instead of without it."""
+        """Its worth in words: nats, and errors with it instead of without it."""
         errors = ((self.rmse, "RMSE"), (self.held_out, "held out"))
         texts = [
             f"{name} {after:.3g} um instead of {before:.3g} um"
@@ -108,7 +109,7 @@ class Explanation(Finding):
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What ``summary.json`` has of it."""
+        """Numbers for ``summary.json``."""
         return {
             "kind": self.kind,
             "text": self.text,
@@ -124,14 +125,14 @@ class Explanation(Finding):
 
 @dataclass(frozen=True)
 class ResidualAnalysis:
-    """A fit of one record, and other places from which its extensions are fitted too.
+    """A fit of one record, and other places from which its extensions are fitted, too.
 
     Attributes
     ----------
     fit
         The fit without any extension.
     whole
-        The posterior of the whole record, of which that of the fit may be thinned.
+        The posterior of the whole record; the fit's posterior may be a thinned one.
     places
         Coordinates (places, free) to climb from, those of the fit first.
     generator
@@ -143,7 +144,7 @@ class ResidualAnalysis:
     begin
         Time of the record's first sample, s.
     alone
-        Whether no other record is fitted: the actuator's model is one of all of them.
+        True if no other record is fitted: all fitted records share the actuator's model.
     before
         Fit that explanations are compared with, if it is another one.
     kinds
@@ -175,9 +176,9 @@ class ResidualAnalysis:
     ) -> ResidualAnalysis:
         """Fit a posterior of one record once more, from its optima (optima, free).
 
-        Something at the start of the record may have drawn the fit to an optimum that the rest of
-        it does not have: a fit of the rest says where else to start from, if it does not allow
-        that optimum.
+        An effect at the start of the record may have drawn the fit to an optimum that the rest of
+        the record does not have. A fit of the rest gives another starting point, if its optimum is
+        a different one.
         """
         theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
         unthinned, posterior = posterior, thin_posterior(posterior, theta, READINGS)
@@ -185,7 +186,7 @@ class ResidualAnalysis:
             posterior = posterior.altered(displacement=readings_at(posterior, unthinned, theta))
         rows = posterior.single_record.readings.rows
         if rows.size > READINGS:
-            # Every so many of them: the voltage stays as it is.
+            # Keep evenly spaced readings; the voltage stays as it is.
             retained = rows[:: -(-rows.size // READINGS)]
             readings = posterior.single_record.displacement.copy()
             readings[np.setdiff1d(rows, retained)] = np.nan
@@ -204,15 +205,16 @@ class ResidualAnalysis:
             if len(of_rest.distinct([best.coordinates])) > 1:
                 places.append(of_rest.coordinates)
                 best = max(best, climb(posterior, places[-1]), key=lambda fit: fit.log_evidence)
-        # As they are: with the start of the record they would be drawn to where the fit is.
+        # Keep the places as they are: a climb on the whole record would draw them to the fit.
         starts = best.distinct(places)
         held_out = thin_windows(held_out, stride_of(posterior, unthinned))
         return cls(best, unthinned, starts, generator, study, held_out, begin, alone)
 
     def of_beginning(self) -> ResidualAnalysis:
-        """Return the same of a long record's beginning, if the record cannot be thinned.
+        """Return the analysis of a long record's beginning, if the record cannot be thinned.
 
-        That shows what another model does. A short record's analysis is returned as it is.
+        The beginning shows the effect of another model. The analysis of a short record is returned
+        as it is.
         """
         if beginning(self.posterior, SAMPLES) is self.posterior:
             return self
@@ -222,10 +224,10 @@ class ResidualAnalysis:
         )
 
     def with_rough_noise(self) -> ResidualAnalysis | None:
-        """Return the same with a rough discrepancy, if it has a smooth one; else none.
+        """Return the analysis with a rough discrepancy instead of a smooth one; else None.
 
-        A smooth discrepancy takes up what an explanation is to explain, and no climb leads from
-        there to where it leaves that to the explanation.
+        A smooth discrepancy takes up the effect that an explanation describes, and no climb leads
+        from there to a mode where the explanation takes it up.
         """
         if not self.alone or not isinstance(self.posterior.single_record.noise, SmoothNoise):
             return None
@@ -244,7 +246,7 @@ class ResidualAnalysis:
 
     @property
     def stride(self) -> int:
-        """Samples of the whole record for each that is looked at."""
+        """Number of samples of the whole record for each one that is used."""
         return stride_of(self.posterior, self.whole)
 
     @property
@@ -293,10 +295,10 @@ class ResidualAnalysis:
 
     @cached_property
     def unexplained(self) -> float:
-        """Nats of log likelihood that the sensor's noise alone would gain, if the model were right.
+        """Gain in log likelihood, nats, if the model were right and left the sensor's noise alone.
 
-        What the discrepancy takes up, no other model can gain more; inf without a discrepancy, as
-        the sensor's noise takes it up then.
+        No other model can gain more than the discrepancy takes up. It is inf without a discrepancy,
+        because the sensor's noise takes everything up then.
         """
         record = self.posterior.single_record
         if not record.noise.states:
@@ -312,21 +314,21 @@ class ResidualAnalysis:
 
     @property
     def lead(self) -> float:
-        """By how many nats of log evidence what explanations are compared with leads the fit."""
+        """Log evidence, nats, of the fit that explanations are compared with, minus this fit's."""
         return self.before.log_evidence - self.fit.log_evidence if self.before else 0.0
 
     @cached_property
     def without(self) -> tuple[float, float]:
-        """RMSE and error of the readings held out, um, of what explanations are compared with."""
+        """RMSE and held-out error, um, of the fit that explanations are compared with."""
         before = self.before or self.fit
         return before.rmse, before.error(self.held_out)
 
     def looks_for(self, kind: str) -> bool:
-        """Whether another model of a kind is fitted."""
+        """Tell whether to fit another model of a kind."""
         return self.kinds is None or kind in self.kinds
 
     def clock(self, time: float) -> str:
-        """Write a time since the first reading as one of the record, s."""
+        """Write a time since the first reading as a time of the record, s."""
         first = self.begin + self.interval * float(self.posterior.single_record.readings.rows[0])
         return clock(first + time, self.interval)
 
@@ -338,7 +340,7 @@ class ResidualAnalysis:
             self.stride > 1
             and rebuilt.single_record.actuator.hold != self.whole.single_record.actuator.hold
         ):
-            # Of a thinned record the hold is in the readings.
+            # The readings of a thinned record depend on the hold.
             theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
             held = readings_at(posterior, rebuilt, theta)
             readings = np.where(np.isfinite(readings), held, np.nan)
@@ -350,7 +352,7 @@ class ResidualAnalysis:
         """Return the posterior of another model of the whole record."""
         if self.alone:
             return study.posterior
-        # The other records have a say in what the actuator counts from.
+        # The reference values of the actuator's stages depend on the other records, too.
         stages = study.posterior.single_record.actuator.stages
         actuator = replace(self.whole.single_record.actuator, stages=stages)
         return study.posterior.altered(actuator=actuator)
@@ -358,7 +360,8 @@ class ResidualAnalysis:
     def extended(self, posterior: Posterior, places: FloatArray) -> LocalFit:
         """Fit another model from places of its own.
 
-        As long as it may become more probable than the fit by a nat: less pays for no parameter.
+        The climb goes on while the model may become more probable than the fit by a nat: a smaller
+        gain does not pay for any parameter.
         """
         return climb(posterior, places, self.fit.log_density + 1.0)
 
@@ -373,9 +376,9 @@ class ResidualAnalysis:
     ) -> Iterator[Explanation]:
         """Fit the model with further stages, or another noise or hold, by ``parts``.
 
-        ``words`` are the text, by default the kind, or say text and advice of the parameters'
-        values by name; ``flags`` are fields of the explanation. There is none of a model that does
-        not follow the readings.
+        ``words`` are the text, by default the kind, or a function from the parameters' values by
+        name to text and advice; ``flags`` are fields of the explanation. A model that does not
+        follow the readings yields no explanation.
         """
         if not self.looks_for(kind):
             return
@@ -413,7 +416,7 @@ class ResidualAnalysis:
         )
 
     def confirmed(self, explanation: Explanation) -> Explanation:
-        """Weigh another model on all readings, if the scene looked at some of them."""
+        """Evaluate an explanation on all readings, if the analysis used a part of them."""
         is_short = (
             self.posterior.single_record.readings.rows.size
             < self.whole.single_record.readings.rows.size
@@ -435,9 +438,9 @@ class ResidualAnalysis:
     def explained(
         self, kind: str, text: str, fix: str, fit: LocalFit, cost: float = 0.0, **facts: Any
     ) -> Explanation:
-        """Compare a fit with that without any extension.
+        """Compare a fit with the one without any extension.
 
-        ``cost`` nats are those of its choice; ``facts`` are other fields of the explanation.
+        ``cost`` is the cost of its choice, nats; ``facts`` are other fields of the explanation.
         """
         return Explanation(
             kind,
@@ -453,7 +456,7 @@ class ResidualAnalysis:
     def _shift(self, fit: LocalFit) -> float:
         """Return the largest shift of the actuator's parameters, in sds of both fits together.
 
-        Of those that both fits have, with the same priors.
+        Only parameters that both fits have, with the same priors, count.
         """
         ours, theirs = self.posterior, fit.posterior
         of_record = ours.single_record.table.of_scope("record", "event")

@@ -1,9 +1,9 @@
-"""Rivals of a model: others that fit the same record, and by how much they disagree elsewhere.
+"""Rivals of a model: models of other families that fit the same record, and their disagreement.
 
-Where what a model misses follows the drive (:mod:`bwbayes.diagnosis.drive_lock`), the record does
-not say what it misses on another drive. Models of other families, which fit the record about as
-well, say how far that may go: another operator, the nonlinearity elsewhere on the signal's path,
-creep or none. Where all of them agree, the drive leaves no room for what they differ in.
+If a model's residual follows the drive (:mod:`bwbayes.diagnosis.drive_lock`), the record does not
+show its size on another drive. Models of other families that fit the record about as well show how
+large it may be: another operator, the nonlinearity elsewhere on the signal's path, with creep or
+without. If all of them agree on a drive, their differences do not matter there.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from bwbayes.prediction.bands import Bands
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched
 
-# Rivals miss at most so many times what the best of them misses.
+# Largest RMSE of a rival, relative to the best of them.
 MISSES = 3.0
 
-# Draws of each model, whose mean is its prediction.
+# Number of draws of each model, whose mean is its prediction.
 DRAWS = 40
 
 
@@ -57,7 +57,7 @@ class Rival:
     rmse: float
 
     def posterior(self, study: Study) -> Posterior:
-        """Return its posterior of the record that it was fitted to, which a ``study`` has."""
+        """Return this model's posterior of its training record, that of the ``study``."""
         return study.with_model(self.spec).posterior
 
     def draw(self, posterior: Posterior, rng: np.random.Generator) -> FloatArray:
@@ -71,7 +71,7 @@ class Rival:
 
 
 def families(spec: ModelSpec) -> Iterator[ModelSpec]:
-    """Yield models of other families than a model: one for each."""
+    """Yield a model of each other family."""
     asymmetric = ("saturation", "sensor-curve")
     base = spec.without(*{*asymmetric, *TERMS, "creep"}.intersection(spec.chain))
     curved = base.with_stages(*TERMS)
@@ -89,10 +89,10 @@ def families(spec: ModelSpec) -> Iterator[ModelSpec]:
 def fit_rivals(
     study: Study, rng: np.random.Generator, watch: Watch = unwatched
 ) -> tuple[Rival, ...]:
-    """Fit a rival of each family to the record of a study, of long ones to some thousand readings.
+    """Fit a rival of each family to a study's record, or to some thousand readings of a long one.
 
-    Each starts at what it has in common with the model, and at its own valley. ``watch`` is called
-    with the share that is done.
+    Each starts from the values of the parameters that it shares with the model, and from its own
+    local minimum. ``watch`` is called with the share that is done.
     """
     posterior_full = study.posterior
     origin = map_estimate.local_minima(posterior_full, rng, 1)[0]
@@ -101,14 +101,14 @@ def fit_rivals(
     known_values = dict(zip(posterior_full.names, origin.tolist(), strict=True))
     rivals = []
     for spec in watched([*families(study.spec)], watch):
-        # One that needs a prior that is not stated is no rival.
+        # Leave out a model that needs a prior that is not stated.
         with suppress(InputError):
             posterior = study.with_model(spec).posterior
             posterior = replace(posterior, datasets=(thin(posterior.single_record, stride),))
             start = np.array([[known_values.get(name, 0.0) for name in posterior.names]])
             places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
             fit = climb(posterior, places)
-            # With the start that the readings tell: of creep that is much.
+            # Use the initial state estimated from the readings, which matters much for creep.
             readings, theta = (
                 posterior.single_record.readings,
                 posterior.prior.theta(fit.free[np.newaxis]),
@@ -121,7 +121,7 @@ def fit_rivals(
 
 
 def close_rivals(rivals: Sequence[Rival], rmse: float) -> list[Rival]:
-    """Return those that fit the training about as well as the best, or as a model of that rmse."""
+    """Return rivals that fit about as well as the best of them, or as a model of this RMSE."""
     limit = MISSES * min([rmse, *(rival.rmse for rival in rivals)])
     return [rival for rival in rivals if rival.rmse <= limit]
 
@@ -134,10 +134,11 @@ def disagreement(
     predict: Callable[[Posterior, FloatArray], Bands],
     rng: np.random.Generator,
 ) -> float:
-    """Return by how much more rivals differ from a model on another drive than in training, um.
+    """Return the excess of the rivals' differences on another drive over those in training, um.
 
-    The root of the mean square over rivals and readings, less that in training, which the
-    discrepancy has in it; of those rivals that fit the training about as well as the best.
+    It is the root of the mean square difference over rivals and readings, less that in training,
+    which the discrepancy includes. Only rivals count that fit the training about as well as the
+    best.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Shapes in a series of numbers: runs, spikes, and values that stay where they are.
+"""Patterns in a series of numbers: runs, spikes, and held values.
 
-Repeated values are normal where nothing moves, and where a sensor is coarse. What is not normal is
-a value that stays at the end of a range while the other column moves on, and one that is held and
-then jumps by what it has missed.
+Repeated values are normal where nothing moves, and where a sensor is coarse. A value is not normal
+if it stays at the end of a range while the other column moves on, or if it is held and then jumps
+by the change it has missed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 
-# Samples in the median that a spike is held against: two beside each other are a spike still.
+# Number of samples in the median to compare a spike with: two neighboring samples are still one.
 NEIGHBORS = 5
 
 
@@ -26,7 +26,7 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def scatter(values: FloatArray) -> float:
-    """Return the sd of values about their median, whatever a minority of them is."""
+    """Return the sd of values about their median, robust against a minority of outliers."""
     # A normal distribution's sd is 1.4826 times its median absolute deviation.
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
@@ -34,9 +34,9 @@ def scatter(values: FloatArray) -> float:
 def spikes(values: FloatArray, drive: FloatArray, threshold: float) -> IntArray:
     """Return the samples of isolated outliers in values (samples,).
 
-    A spike is one or two samples that lie off the median of their neighborhood by eight times what
-    is usual, and by `least`; an edge or a turn does not. Where `drive` (samples,), in the values'
-    unit, has a spike of its own nearby, the values may have one of twice its size.
+    A spike is one or two samples that lie off the median of their neighborhood by eight times the
+    usual scatter, and by ``threshold``; an edge or a reversal does not. If `drive` (samples,), in
+    the values' unit, has a spike nearby, a spike of up to twice its size is allowed.
     """
     off, own_scatter = (
         series - scipy.ndimage.median_filter(series, NEIGHBORS, mode="mirror")
@@ -46,8 +46,8 @@ def spikes(values: FloatArray, drive: FloatArray, threshold: float) -> IntArray:
     spread = scatter(off[off != 0]) if np.any(off) else 0.0
     limit = max(8 * spread, threshold) + allowed
     suspects = np.flatnonzero(np.abs(off) > limit)
-    # A spike moves its neighbors' medians too. The largest comes first, and a straight line takes
-    # its place before the next is judged.
+    # A spike moves its neighbors' medians, too. Take the largest first, and replace it by a
+    # straight line before testing the next.
     half = NEIGHBORS // 2
     padded = np.pad(values, half, mode="reflect")
     isolated = np.zeros(padded.size, dtype=np.bool_)
@@ -71,25 +71,25 @@ def lasting_jumps(
 ) -> IntArray:
     """Return the samples at which values (samples,) jump, and stay for longer than a spike does.
 
-    A jump is a spike of the differences, of those (samples - 1,) that are `adjacent`, and of twice
-    the largest that those of `drive` have anywhere: values may be late. The medians of the samples
-    before it and from it on lie apart too.
+    A jump is a spike of the differences (samples - 1,) that are `adjacent`, of at least twice the
+    largest spike in those of `drive` anywhere, since values may be late. The medians of the samples
+    before it and from it on have to differ, too.
     """
     moved, pushed = (np.where(adjacent, np.diff(series), 0.0) for series in (values, drive))
     pushed -= scipy.ndimage.median_filter(pushed, NEIGHBORS, mode="mirror")
     threshold = max(threshold, 2 * float(np.max(np.abs(pushed))))
     at = spikes(moved, np.zeros(moved.size), threshold) + 1
     half = NEIGHBORS // 2
-    # With as many samples on either side as a median takes.
+    # Keep jumps with enough samples for a median on either side.
     at = at[(at >= NEIGHBORS) & (at <= values.size - NEIGHBORS)]
     medians = scipy.ndimage.median_filter(values - drive, NEIGHBORS, mode="nearest")
     return at[2 * np.abs(medians[at + half] - medians[at - half - 1]) > np.abs(moved[at - 1])]
 
 
 class Line(NamedTuple):
-    """A line of a spectrum: its frequency, Hz, and a source of that frequency in words, or none.
+    """A line of a spectrum: its frequency, Hz, and a source of that frequency in words, or "".
 
-    It ``is_steady`` if it goes on where the drive rests, instead of swelling with it.
+    It ``is_steady`` if it goes on where the drive rests, instead of growing with it.
     """
 
     frequency: float
@@ -100,9 +100,9 @@ class Line(NamedTuple):
 def strongest_line(
     white: FloatArray, drive: FloatArray, rows: IntArray, interval: float
 ) -> Line | None:
-    """Return the strongest line of white noise (readings,) at ``rows`` that the drive has not.
+    """Return the strongest line of innovations (readings,) at ``rows`` that the drive lacks.
 
-    A loop that is missed shows at harmonics of the drive (readings,), which rise and fall slowly
+    An error of the loop shows at harmonics of the drive (readings,), which rise and fall slowly
     with their order: a line is stronger than any two of them on either side, and may lie on one.
     """
     samples = int(rows[-1]) + 1
@@ -116,7 +116,7 @@ def strongest_line(
     best = float(frequency[int(np.argmax(lines * power[0]))])
     if not best:
         return None
-    # Lines of a size of their own, and in proportion to the drive's swing, by the nats of each.
+    # Compare a line of constant size with one in proportion to the drive's swing, by their nats.
     span = round(1 / (interval * max(frequency[main], frequency[1])))
     swing = scipy.ndimage.maximum_filter1d(values[1], span)
     swing = (swing - scipy.ndimage.minimum_filter1d(values[1], span))[rows]
@@ -126,7 +126,7 @@ def strongest_line(
         for size in (np.ones(rows.size), swing)
     )
     is_steady = bool(steady > swelling + np.log(20))
-    # Mains are right to a fifth of a percent; half the width of a line under the window.
+    # Tolerance: mains are right to a fifth of a percent; half a line's width under the window.
     width = max(2e-3 * best, 2 / (interval * max(samples - 1 - int(rows[0]), 1)))
     for mains in (50, 60):
         harmonic = round(best / mains)
@@ -154,7 +154,7 @@ class FrozenRun(NamedTuple):
 
 
 def clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
-    """Return where values (samples,) stay at their largest while the other column moves on.
+    """Return the runs of values (samples,) at their largest while the other column moves on.
 
     A sensor whose steps are finer than its noise hardly ever repeats itself, in 2% of its
     readings at most: then all readings of the largest value count. A coarse one repeats it at rest,
@@ -181,11 +181,11 @@ def clipped(values: FloatArray, other: FloatArray) -> FrozenRun | None:
 
 
 def find_held(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
-    """Return where readings (samples,) are held while the voltage moves, and then jump.
+    """Return the runs of readings (samples,) that are held while the voltage moves, and then jump.
 
-    A coarse sensor repeats itself where it moves slowly, and goes on by a step or two; one that is
-    held goes on as it came, by all that it has missed. One run of twenty samples is enough, of
-    shorter ones more than chance makes.
+    A coarse sensor repeats itself where it moves slowly, and goes on by a step or two; a held one
+    goes on in its direction, by all the change it has missed. One run of twenty samples is enough;
+    shorter runs have to be more than chance makes.
     """
     moved = np.diff(displacement)
     if not np.any(moved):
@@ -215,7 +215,7 @@ def find_held(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None
 
 
 def _jumps(before: FloatArray, after: FloatArray, step: float) -> BoolArray:
-    """Tell where values go on as they came, by more than four steps of the sensor."""
+    """Tell where values go on in their direction, by more than four steps of the sensor."""
     result: BoolArray = (before * after > 0) & (
         np.minimum(np.abs(before), np.abs(after)) > 4 * step
     )
@@ -223,10 +223,10 @@ def _jumps(before: FloatArray, after: FloatArray, step: float) -> BoolArray:
 
 
 def find_repeated(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | None:
-    """Return where whole samples are repeated and what follows has gone on without them.
+    """Return the runs of repeated samples after which both columns continue as if without a pause.
 
-    The voltage (samples,) then jumps by as many of its steps as samples were repeated; that of a
-    staircase does not.
+    The voltage (samples,) then jumps by as many of its steps as samples were repeated; the voltage
+    of a staircase does not.
     """
     steps = np.diff(voltage)
     same = np.concatenate([[False], (steps == 0) & (np.diff(displacement) == 0)])
@@ -246,7 +246,7 @@ def find_repeated(voltage: FloatArray, displacement: FloatArray) -> FrozenRun | 
 def copies(voltage: FloatArray, displacement: FloatArray) -> int:
     """Return how many times in a row every sample (samples,) is written, both columns alike.
 
-    Then all that changes does so at every so manieth sample, but for one change in twenty.
+    Then at least 19 of 20 changes of the columns lie on a grid of that many samples.
     """
     changes = np.flatnonzero((np.diff(voltage) != 0) | (np.diff(displacement) != 0))
     if changes.size < 20:
@@ -259,7 +259,7 @@ def copies(voltage: FloatArray, displacement: FloatArray) -> int:
 def resolution(values: FloatArray) -> float:
     """Return the smallest distance of two levels of values (samples,), as a part of their range.
 
-    Numbers that agree to nine digits of the range are one level.
+    Numbers that agree to nine digits of the range count as one level.
     """
     levels = np.unique(np.round((values - values.min()) / (np.ptp(values) or 1.0), 9))
     return float(np.diff(levels).min()) if levels.size > 1 else 0.0
@@ -268,8 +268,8 @@ def resolution(values: FloatArray) -> float:
 def moves_between(voltage: FloatArray, displacement: FloatArray) -> bool:
     """Tell whether a displacement (samples,) moves on while the voltage stays at its levels.
 
-    Then it moves as fast before each jump as it does on the whole. Along a staircase it has settled
-    by then: behind a lag of half a hold a hold's second half has 0.54 of that speed.
+    If it does, it moves as fast before each jump as on average. Along a staircase it has settled by
+    then: behind a lag of half a hold, its speed in a hold's second half is 0.54 of the average.
     """
     jumps = np.flatnonzero(np.diff(voltage)) + 1
     if jumps.size < 5:
@@ -282,6 +282,6 @@ def moves_between(voltage: FloatArray, displacement: FloatArray) -> bool:
 
 
 def _enough(first: IntArray, last: IntArray, stuck: BoolArray) -> FrozenRun | None:
-    """Return the runs that are stuck if these are ten samples in all, enough to say so."""
+    """Return the stuck runs if they have ten samples in all, the least that is significant."""
     runs_stuck = FrozenRun(first[stuck], last[stuck])
     return runs_stuck if runs_stuck.samples >= 10 else None

@@ -1,19 +1,19 @@
-"""Validation of bands on a record: the outcome that stands first on screen and report.
+"""Validation of bands on a record: the first result on the screen and in the report.
 
-Bands are held against the readings in three ways: how many readings they cover, how large the
-residuals are, and whether the residuals lean to one side (:mod:`bwbayes.diagnosis.departures`).
-Validation fails where luck would do it in one of 5,000 good records, and is inconclusive where it
-would in one of a hundred, or where the record is worth too few readings. A fit is judged on its own
-readings too. There the noise model grows until it covers whatever the model misses, so that a fit
-fails when it misses more than a part of the displacement's range.
+Bands are compared with the readings in three ways: coverage, size of the residuals, and bias
+(:mod:`bwbayes.diagnosis.departures`). Validation fails on a departure that chance causes in one of
+5,000 good records, and is inconclusive on one in a hundred, or if the record has too small an
+effective sample size. A fit is validated on its own readings, too. There the noise model grows
+until it covers any residual, so that a fit fails if the residual exceeds a part of the
+displacement's range.
 
-A verdict that fails names the likely cause: on readings that were fitted the explanation with the
-best evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the
-residuals (:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, where
-the best explanation is something that the actuator has not done, as a transient, a drift or
-outliers: parameters that have followed it are others. Nor has it where a better model is known:
-held-out readings have the drive of those that were fitted, and a discrepancy takes up there what
-the model misses; along another drive its size is another one.
+A failed validation names the likely cause: on fitted readings the explanation with the best
+evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that explains the residuals
+(:mod:`bwbayes.diagnosis.causes`). A fit has not passed, whatever its bands cover, if the best
+explanation is an effect that does not come from the actuator, such as a transient, a drift or
+outliers: the parameters may have followed it. It has not passed either if a better model is known:
+held-out readings have the drive of the fitted ones, and there a discrepancy takes up the model's
+error; along another drive the error has another size.
 
 Every product of a run carries the run's :class:`ValidationSummary`: it goes first
 on every page, into every file of numbers, and decides the exit status of every command.
@@ -51,7 +51,7 @@ class ValidationContext:
         Correlation time of the discrepancy, s; to be on the safe side, a high quantile of its
         posterior. Zero without a discrepancy.
     noise_log_sd
-        Sd of the logarithm of the noise's sd over the draws: how well its size is known.
+        Sd of the logarithm of the noise's sd over the draws: the uncertainty of its size.
     fitted
         Lowest and highest voltage that was fitted, V.
     extent
@@ -67,12 +67,12 @@ class ValidationContext:
 
     @classmethod
     def of(cls, posterior: Posterior, draws: FloatArray) -> ValidationContext:
-        """Return what a posterior and its draws (draws, free) say."""
+        """Return the context of a posterior and its draws (draws, free)."""
         memory, noise_log_sd = [], []
         for _, single, record_draws in posterior.each(draws):
             dataset = single.single_record
             noise = dataset.table.noise(single.prior.theta(record_draws))
-            # Rather too long than too short.
+            # Prefer a time that is too long to one that is too short.
             memory.append(float(np.quantile(dataset.noise.correlation_time(noise), 0.9)))
             variance = np.sum(np.square(dataset.noise.marginal_sd(noise)), axis=0)
             noise_log_sd.append(float(np.std(np.log(variance)) / 2))
@@ -87,26 +87,27 @@ class ValidationContext:
         )
 
 
-# How a validation came out, in a word.
+# Outcome of a validation in a word.
 STATUSES = {True: "passed", False: "failed", None: "inconclusive"}
 
 
 @dataclass(frozen=True)
 class BandValidation:
-    """Whether bands hold on one record or window.
+    """Validation of bands on one record or window.
 
     Attributes
     ----------
     name, training, separate
         Those of the bands.
     passed
-        False if the bands fail one of the tests; None if luck may have passed or failed them, or
-        the record is too short to tell.
+        False if the bands fail one of the tests; None if the outcome may be chance, or the record
+        is too short.
     reasons
-        Departures and their sizes, one line each, the most telling first; of None, why nothing can
-        be told.
+        Departures and their sizes, one line each, the most important first; if ``passed`` is None,
+        the reasons for that.
     cause
-        The likely cause with its fix, if the bands do not hold, or the fit has followed a drift.
+        The likely cause with its fix, if the bands fail, the fit has followed a foreign effect, or
+        a better model is known.
     notes
         Further notes on the record, which decide nothing.
     """
@@ -133,13 +134,13 @@ class BandValidation:
 
     @property
     def line(self) -> str:
-        """The verdict in one line, without its status."""
+        """The result in one line, without its status."""
         why = "".join(f": {reason}" for reason in self.reasons[:1])
         return f"{self.where}{why}" + ("" if self.cause is None else f". {self.cause.line}")
 
     @property
     def summary(self) -> dict[str, object]:
-        """The verdict as ``validation.NAME`` in summary.json has it."""
+        """The result for ``validation.NAME`` in summary.json."""
         return {
             "passed": self.passed,
             "message": self.line,
@@ -152,7 +153,7 @@ class BandValidation:
 
 @dataclass(frozen=True)
 class ValidationSummary:
-    """Whether the bands of a run hold on all that they were validated on.
+    """Validation of the bands of a run on all records and windows together.
 
     Attributes
     ----------
@@ -167,12 +168,12 @@ class ValidationSummary:
 
     @classmethod
     def of(cls, validation: Iterable[BandValidation]) -> Self:
-        """Return what the verdicts of a run come to."""
+        """Summarize the validations of a run."""
         return cls._of((verdict.passed, verdict.line) for verdict in validation)
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> Self:
-        """Return what a converged run's ``summary.json`` says."""
+        """Read the validation from a converged run's ``summary.json``."""
         entries = (summary.get("validation") or {}).items()
         if any("passed" not in entry for _, entry in entries):
             raise InputError(
@@ -196,24 +197,24 @@ class ValidationSummary:
 
     @property
     def exit_status(self) -> ExitStatus:
-        """What a command ends with that builds on it."""
+        """Exit status of a command that uses the run."""
         statuses = {False: ExitStatus.VALIDATION_FAILED, None: ExitStatus.VALIDATION_INCONCLUSIVE}
         return statuses.get(self.passed, ExitStatus.SUCCESS)
 
     @property
     def headline(self) -> str:
-        """What stands above the lines; nothing if validation passed."""
+        """Title above the lines; empty if validation passed."""
         titles = {True: "", False: "VALIDATION FAILED", None: "Validation inconclusive"}
         return titles[self.passed]
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What to say of it, a line each; nothing if validation passed."""
+        """Messages about the validation, a line each; none if it passed."""
         return tuple(f"{self.headline}: {line}" for line in self.lines)
 
     @property
     def numbers(self) -> dict[str, object]:
-        """What files of numbers have of it."""
+        """Status and messages for files of numbers."""
         return {"status": self.status, "messages": list(self.lines)}
 
 
@@ -224,7 +225,7 @@ def validate_bands(
     explanations: Sequence[Explanation] = (),
     beyond: Sequence[Finding] = (),
 ) -> BandValidation | None:
-    """Judge bands by the readings after ``scored_from``; None if there are none.
+    """Validate bands on the readings after ``scored_from``; return None without any.
 
     A good record, one that the fitted model describes, fails with a probability below 1%.
 
@@ -237,7 +238,7 @@ def validate_bands(
     explanations
         Explanations that may describe a fitted record better, the best first.
     beyond
-        In what the record's drive leaves the one that was fitted.
+        Respects in which the record's drive goes beyond the fitted one.
     """
     if not bands.scored(bands.measured).any():
         return None
@@ -245,7 +246,7 @@ def validate_bands(
     reasons = standard.reasons(background.fitted, background.extent)
     width = (standard.excess_width,) if bands.training and standard.excess_width else ()
     verdict = BandValidation(bands.name, bands.training, True, notes=width, separate=bands.separate)
-    # What bands hold after, as far as these readings tell, has done no harm.
+    # A lead-in that does not fit is noted only if the readings after it show a departure.
     lead, doubted = bands.lead_in, verdict
     off = bool(reasons or standard.chances())
     if lead is not None and lead.p_value < LEAD_IN_ALARM and off:
@@ -261,7 +262,7 @@ def validate_bands(
             why = Finding("sign", *DEFECTS["sign"].in_bands)
         elif why is None:
             why = cause(bands, background.memory, beyond)
-            # A fit has no other gain, offset or noise than its own.
+            # A fit cannot have another gain, offset or noise than its own.
             why = UNEXPLAINED if bands.training and why.kind != "outliers" else why
         return replace(doubted, passed=False, reasons=tuple(reasons), cause=why)
     doubts = [
@@ -284,7 +285,7 @@ def validate_bands(
         )
     if standard.idle and not bands.training:
         doubts.append(standard.idle)
-    minimum = 5.0  # worth fewer independent readings a record cannot show that bands hold
+    minimum = 5.0  # smallest effective sample size that can validate bands
     if standard.effective_size < minimum:
         doubts.append(
             f"effective sample size {standard.effective_size:.1f} is too small to validate the "
