@@ -1,4 +1,4 @@
-"""The chain of a sampling: what every ensemble did, block by block.
+"""The chain of a sampling: the steps of every ensemble, block by block.
 
 A :class:`Chain` keeps it in memory; :class:`~bwbayes.sampling.storage.ChainFile` writes it to files
 as well. The blocks of the pilot and the tuning are kept apart from those that count, and so are
@@ -21,15 +21,15 @@ from bwbayes.shown import brief
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-# Draws of all walkers that are judged and reported at most; of more, every second or fourth step
-# is used, and so on. Chains get that long because their steps tell little that is new.
+# Largest number of draws of all walkers in checks and reports; longer chains are thinned by powers
+# of two. Chains get that long because their steps are highly correlated.
 MOST_DRAWS = 2**19
 
 Phase = Literal["pilot", "tuning", "sampling"]
 PHASES: tuple[Phase, ...] = ("pilot", "tuning", "sampling")
 
 
-# A generator's state as emcee has it: its kind, 624 words, a position, and a normal that it kept.
+# A generator's state in emcee's form: kind, 624 words, position, flag and value of a kept normal.
 RandomState = tuple[str, NDArray[np.uint32], int, int, float]
 
 
@@ -40,7 +40,7 @@ def unpack_random_state(words: NDArray[np.uint32]) -> RandomState:
 
 
 def pack_random_state(state: RandomState) -> NDArray[np.uint32]:
-    """Return a generator's state, (628,): 624 words, position, and the normal number it kept."""
+    """Return a generator's state, (628,): 624 words, position, flag and value of a kept normal."""
     _, words, position, has_normal, normal = state
     position_and_flag = np.array([position, has_normal], dtype=np.uint32)
     return np.concatenate([words, position_and_flag, np.array([normal]).view(np.uint32)])
@@ -48,7 +48,7 @@ def pack_random_state(state: RandomState) -> NDArray[np.uint32]:
 
 @dataclass(frozen=True)
 class EnsembleState:
-    """Where an ensemble stands.
+    """State of an ensemble.
 
     ``coordinates`` (walkers, free), ``log_density`` (walkers,) and ``random_state`` (628,), the
     words of emcee's generator.
@@ -63,11 +63,11 @@ class EnsembleState:
 
 @dataclass(frozen=True)
 class Block:
-    """What an ensemble did.
+    """A block of steps of an ensemble.
 
-    ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), ``accepted``
-    (walkers,) moves, ``moves`` how often each move was proposed to a walker and accepted, by its
-    name, and the ``end`` it goes on from.
+    ``coordinates`` (steps, walkers, free), ``log_density`` (steps, walkers), the number of
+    ``accepted`` moves (walkers,), ``moves`` with the numbers of proposals to a walker and of
+    acceptances by the move's name, and the ``end`` state, from which the ensemble goes on.
     """
 
     coordinates: FloatArray
@@ -112,7 +112,7 @@ class Chain:
     def fall_back(self, blocks: int, refit: StudentMixture | None = None) -> None:
         """Set the first blocks of the sampling aside: they count no longer.
 
-        It goes on with a proposal that was fitted to them, or without any.
+        The sampling goes on with a proposal fitted to them, or without any.
         """
         self.set_aside, self.refit = blocks, refit
 
@@ -125,10 +125,10 @@ class Chain:
         self._blocks[phase].append(tuple(blocks))
 
     def publish(self) -> None:
-        """Let others read the draws that count so far; nobody does in memory."""
+        """Let others read the draws that count so far; a chain in memory does nothing."""
 
     def blocks(self, phase: Phase) -> int:
-        """Return how many blocks each ensemble has, without those that were set aside."""
+        """Return the number of blocks of each ensemble, without those that were set aside."""
         return len(self._counting(phase))
 
     def history(self, phase: Phase) -> tuple[tuple[Block, ...], ...]:
@@ -136,7 +136,7 @@ class Chain:
         return tuple(self._blocks[phase])
 
     def steps(self, phase: Phase) -> int:
-        """Return how many steps each ensemble has made."""
+        """Return the number of steps of each ensemble."""
         return sum(len(blocks[0].coordinates) for blocks in self._counting(phase))
 
     @property
@@ -146,18 +146,18 @@ class Chain:
         return tuple(block.end for block in done[-1]) if done else self.starts
 
     def draws(self, phase: Phase, blocks: int | None = None) -> int:
-        """Return how many draws all walkers have made, in the first ``blocks`` or all."""
+        """Return the number of draws of all walkers, in the first ``blocks`` blocks or in all."""
         return sum(b.log_density.size for row in self._counting(phase)[:blocks] for b in row)
 
     def coordinates(self, phase: Phase, thin: int = 1, blocks: int | None = None) -> FloatArray:
-        """Return (steps, ensembles, walkers, free), unconstrained, of every ``thin``-th step.
+        """Return unconstrained draws (steps, ensembles, walkers, free), every ``thin``-th step.
 
-        Of the first ``blocks`` blocks that count, or of all.
+        The draws are those of the first ``blocks`` blocks that count, or of all.
         """
         return self._joined(phase, "coordinates", thin, blocks)
 
     def log_density(self, phase: Phase, thin: int = 1, blocks: int | None = None) -> FloatArray:
-        """Return (steps, ensembles, walkers), nats, of the steps of :meth:`coordinates`."""
+        """Return the log density (steps, ensembles, walkers), nats, of :meth:`coordinates`."""
         return self._joined(phase, "log_density", thin, blocks)
 
     def accepted(self, phase: Phase) -> IntArray:
@@ -165,7 +165,7 @@ class Chain:
         return np.array([[block.accepted for block in blocks] for blocks in self._counting(phase)])
 
     def moves(self, phase: Phase) -> dict[str, tuple[int, int]]:
-        """Return how often each kind of move was proposed to a walker, and accepted.
+        """Return the numbers of proposals to a walker and of acceptances by kind of move.
 
         Kinds that were never proposed are left out.
         """
@@ -185,16 +185,16 @@ class Chain:
         parts, done = [], 0
         for blocks in self._counting(phase)[:count]:
             arrays = [getattr(block, name) for block in blocks]
-            first = -(done + 1) % thin  # of steps counted from one, those that thin divides
+            first = -(done + 1) % thin  # take steps, counted from one, that thin divides
             parts.append(np.stack([values[first::thin] for values in arrays], axis=1))
             done += len(arrays[0])
         return np.concatenate(parts)
 
 
 def thinning(draws: int, limit: int | None = None) -> int:
-    """Return of how many steps one is used, of so many draws: a power of two.
+    """Return the thinning of so many draws: a power of two.
 
-    So that ``limit`` are used at most, ``MOST_DRAWS`` by default.
+    At most ``limit`` draws remain, ``MOST_DRAWS`` by default.
     """
     thin = 1
     while draws > (limit or MOST_DRAWS) * thin:
@@ -210,10 +210,10 @@ def draws(
 ) -> FloatArray:
     """Return a chain's draws in their own units, (steps, ensembles, walkers, free).
 
-    Of a long chain every second step, or every fourth, and so on: ``MOST_DRAWS`` at most. With
-    ``covariances`` (free, free), that of the posterior and more, they are wider, see
-    :func:`~bwbayes.inference.voltage_noise.widen_draws`; where the prior allows no such place, as
-    sampled.
+    Long chains are thinned by powers of two, to ``MOST_DRAWS`` draws at most. With ``covariances``
+    (free, free), of the posterior and a larger one, the draws are widened, see
+    :func:`~bwbayes.inference.voltage_noise.widen_draws`; a draw that the prior would exclude then
+    stays as sampled.
     """
     coordinates = chain.coordinates(phase, thinning(chain.draws(phase)))
     if covariances is not None:

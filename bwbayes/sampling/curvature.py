@@ -1,15 +1,15 @@
 """Coordinates in which a curved posterior is straight, and nearly normal.
 
-Along a ridge that a record hardly tells, other parameters follow the one that is free, and seldom
-in a straight line: the ridge is a hundred times as long as wide, and bent by many times its width.
-Tails are longer on one side, and an offset is the less known the larger the discrepancy. No few
-ellipsoids cover that, least of all where there are few draws. Three maps take it out, one after the
-other. Of two sds, or of two lags in a row, a record may tell hardly more than what they are
-together: the ridge is then two legs at a right angle, which a :class:`TotalRatioMap` puts in line.
-A :class:`SkewMap` makes both tails of each coordinate alike. A :class:`QuadraticMap` takes of each
-coordinate what those before it leave open, longest first, and lets it bend quadratically with them,
-and widen. Each tells how much it stretches, so that a distribution of the straight coordinates is
-one of the bent ones, density and all.
+Along a ridge that a record hardly determines, other parameters follow the free one, and seldom in a
+straight line: the ridge is a hundred times as long as wide, and bent by many times its width. Tails
+are longer on one side, and an offset is the less certain the larger the discrepancy. A few
+ellipsoids do not cover such a shape, least of all with few draws. Three maps straighten it, one
+after the other. A record may determine hardly more than the total of two sds, or of two lags in a
+row: the ridge then has two legs at a right angle, which a :class:`TotalRatioMap` puts in line. A
+:class:`SkewMap` makes both tails of each coordinate alike. A :class:`QuadraticMap` takes the part
+of each coordinate that those before it leave open, longest first, and lets it bend quadratically
+with them, and widen. Each map returns how much it stretches, so that a density of the straight
+coordinates gives one of the bent ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.sampling.secant import SecantMap
 
 LONGEST = 12  # only the longest coordinates bend others
-FARTHEST = 5.0  # sds beyond which a bend goes on straight: no draws have shown it
+FARTHEST = 5.0  # sds beyond which a bend continues straight: no draws show it there
 
 # Sds whose squares add up, by name.
 SDS = SENSOR_SD.name, DISCREPANCY_SD.name
@@ -39,8 +39,8 @@ SDS = SENSOR_SD.name, DISCREPANCY_SD.name
 class QuadraticMap:
     """The map from straight coordinates z to bent ones x.
 
-    With c = clip(z) to five sds, and next of the coordinates always the one of which those before
-    it leave open most,
+    With c = clip(z) to five sds, and the coordinates ordered so that each next one is the one that
+    those before it leave open most,
 
         yⱼ = zⱼ exp(Σ_{i < j} sᵢⱼ cᵢ) + Σ_{i ≤ k < j} bᵢₖⱼ (cᵢ cₖ − δᵢₖ),   x = μ + y Fᵀ.
 
@@ -67,9 +67,9 @@ class QuadraticMap:
     def fitted(cls, draws: FloatArray) -> QuadraticMap | None:
         """Fit to draws (count, free), or 20,000 of them; None if not bent and of one width.
 
-        A coordinate bends if that explains a tenth of its variance, by least squares and with as
-        many others as leave fifty draws to a coefficient. It widens if that makes the draws more
-        probable, by a hundredth of a nat each.
+        A coordinate bends if the bend explains a tenth of its variance, by least squares and with
+        as many others as leave fifty draws to a coefficient. It widens if the width makes the draws
+        more probable, by a hundredth of a nat each.
 
         Raises
         ------
@@ -79,7 +79,7 @@ class QuadraticMap:
         draws = subsample(draws, 20_000)
         count, free = draws.shape
         center = np.mean(draws, axis=0)
-        # A decomposition of the draws keeps digits that one of their covariance would lose.
+        # Decompose the draws, not their covariance, which would lose digits.
         triangle, order = scipy.linalg.qr(draws - center, mode="r", pivoting=True)
         factor = np.empty((free, free))
         factor[order] = triangle[:free].T / np.sqrt(count)
@@ -91,7 +91,7 @@ class QuadraticMap:
             if j <= LONGEST and (products.shape[1] + j) * 50 <= count:
                 products = np.concatenate([products, _products(z, j - 1)], axis=1)
             terms = products.shape[1]
-            # Few draws tell little: each coefficient is drawn to zero by a thousandth of them all.
+            # Shrink each coefficient to zero, with the weight of a thousandth of all draws.
             information = products.T @ products / count + 1e-3 * np.eye(terms)
             coefficients = np.linalg.solve(information, products.T @ z[:, j] / count)
             whitened = z[:, j] - products @ coefficients
@@ -110,18 +110,18 @@ class QuadraticMap:
 
     @cached_property
     def _log_volume(self) -> float:
-        """Log |det F|."""
+        """The logarithm of |det F|."""
         return float(np.linalg.slogdet(self.factor)[1])
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
-        """Every i and k of the rows of ``bends``."""
+        """The indices i and k of the rows of ``bends``."""
         k, i = np.tril_indices(min(self.center.size, LONGEST))
         return i, k
 
     @cached_property
     def _curved(self) -> tuple[tuple[int, int, int], ...]:
-        """The coordinates that bend or widen, how many pairs bend them, how many others widen."""
+        """Coordinates that bend or widen, with the numbers of bending pairs and widening others."""
         scales = np.zeros((1, self.center.size)) if self.scales is None else self.scales
         ends = [
             [int(np.max(np.flatnonzero(column), initial=-1)) + 1 for column in table.T]
@@ -166,7 +166,7 @@ class QuadraticMap:
 
 @dataclass(frozen=True)
 class SkewMap:
-    """The map from straight coordinates y to those x of which one tail is longer, each by itself.
+    """The map from straight coordinates y to coordinates x with one longer tail, each by itself.
 
     With z = (x − μ) / σ and a power e = λ where z is positive, 2 − λ where not,
 
@@ -190,9 +190,10 @@ class SkewMap:
 
     @classmethod
     def fitted(cls, draws: FloatArray) -> SkewMap:
-        """Fit to draws (count, free), or 5,000 of them: each coordinate is to be normal.
+        """Fit to draws (count, free), or 5,000 of them, so that each coordinate becomes normal.
 
-        By maximum likelihood. Powers keep away from 0 and 2, where a tail would be exponential.
+        The fit is by maximum likelihood. Powers keep away from 0 and 2, where a tail would be
+        exponential.
         """
         draws = subsample(draws, 5_000)
         center, scale = np.median(draws, axis=0), np.std(draws, axis=0)
@@ -229,7 +230,7 @@ class SkewMap:
 class TotalRatioMap:
     """The map from straight coordinates y to those x of pairs a and b that add up.
 
-    Of sds the squares add up, p = 2; of time constants these themselves, p = 1. With
+    The squares of sds add up, p = 2, and time constants add up themselves, p = 1. With
     ln a = c₁ + s₁ x₁ and ln b = c₂ + s₂ x₂,
 
         s₁ y₁ = ln (aᵖ + bᵖ) / p,   s₂ y₂ = ln (b / a),
@@ -255,9 +256,9 @@ class TotalRatioMap:
 
     @classmethod
     def of_prior(cls, prior: JointPrior) -> TotalRatioMap | None:
-        """Take the sds of each record's sensor and discrepancy, and the first two lags in a row.
+        """Map the sds of each record's sensor and discrepancy, and the first two lags in a row.
 
-        Where both are free and lognormal. None if there are no such pairs.
+        Only pairs count that are free and lognormal; None if there are none.
         """
         forms = {
             (p.plain, p.record): (row, p.formula)
@@ -314,9 +315,8 @@ type Map = TotalRatioMap | SkewMap | QuadraticMap | SecantMap
 def fit_maps(draws: FloatArray) -> list[Map]:
     """Return the maps, one after the other, that make draws (count, free) straight.
 
-    A tail may be longer because of a bend, and is taken for one then: there are skews only if the
-    draws are more probable with them, by a hundredth of a nat each, as those of a normal
-    distribution.
+    A tail may be longer because of a bend, and counts as a bend then: there are skews only if they
+    make the draws more probable as those of a normal distribution, by a hundredth of a nat each.
     """
     candidates: list[tuple[float, list[Map]]] = []
     without: list[Map] = []
@@ -349,13 +349,13 @@ def invert_maps(maps: Sequence[Map], whitened: FloatArray) -> tuple[FloatArray, 
 
 
 def subsample(draws: FloatArray, count: int) -> FloatArray:
-    """Return so many of draws (count, free) at most, evenly from first to last."""
-    # An odd stride, or the same few walkers might be taken at every step.
+    """Return at most ``count`` of the draws (draws, free), evenly from first to last."""
+    # An odd stride avoids taking the same few walkers at every step.
     return draws[:: -(-len(draws) // count) | 1]
 
 
 def _products(z: FloatArray, last: int) -> FloatArray:
-    """Return cᵢ cₖ − δᵢₖ (count, k + 1) of one k, the ``last``, and every i up to it."""
+    """Return cᵢ cₖ − δᵢₖ (count, k + 1) for one k, the ``last``, and every i up to it."""
     near = np.clip(z[:, : last + 1], -FARTHEST, FARTHEST)
     products: FloatArray = near * near[:, -1:]
     products[:, -1] -= 1.0
@@ -363,21 +363,21 @@ def _products(z: FloatArray, last: int) -> FloatArray:
 
 
 def _fit_log_scales(near: FloatArray, values: FloatArray) -> FloatArray:
-    """Return s (others,) of which values (count,) are as wide as exp(s·c) of c (count, others).
+    """Return s (others,) for values (count,) as wide as exp(s·c) with c (count, others).
 
-    By maximum likelihood of normal values; zeros unless a value is more probable by that than with
-    one width, by a hundredth of a nat on average.
+    The fit is by maximum likelihood of normal values; s is zero unless values are more probable
+    with it than with one width, by a hundredth of a nat on average.
     """
     count, others = near.shape
     design = np.column_stack([np.ones(count), near])
-    # A value far out would tell more than all others.
+    # Clip values far out, which would outweigh all others.
     squares = np.minimum(np.abs(values) / np.std(values), FARTHEST) ** 2
 
     def loss(logs: FloatArray) -> tuple[float, FloatArray]:
         width = design @ logs
         with np.errstate(over="ignore"):
             scaled = squares * np.exp(-2 * width)
-        # Drawn to zero by a hundredth of a draw each.
+        # Shrink the coefficients to zero, with a hundredth of each draw's weight.
         value = np.mean(width + 0.5 * scaled) + 0.005 * logs @ logs
         return float(value), design.T @ (1 - scaled) / count + 0.01 * logs
 

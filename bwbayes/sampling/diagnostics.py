@@ -1,12 +1,12 @@
-"""Has it converged? What is asked of a chain before anything is said about the parameters.
+"""Convergence diagnostics, which a chain has to pass before the parameters are reported.
 
 Ensembles are independent and start far apart; the walkers of one ensemble are not independent at
 the start and hardly so later. So R-hat is the nested one, with an ensemble as the superchain, and
-once more with the halves of each ensemble apart, which shows drift. That of single walkers, much
-more lenient, shows those that never leave their mode. Effective draws are counted with walkers as
-chains, capped by what the means of whole ensembles show, which also sees correlation between
-walkers. A walker that does not move blocks convergence by itself, and what is not a number never
-passes. This module alone knows arviz's statistics.
+once more with the halves of each ensemble as superchains, which shows drift. The R-hat of single
+walkers, much more lenient, shows walkers that never leave their mode. Effective draws are counted
+with walkers as chains, and capped by the effective draws of the means of whole ensembles, which
+include correlation between walkers. A walker that does not move prevents convergence by itself, and
+nan never passes. This module alone uses arviz's statistics.
 """
 
 # mypy: allow-untyped-calls
@@ -28,16 +28,16 @@ from bwbayes.shown import brief
 
 MAX_RHAT = 1.01
 
-# Of walkers that mix it is 1.01 after 50 autocorrelation times: √(1 + 1/50).
+# The R-hat of walkers that mix is 1.01 after 50 autocorrelation times: √(1 + 1/50).
 MAX_WALKER_RHAT = 1.05
 
-# Above this a proposal does not cover the draws.
+# Above this limit a proposal does not cover the draws.
 MAX_PARETO_K = 0.7
 
 # Log weights that differ by less than this, nats, are equal: the proposal is the posterior itself.
 EQUAL = 1e-6
 
-# Steps in autocorrelation times, before which no estimate of it can be trusted.
+# Least length of a chain, in autocorrelation times, for a reliable estimate of that time.
 LENGTH = 50
 
 
@@ -46,11 +46,11 @@ class ConvergenceDiagnostics:
     """The state of a sampling; arrays are (free,).
 
     ``rhat`` is the larger of nested and split nested R-hat; ``ess_bulk``, of the ranks, and
-    ``ess_tail`` are totals, and so is ``ess_mean``, which the Monte Carlo error of the mean hangs
-    on; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
-    ``stuck`` counts the walkers that do not move any more, as :func:`stuck` does; ``pareto_k`` is
-    that of the proposal at these draws, None if there is no proposal; ``walker_rhat`` is the
-    largest R-hat with each walker a chain.
+    ``ess_tail`` are totals, and so is ``ess_mean``, which determines the Monte Carlo error of the
+    mean; ``autocorrelation`` is in steps; ``acceptance`` is the mean fraction of accepted moves;
+    ``stuck`` is the number of walkers that do not move any more, from :func:`stuck`; ``pareto_k``
+    is that of the proposal at these draws, None without a proposal; ``walker_rhat`` is the largest
+    R-hat with each walker as a chain.
     """
 
     __repr__ = brief
@@ -68,25 +68,25 @@ class ConvergenceDiagnostics:
 
     @property
     def covered(self) -> bool:
-        """Whether the proposal, if there is one, covers the draws."""
+        """True if the proposal, if there is one, covers the draws."""
         return self.pareto_k is None or self.pareto_k < MAX_PARETO_K
 
     @property
     def lowest_ess(self) -> float:
-        """The effective draws of the parameter that has the fewest, of ranks or tails."""
+        """The smallest number of effective draws of any parameter, in bulk or tail."""
         return float(np.min([self.ess_bulk, self.ess_tail]))
 
     @property
     def steps_needed(self) -> float:
-        """Steps, to two digits, for walkers to agree, as they differ now: R² − 1 ∝ 1/steps."""
+        """Steps until walkers agree, to two digits, from their R-hat: R² − 1 ∝ 1/steps."""
         steps = self.steps * (self.walker_rhat**2 - 1) / (MAX_WALKER_RHAT**2 - 1)
         return float(f"{steps:.1e}")
 
     def failures(self, ess: float, fraction: float = 1.0) -> list[str]:
-        """Say what is missing for ``ess`` effective draws of each parameter; empty if nothing is.
+        """Return the reasons against convergence with ``ess`` effective draws, if any.
 
-        First what more draws need not cure. Of effective draws, and of autocorrelation times, a
-        ``fraction`` is enough. Every comparison is written so that nan fails it.
+        Reasons that more draws need not cure come first. A ``fraction`` of the effective draws, and
+        of the autocorrelation times, is enough. Every comparison is written so that nan fails it.
         """
         reasons = self.disagreements()
         draws = fraction * ess
@@ -98,9 +98,9 @@ class ConvergenceDiagnostics:
         return reasons
 
     def disagreements(self) -> list[str]:
-        """Say what is wrong with the draws that there are; empty if nothing is.
+        """Return the defects of the existing draws, if any.
 
-        Numbers are rounded away from the limit that they miss.
+        Numbers are rounded away from the limit that they violate.
         """
         reasons = []
         if not (self.rhat < MAX_RHAT).all():
@@ -119,7 +119,7 @@ class ConvergenceDiagnostics:
 
 @dataclass(frozen=True)
 class SamplingResult:
-    """How a sampling ended: ``converged`` or not, why, the last check, and what to know of it."""
+    """Result of a sampling: ``converged`` or not, the reason, the last check, and remarks."""
 
     __repr__ = brief
 
@@ -137,7 +137,7 @@ def check(
     autocorrelation: FloatArray | None = None,
     pareto_k: float | None = None,
 ) -> ConvergenceDiagnostics:
-    """Judge the draws of a sampling.
+    """Compute the convergence diagnostics of a sampling's draws.
 
     Parameters
     ----------
@@ -148,17 +148,17 @@ def check(
     block
         Steps in a block.
     thin
-        Of how many steps the draws are one.
+        Thinning: the draws hold one of so many steps.
     autocorrelation
         Their autocorrelation times, if they are known.
     pareto_k
-        That of the proposal at these draws, if there is one.
+        Pareto k̂ of the proposal at these draws, if there is one.
     """
     if autocorrelation is None:
         autocorrelation = times(draws, thin)
     columns = np.moveaxis(draws, -1, 0)
-    # Two threads: sorting and transforms leave Python free. Where threads silence warnings side by
-    # side, as arviz does, the last to end may leave them so.
+    # Two threads help: sorting and transforms release Python's lock. If threads silence warnings at
+    # the same time, as arviz does, the last to end may leave them silenced.
     with warnings.catch_warnings(), ThreadPoolExecutor(2) as executor:
         statistics = executor.map(_one_parameter, columns)
         rhat, bulk, tail, mean, walker_rhat = np.array([*statistics]).T
@@ -177,16 +177,16 @@ def check(
 
 
 def _one_parameter(values: FloatArray) -> tuple[float, ...]:
-    """Judge the draws (steps, ensembles, walkers) of one parameter.
+    """Compute the diagnostics of one parameter's draws (steps, ensembles, walkers).
 
-    R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers: walkers that
-    share modes between them in the same way in each ensemble, and never change, look alike to the
-    nested R-hat, and are worth as many effective draws as they are.
+    Returns R-hat, effective draws in bulk and tail and for the mean, and R-hat of the walkers. If
+    the walkers of each ensemble divide themselves among modes in the same way and never change, the
+    nested R-hat does not show it, and each counts as an effective draw.
     """
     steps, ensembles, _ = values.shape
     scores = _scores(values)
     half = steps // 2
-    # The halves of all ensembles are superchains of their own: first halves, then second ones.
+    # The halves of all ensembles are superchains: first halves, then second ones.
     halves = [np.concatenate([s[:, :half], s[:, steps - half :]]) for s in scores]
     rhat = float(np.max([_rhat(scores, ensembles), _rhat(halves, 2 * ensembles)]))  # keeps a nan
     ranked = scores[0]
@@ -199,8 +199,8 @@ def _one_parameter(values: FloatArray) -> tuple[float, ...]:
 def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
     """Count the walkers that have not moved for 25 autocorrelation times, or never.
 
-    The longest of an independence sampler's rests at a place where its proposal hardly goes are a
-    third of that. Arguments as in :func:`check`.
+    An independence sampler's longest rests, at places that it hardly proposes, are a third of that.
+    Arguments are as in :func:`check`.
     """
     blocks = 25 * np.max(autocorrelation) / block
     last = max(int(np.ceil(blocks)), 1) if np.isfinite(blocks) else len(accepted)
@@ -208,30 +208,30 @@ def stuck(accepted: IntArray, block: int, autocorrelation: FloatArray) -> int:
 
 
 def pareto_k(log_weights: FloatArray) -> float:
-    """Pareto k̂ of a proposal from log weights log p − log q (draws,) at draws of the posterior p.
+    """Return Pareto k̂ of a proposal from log weights log p − log q (draws,) at draws of p.
 
-    Above 0.7 the proposal q does not cover p. Importance weights are judged at draws of q; at
-    draws of p, where a weight w is w times as frequent, a tail of shape k has the shape
-    k' = k / (1 − k), so k = k' / (1 + k'). Places count once, however long a walker stayed: else
-    one walker at a large weight would make the tail by itself. Weights that are all equal have no
-    tail to fear, k = 0: the proposal is the posterior. Too few of them to see a tail give infinity.
+    Above 0.7 the proposal q does not cover the posterior p. The k̂ of importance weights is defined
+    at draws of q; at draws of p, where a weight w is w times as frequent, a tail of shape k has the
+    shape k' = k / (1 − k), so k = k' / (1 + k'). Places count once, however long a walker stayed:
+    else one walker at a large weight would make the tail by itself. Equal weights have no tail,
+    k = 0: the proposal is the posterior. If weights are too few to show a tail, k is infinite.
     """
     with np.errstate(invalid="ignore"):
         if log_weights.size and np.ptp(log_weights) < EQUAL:
             return 0.0
     try:
         shape = float(_arviz().psislw(-np.unique(log_weights))[1])
-    except (ValueError, IndexError):  # nothing
+    except (ValueError, IndexError):  # there are no weights
         return np.inf
     return shape / (1 + shape) if shape > 0 else shape
 
 
 def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
-    """Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
+    """Return Pareto-smoothed importance weights (draws,), adding up to one, and their k̂.
 
     The largest weights are replaced by the order statistics of the generalized Pareto distribution
-    fitted to them. Above k̂ = 0.7 they cannot be trusted; infinity where no tail can be fitted, or
-    a weight is not a number.
+    fitted to them. Weights with k̂ above 0.7 are unreliable; k̂ is infinite if no tail can be
+    fitted, or a weight is not a number.
 
     Notes
     -----
@@ -247,15 +247,15 @@ def smoothed_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
 
 
 def nested_rhat(draws: FloatArray) -> FloatArray:
-    """Nested R-hat (free,) of draws (steps, ensembles, walkers, free), an ensemble a superchain."""
+    """Return nested R-hat (free,) of draws (steps, ensembles, walkers, free) by ensembles."""
     columns = np.moveaxis(draws, -1, 0)
     return np.array([_rhat(_scores(values), values.shape[1]) for values in columns])
 
 
 def effective_draws(values: FloatArray) -> tuple[float, float]:
-    """Effective number of draws (steps, ensembles, walkers) of one parameter, bulk and tail.
+    """Return one parameter's effective draws (steps, ensembles, walkers), in bulk and tail.
 
-    With walkers as arviz's chains, and no more than the series of ensemble means allow: a mean of
+    The walkers are arviz's chains, and the series of ensemble means sets an upper bound: a mean of
     W independent walkers has a W-th of the variance, so n effective means are worth n times the
     ratio of the variances.
     """
@@ -264,13 +264,13 @@ def effective_draws(values: FloatArray) -> tuple[float, float]:
 
 
 def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, float, float]:
-    """Effective draws in bulk and tail and for the mean, given the draws' normal scores too.
+    """Return effective draws in bulk and tail and for the mean, given the draws' normal scores.
 
-    Of the means of the scores and of being in a tail: what arviz calls bulk and tail, which would
-    rank the draws three times more. And of the mean of the draws as they are: those of a heavy
-    tail are worth another number.
+    Bulk and tail are arviz's: for the means of the scores and of the indicators of a tail; arviz
+    itself would rank the draws three times more. The last number is for the mean of the draws as
+    they are, which differs for a heavy tail.
     """
-    # A comparison would take what is not a number for a draw beyond the tail.
+    # A comparison would count nan as a draw beyond the tail.
     tails = [
         np.where(np.isnan(scores), np.nan, scores <= scipy.special.ndtri(p)) for p in (0.05, 0.95)
     ]
@@ -285,10 +285,10 @@ def _effective_draws(values: FloatArray, scores: FloatArray) -> tuple[float, flo
 
 
 def _rhat(scores: Sequence[FloatArray], ensembles: int) -> float:
-    """Nested R-hat of two scores (chains, steps), an ensemble's chains in a row.
+    """Return nested R-hat of two scores (chains, steps), with an ensemble's chains in a row.
 
-    Of the scores and the folded ones, which show a place and a width, it is the larger: what arviz
-    calls rank, which would rank the draws once more.
+    It is the larger of that of the scores, which shows the location, and that of the folded scores,
+    which shows the width: arviz's method "rank", without ranking the draws once more.
     """
     superchain = np.repeat(np.arange(ensembles), len(scores[0]) // ensembles)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -311,8 +311,8 @@ def as_chains(values: FloatArray) -> FloatArray:
 def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rank draws (steps, ensembles, walkers) into two normal scores (chains, steps).
 
-    With the mean rank r of equal draws among N, Φ⁻¹((r − 3/8) / (N + 1/4)); nan if any draw is.
-    The second ones are those of the draws' distances from their median.
+    A score is Φ⁻¹((r − 3/8) / (N + 1/4)) with the mean rank r of equal draws among N; it is nan if
+    any draw is. The second scores are those of the draws' distances from their median.
     """
     chains = as_chains(values)
     with np.errstate(invalid="ignore"):
@@ -327,20 +327,21 @@ def _scores(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def times(draws: FloatArray, thin: int = 1) -> FloatArray:
-    """Autocorrelation times (free,), in steps, of draws (steps, ensembles, walkers, free)."""
+    """Return autocorrelation times (free,), steps, of draws (steps, ensembles, walkers, free)."""
     columns = np.moveaxis(draws, -1, 0)
-    # A thinned series does not tell times below its own step.
+    # A thinned series does not show times below its own step.
     return thin * np.array([autocorrelation_time(as_chains(values)) for values in columns])
 
 
 def autocorrelation_time(chains: FloatArray) -> float:
-    """Integrated autocorrelation time, in steps, of chains (chains, steps) of one parameter.
+    """Return the integrated autocorrelation time, steps, of one parameter's ``chains``.
 
-    It is nan where it cannot be told, for instance where nothing moves.
+    They are (chains, steps). The time is nan if it cannot be estimated, for instance if nothing
+    moves.
     """
     from emcee.autocorr import auto_window  # noqa: PLC0415  # slow to load
 
-    # As emcee's ``integrated_time`` does it, which transforms one chain after the other.
+    # This is emcee's ``integrated_time``, which transforms one chain after the other.
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         sums = 2 * np.cumsum(np.mean(_arviz().autocorr(chains), axis=0)) - 1
         time = float(sums[auto_window(sums, 5)])

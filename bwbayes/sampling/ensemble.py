@@ -3,7 +3,7 @@
 :func:`advance` is a pure function of the posterior and each :class:`EnsembleState`, random state
 included. So it does not matter where, when or in which order ensembles run: a run with two
 workers, or one that was interrupted and resumes, gives the same bits. The steps themselves are
-those of ``emcee.EnsembleSampler``, by whatever emcee moves it is given.
+those of ``emcee.EnsembleSampler`` with the given emcee moves.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def advance(
     moves: Sequence[WeightedMoves],
     steps: int,
 ) -> list[Block]:
-    """Advance ensembles by ``steps`` steps, one after the other, each by ``moves`` of its own.
+    """Advance ensembles by ``steps`` steps, one after the other, each by its item of ``moves``.
 
     Each step takes one of an ensemble's moves at random, with its weight, for all walkers.
     """
@@ -82,9 +82,9 @@ def advance(
 
 
 class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]  # emcee has no types
-    """emcee's sampler; a place that is not finite has no density, where emcee would end.
+    """emcee's sampler; it gives a place that is not finite no density, where emcee would end.
 
-    Far away a proposal may overflow. Without a proper posterior walkers come there sooner or later.
+    A proposal far away may overflow. Without a proper posterior walkers get there in the end.
     """
 
     def compute_log_prob(self, coords: FloatArray) -> tuple[FloatArray, None]:

@@ -1,4 +1,4 @@
-"""How the walkers move.
+"""Moves of the walkers.
 
 Differential evolution steps along the difference of two other walkers, so it follows any ridge the
 ensemble lies on; a snooker step now and then helps between modes. Neither needs tuning, and they
@@ -6,7 +6,7 @@ bring the pilot to the posterior, where half of its steps try places of the poin
 Once the pilot is there, a mixture of Student-t distributions fitted to its draws, and bent as they
 are, proposes places independently of where a walker is, which mixes about ten times faster. The fit
 is frozen before the draws that count, and a seventh of the steps remain differential evolution and
-snooker, so that whatever the fit does not cover is reached, and left again.
+snooker, so that walkers reach the places that the fit does not cover, and leave them again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WeightedMoves = Mapping[str, tuple[moves.Move, float]]
 class SnookerMove(moves.RedBlueMove):  # type: ignore[misc]  # emcee has no types
     """A step along the line through another walker, as long as two more are apart on that line.
 
-    With e the unit vector from walker z to x, and walkers z₁, z₂, all of the half that rests,
+    With the unit vector e from walker z to x, and walkers z₁, z₂, all of the half at rest,
 
         x' = x + 1.7 e (e·z₁ − e·z₂),   log factor (p − 1) log(|x' − z| / |x − z|),
 
@@ -76,7 +76,7 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
     tries
         n, for each walker and step.
     ahead
-        Of how many steps the tries are drawn at once, for they do not depend on the walkers: on a
+        Number of steps whose tries are drawn at once, since they do not depend on the walkers: on a
         short record a call of the density costs more than the models in it.
     """
 
@@ -86,7 +86,7 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         self._left: tuple[FloatArray, FloatArray] | None = None
 
     def propose(self, model: Model, state: emcee.State) -> tuple[emcee.State, BoolArray]:
-        """Propose for all walkers, as emcee asks for it."""
+        """Propose for all walkers, as the interface of emcee's moves requires."""
         walkers = len(state.coords)
         if not self._drawn:
             self._drawn = [*self._draw(model, walkers)]
@@ -106,9 +106,9 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
     ) -> tuple[IntArray, BoolArray, FloatArray]:
         """Choose for each walker, at log w₀ (walkers,), one of log wᵢ (tries, walkers).
 
-        Return which, whether it is accepted, and its log weight, each (walkers,). One number from 0
-        to 1 does both: it falls into the part of the range that belongs to a try, and where in that
-        part it falls is again such a number.
+        Returns its index, whether it is accepted, and its log weight, each (walkers,). One uniform
+        number decides both: it falls into the part of the range that belongs to a try, and its
+        position within that part is again uniform.
         """
         rows = np.arange(here.size)
         largest = np.maximum(np.max(weight, axis=0), here)
@@ -122,14 +122,14 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
         return which, accepted, chosen
 
     def _log_weight(self, state: emcee.State) -> FloatArray:
-        """Return log w₀ (walkers,); as this move left the walkers, it is known."""
+        """Return log w₀ (walkers,), which is known if the walkers are as this move left them."""
         if self._left is not None and np.array_equal(self._left[0], state.coords):
             return self._left[1]
         log_weight: FloatArray = state.log_prob - self.proposal.log_density(state.coords)
         return log_weight
 
     def _draw(self, model: Model, walkers: int) -> Iterator[_Tries]:
-        """Draw the tries of the next steps, and ask for their densities at once."""
+        """Draw the tries of the next steps, and compute their densities at once."""
         count = self.ahead * self.tries * walkers
         coords, log_density = self.proposal.evaluate(self.proposal.draw(model.random, count))
         log_prob, _ = model.compute_log_prob_fn(coords)
@@ -143,7 +143,7 @@ class IndependenceMove(moves.Move):  # type: ignore[misc]  # emcee has no types
 
 
 class _Tries(NamedTuple):
-    """``coords`` (tries, walkers, free), and their log π and log w, (tries, walkers) each."""
+    """Tries of a step: ``coords`` (tries, walkers, free), log π and log w (tries, walkers)."""
 
     coords: FloatArray
     log_prob: FloatArray
@@ -151,13 +151,13 @@ class _Tries(NamedTuple):
 
 
 class Counted(moves.Move):  # type: ignore[misc]
-    """Another move, and how often it was ``proposed`` to a walker and ``accepted``."""
+    """Another move, with the numbers of its proposals to walkers and of its acceptances."""
 
     def __init__(self, move: moves.Move) -> None:
         self.move, self.proposed, self.accepted = move, 0, 0
 
     def propose(self, model: Model, state: emcee.State) -> tuple[emcee.State, BoolArray]:
-        """Propose what the other move does."""
+        """Make the other move's proposal, and count it."""
         state, accepted = self.move.propose(model, state)
         self.proposed += accepted.size
         self.accepted += int(np.count_nonzero(accepted))
@@ -165,7 +165,7 @@ class Counted(moves.Move):  # type: ignore[misc]
 
 
 def pilot_moves(proposal: StudentMixture | None = None, ahead: int = 1) -> WeightedMoves:
-    """Return moves and weights for the pilot: half of its steps are a first guess's, if any."""
+    """Return moves and weights for the pilot: half of its steps use a first guess, if any."""
     share = 0.0 if proposal is None else 0.5
     return _with_independence(share, proposal, ahead=ahead)
 
@@ -173,7 +173,7 @@ def pilot_moves(proposal: StudentMixture | None = None, ahead: int = 1) -> Weigh
 def sampling_moves(
     proposal: StudentMixture | None, tries: int = 1, ahead: int = 1
 ) -> WeightedMoves:
-    """Return moves and weights for the draws that count; as the pilot's without a proposal."""
+    """Return moves and weights for the draws that count; without a proposal, those of the pilot."""
     share = 0.0 if proposal is None else 0.85
     return _with_independence(share, proposal, tries, ahead)
 

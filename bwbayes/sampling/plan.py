@@ -1,7 +1,7 @@
-"""How a posterior is sampled: the walkers, the target, the budget, and what a step may cost.
+"""Plan of a sampling: the walkers, the target, the budget, and the cost of a step.
 
-On a short record a step is mostly Python's work, whatever the models in it: there an independence
-move draws the tries of several steps at once, and a step has several tries to choose from.
+On a short record, Python takes most of the time of a step, whatever the models in it: there an
+independence move draws the tries of several steps at once, and a step has several tries.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from bwbayes.errors import InputError
 
 @dataclass(frozen=True)
 class SamplingPlan:
-    """How to sample, and when to stop.
+    """Settings of a sampling, and its stopping rule.
 
     Parameters
     ----------
@@ -26,15 +26,15 @@ class SamplingPlan:
     block
         Steps that are made and stored at a time; checks come after whole blocks.
     max_steps, max_pilot_steps
-        The budget: steps of each ensemble that count, and before.
+        The budget: steps of each ensemble that count, and of the pilot.
     min_pilot_steps
-        Steps of the pilot in any case.
+        Least number of steps of the pilot.
     ensembles_per_task
         Ensembles that one task advances.
     tries
         Tries of an independence move that counts, for each walker and step.
     ahead
-        Steps of which an independence move draws the tries at once.
+        Number of steps whose tries an independence move draws at once.
     """
 
     ess: float = 2000.0
@@ -56,28 +56,28 @@ class SamplingPlan:
 
 
 def best_ensembles_per_task(ensembles: int, walkers: int, samples: int) -> int:
-    """Return how many ensembles one task advances, on a record of so many samples.
+    """Return the number of ensembles that one task advances, on a record of so many samples.
 
-    All where a step is light: threads would wait for each other's Python. Half of them, for two
-    threads, where the models take as long as Python does. Else each by itself.
+    If a step is cheap, a task advances all: threads would wait for each other's Python code. If the
+    models take as long as Python, a task advances half of them, for two threads; else, one.
     """
     size = walkers * samples
     return ensembles if size <= 1 << 16 else ensembles // 2 if size <= 1 << 18 else 1
 
 
 def best_tries(walkers: int, readings: int) -> int:
-    """Return how many tries an independence move has, for so many readings.
+    """Return the number of tries of an independence move, for so many readings.
 
-    Several where readings are few, four of up to 32 with 64 walkers: what they leave open is wide
-    and curved, and the mixture covers it badly.
+    Records with few readings get several, up to 32 readings and with 64 walkers four: their
+    posteriors are wide and curved, and the mixture covers them badly.
     """
     return max(1, min(4, (1 << 13) // (walkers * readings)))
 
 
 def best_ahead(walkers: int, samples: int) -> int:
-    """Return of how many steps tries are drawn at once, on a record of so many samples.
+    """Return the number of steps whose tries are drawn at once, on a record of so many samples.
 
-    Of eight where a call of the density costs more than the models in it. What a block of steps
-    leaves over is lost, which where models are dear would cost more than the calls.
+    It is eight if a call of the density costs more than the models in it. Tries left over from a
+    block of steps are lost, which would cost more than the calls if models are expensive.
     """
     return max(1, min(8, (1 << 17) // (walkers * samples)))

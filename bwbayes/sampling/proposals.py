@@ -1,8 +1,8 @@
 """Distributions that propose places independently of where a walker is.
 
 A Student-t distribution around the draws of a pilot covers a posterior that is nearly Gaussian.
-Others take a few of them: a mixture fitted by expectation maximization, in coordinates in which
-ridges are straight and tails alike (:mod:`bwbayes.sampling.curvature`). Heavy tails on every
+Other posteriors need a few of them: a mixture fitted by expectation maximization, in coordinates
+with straight ridges and equal tails (:mod:`bwbayes.sampling.curvature`). Heavy tails of every
 component keep the ratio of posterior to proposal bounded.
 """
 
@@ -33,7 +33,7 @@ from bwbayes.shown import brief
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-# By the name in a file, in the order in which they make coordinates straight.
+# Maps by their names in a file, in the order in which they are applied.
 _MAPS: dict[str, type[Map]] = {
     "secant": SecantMap,
     "totals": TotalRatioMap,
@@ -59,7 +59,7 @@ class StudentMixture:
     factors
         Lⱼ, lower triangular, (components, free, free).
     maps
-        What makes the straight coordinates, one after the other.
+        Maps to the straight coordinates, applied one after the other.
     freedom
         ν; small enough for tails heavier than the posterior's.
     """
@@ -81,13 +81,13 @@ class StudentMixture:
     ) -> StudentMixture:
         """Fit to draws (count, free), by expectation maximization of a Gaussian mixture.
 
-        Of three components, or up to six where draws are many: few would be followed too closely.
-        With their log densities (count,) under what they are drawn from, the mixture gets one more
-        component, of the draws where log p − log q is largest: a walker that is there would hardly
-        be led away. Modes that a first ``guess`` has beside the most probable one get a twentieth
-        each besides, as the guess has them: a mode that is not proposed is not found again. The
-        coordinates are those in which the first mode is straight; pairs of sds are in line as in
-        the guess.
+        The mixture has three components, or up to six for many draws: it would follow few draws too
+        closely. With their log densities (count,) under the distribution that they are drawn from,
+        it gets one more component, of the draws with the largest log p − log q: a walker there
+        would hardly ever leave. Each mode of a first ``guess`` besides the most probable one gets a
+        component of the guess's shape with a weight of a twentieth: a mode that is not proposed is
+        not found again. The coordinates are those in which the first mode is straight; pairs of sds
+        are in line as in the guess.
 
         Raises
         ------
@@ -106,9 +106,9 @@ class StudentMixture:
         further = fit_maps(first)
         draws, slope = apply_maps(further, draws)
         modes = [apply_maps(further, mode)[0] for mode in modes]
-        # First with so few of the draws that they cost little, then with all.
+        # Fit first to so few of the draws that they cost little, then to more.
         sample = subsample(draws, 1024)
-        # A draw belongs at first to the nearest of a few, or of the modes, in units of their sds.
+        # Each draw first belongs to the nearest of a few draws and modes, in units of their sds.
         at = np.linspace(0, len(sample) - 1, min(max(len(draws) // 4_000, 3), 6)).astype(int)
         few = np.stack([*sample[at], *(np.mean(mode, axis=0) for mode in modes)])
         away = (few[:, np.newaxis] - sample) / np.std(sample, axis=0)
@@ -123,7 +123,7 @@ class StudentMixture:
             mixture = mixture._with(_of_shares(mode, np.ones((1, len(mode)))), 0.05)
         if log_density is not None:
             log_ratio = log_density - log_slope - slope - mixture.log_density(draws)
-            # The 2% of draws with the largest log p − log q.
+            # Add a component for the 2% of draws with the largest log p − log q.
             worst = log_ratio >= np.quantile(log_ratio, 0.98)
             mixture = mixture._with(_of_shares(draws, np.stack([worst, ~worst])), 0.1)
         return replace(mixture, maps=(*maps, *further))
@@ -136,10 +136,10 @@ class StudentMixture:
         shares: FloatArray,
         totals: TotalRatioMap | None = None,
     ) -> StudentMixture:
-        """Take modes' places (modes, free), covariances (modes, free, free) and shares (modes,).
+        """Make a mixture of modes (modes, free), covariances (modes, free, free), shares (modes,).
 
-        The first three modes; of fewer, the same ones again, twice and three times as wide. No
-        component gets less than a twelfth: the shares of modes are a guess.
+        It has the first three modes; fewer modes are repeated, twice and three times as wide. Each
+        component gets at least a twelfth, because the shares of modes are a guess.
         """
         if totals is not None:
             slopes = totals.slopes(optima)
@@ -154,7 +154,7 @@ class StudentMixture:
         return cls(weights, optima[modes], factors, maps, freedom=6.0)
 
     def arrays(self) -> dict[str, Any]:
-        """Return what it is made of, by name, to be written to a file."""
+        """Return the arrays of the mixture by name, to be written to a file."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "maps"}
         names = {kind: name for name, kind in _MAPS.items()}
         for map_ in self.maps:
@@ -164,7 +164,7 @@ class StudentMixture:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, Any]) -> StudentMixture | None:
-        """Return the mixture that was written to a file as :meth:`arrays`, if any was."""
+        """Return the mixture that a file holds as :meth:`arrays`, or None."""
         if "weights" not in arrays:
             return None
         maps: list[Map] = []
@@ -176,7 +176,7 @@ class StudentMixture:
         return cls(**parts, maps=tuple(maps))
 
     def of_posterior(self, posterior: Posterior) -> StudentMixture:
-        """Return the mixture with maps that know what is sampled; a file does not keep it."""
+        """Return the mixture with the posterior set in its maps; a file does not keep it."""
         maps = [
             replace(m, posterior=posterior) if isinstance(m, SecantMap) else m for m in self.maps
         ]
@@ -184,11 +184,11 @@ class StudentMixture:
 
     @property
     def has_secant(self) -> bool:
-        """Whether one of its maps asks the model: a :class:`SecantMap`."""
+        """True if one of its maps needs the model: a :class:`SecantMap`."""
         return any(isinstance(map_, SecantMap) for map_ in self.maps)
 
     def behind(self, first: Map) -> StudentMixture:
-        """Return what tells a fit to put draws in line with another map first, of no modes."""
+        """Return a guess for a fit that applies another map first, without further modes."""
         weights, centers, factors = self.weights[:1], self.centers[:1], self.factors[:1]
         return replace(
             self, weights=weights, centers=centers, factors=factors, maps=(first, *self.maps)
@@ -196,7 +196,7 @@ class StudentMixture:
 
     @cached_property
     def _whitening(self) -> FloatArray:
-        # Its transpose times a row is one product for all coordinates.
+        # Store the transpose: a row times it is one product for all coordinates.
         return np.ascontiguousarray(np.linalg.inv(self.factors).transpose(0, 2, 1))
 
     @cached_property
@@ -205,15 +205,15 @@ class StudentMixture:
         return np.sum(np.log(np.diagonal(self.factors, axis1=1, axis2=2)), axis=1)
 
     def squares(self, whitened: FloatArray) -> FloatArray:
-        """Squared distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
+        """Return distances |Lⱼ⁻¹(z − μⱼ)|² (components, ...) of coordinates (..., free)."""
         pairs = zip(self.centers, self._whitening, strict=True)
         white = [(whitened - center) @ whitening for center, whitening in pairs]
         return np.stack([np.einsum("...j,...j->...", z, z) for z in white])
 
     def log_parts(self, squares: FloatArray) -> FloatArray:
-        """Log densities times weights, of :meth:`squares` and shaped alike."""
+        """Return the components' weighted log densities from :meth:`squares`, in their shape."""
         freedom, free = self.freedom, self.centers.shape[1]
-        # Of a Student-t distribution.
+        # The normalization of a Student-t distribution.
         constant = scipy.special.gammaln((freedom + free) / 2) - scipy.special.gammaln(freedom / 2)
         constant -= 0.5 * free * np.log(freedom * np.pi)
         scales = np.log(self.weights) - self._log_volumes + constant
@@ -222,7 +222,7 @@ class StudentMixture:
         return parts
 
     def log_density(self, coordinates: FloatArray) -> FloatArray:
-        """Log density (..., count) at coordinates (..., count, free)."""
+        """Return the log density (..., count) at coordinates (..., count, free)."""
         flat = coordinates.reshape(-1, coordinates.shape[-1])
         density = np.empty(len(flat))
         for start in range(0, len(flat), 1 << 15):  # maps and components take memory
@@ -238,7 +238,7 @@ class StudentMixture:
 
     def draw(self, random: np.random.RandomState, count: int) -> FloatArray:
         """Draw straight coordinates (count, free) with emcee's generator."""
-        # As ``random.choice`` does with these weights, without its checks of them.
+        # The same as ``random.choice`` with these weights, without its checks of them.
         ends = np.cumsum(self.weights)
         chosen = (ends / ends[-1]).searchsorted(random.random_sample(count), side="right")
         normal = random.standard_normal((count, self.centers.shape[1]))
@@ -248,23 +248,23 @@ class StudentMixture:
         return whitened
 
     def _whitened_density(self, whitened: FloatArray) -> FloatArray:
-        """Log density (count,) of straight coordinates (count, free)."""
+        """Return the log density (count,) of straight coordinates (count, free)."""
         density: FloatArray = np.logaddexp.reduce(self.log_parts(self.squares(whitened)))
         return density
 
     @cached_property
     def _modes(self) -> list[int]:
-        """Which mode each component stands for, (components,): those of one center, one mode."""
+        """The mode of each component, (components,): components with one center are one mode."""
         centers = [tuple(center) for center in self.centers]
         return [list(dict.fromkeys(centers)).index(center) for center in centers]
 
     @property
     def _lesser(self) -> list[int]:
-        """The first component of each mode but the first."""
+        """The first component of each mode except the first mode."""
         return [self._modes.index(mode) for mode in range(1, max(self._modes) + 1)]
 
     def _stand_ins(self, component: int) -> FloatArray:
-        """Return points (some, free) that stand for draws of a component.
+        """Return points (points, free) that represent draws of a component.
 
         With the columns lₖ of L, the points μ ± lₖ √p have the component's mean and covariance.
         """
@@ -273,7 +273,7 @@ class StudentMixture:
         return points
 
     def _with(self, other: StudentMixture, weight: float) -> StudentMixture:
-        """Return the mixture with the first component of another one, which gets a weight."""
+        """Return the mixture with the first component of another one added, with a weight."""
         return StudentMixture(
             np.append((1 - weight) * self.weights, weight),
             np.concatenate([self.centers, other.centers[:1]]),
@@ -281,7 +281,7 @@ class StudentMixture:
         )
 
     def _fitted_on(self, draws: FloatArray) -> StudentMixture:
-        """Take a round of expectation maximization."""
+        """Make one round of expectation maximization."""
         logs = np.log(self.weights) - self._log_volumes
         logs = logs[:, np.newaxis] - 0.5 * self.squares(draws)
         density = np.exp(logs - np.max(logs, axis=0))
@@ -290,7 +290,7 @@ class StudentMixture:
 
 def _require_spread(draws: FloatArray) -> None:
     """Refuse draws (count, free) that do not span the space."""
-    # Rounding leaves some variance to draws that lie in a plane, or do not differ at all.
+    # Rounding gives some variance to draws that lie in a plane, or do not differ at all.
     plane = np.column_stack([np.ones(len(draws)), draws])
     # The triangle has the singular values of all draws, and is small.
     sizes = np.linalg.svd(np.linalg.qr(plane, mode="r"), compute_uv=False)
@@ -301,9 +301,9 @@ def _require_spread(draws: FloatArray) -> None:
 def _of_shares(draws: FloatArray, share: FloatArray) -> StudentMixture:
     """Return the mixture whose components have these shares (components, count) of draws.
 
-    Every component gets a thousandth of each draw, so that none starves, and a tenth of the mean
-    covariance: the draws are few. That of all draws would be far too wide where components are
-    modes apart.
+    Every component gets a thousandth of each draw, so that none becomes empty, and a tenth of the
+    mean covariance, since draws are few. The covariance of all draws would be far too wide if
+    components are separate modes.
     """
     share = (share + 1e-3) / (1 + 1e-3 * len(share))
     weights = share.mean(axis=1)

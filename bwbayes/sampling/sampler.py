@@ -1,28 +1,28 @@
-"""Sampling: several independent ensembles, run until the chain says that it has converged.
+"""Sampling: several independent ensembles, run until the chain has converged.
 
 The ensembles start far apart. A pilot brings them to the posterior, by differential evolution and
-by a first guess of it, the point fit's; a short tuning with a first fit of the proposal gives the
-draws for its last one. Where walkers take few of the places that it proposes, the tuning goes on a
-little, each time with a new fit and twice as long. Every fit keeps a share for each mode that the
-point fit knows, be it in the draws or not. Pilot and tuning are thrown away. Then draws
-count, and the chain is judged (:mod:`bwbayes.sampling.diagnostics`), until two judgments in a row
-find nothing wrong, the first on half the draws that are to be reached, the second on all of them
-and a fifth more than the first at least; or the budget of steps is used up, or a tenth of it shows
-that walkers differ so much that four times as many would not do.
-To judge costs as much as many steps, so each judgment predicts how long the chain must become,
-and the next one waits until then, and until the chain is long against its autocorrelation times.
+by a first guess of it from the point fit; a short tuning with a first fit of the proposal gives the
+draws for its last fit. If walkers accept few of the proposed places, the tuning continues a little,
+each time with a new fit and twice as long. Every fit keeps a share for each mode of the point fit,
+whether the draws contain it or not. Pilot and tuning are discarded. Then draws count, and the chain
+is checked (:mod:`bwbayes.sampling.diagnostics`) until two checks in a row pass, the first on half
+of the required draws, the second on all of them and at least a fifth more than the first; or until
+the budget of steps is used up, or a tenth of it shows that walkers differ so much that four times
+the budget would not suffice. A check costs as much as many steps, so each one predicts the
+necessary length of the chain, and the next one waits for it, and until the chain is long compared
+with its autocorrelation times.
 
-A proposal that covers the posterior badly leaves walkers where it hardly goes, or keeps them away
-from there. It is judged on the draws that it made: by Pareto k, and by whether effective draws grow
-with the steps. Where k is above 0.7, or where what is left would take longer than a new beginning
-at the best rate so far, the draws are set aside, and the sampling starts again from where the
-ensembles are with another proposal, which is fitted to all that was set aside, for that has been
-where the first hardly goes. If k is above 0.7 after half of the budget, differential evolution goes
-on alone, which needs about ten times the steps. So all draws that count come from one kernel, fixed
-before the first of them.
+A proposal that covers the posterior badly leaves walkers at places that it hardly proposes, or
+keeps them away from there. It is tested on the draws that it made: by Pareto k, and by the growth
+of effective draws with the steps. If k is above 0.7, or if the rest would take longer than a new
+start at the best rate so far, the draws are set aside. The sampling then starts again from the
+present states of the ensembles with another proposal, fitted to all draws that were set aside,
+because they include places that the first one hardly proposes. If k is above 0.7 after half of the
+budget, differential evolution continues alone, which needs about ten times the steps. So all draws
+that count come from one kernel, fixed before the first of them.
 
-All decisions are functions of the chain alone, and are taken again from its beginning when a run
-that was interrupted goes on: it comes to the same end.
+All decisions are functions of the chain alone, and an interrupted run takes them again from its
+beginning when it resumes: it has the same result.
 """
 
 from __future__ import annotations
@@ -57,20 +57,19 @@ from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.secant import SecantMap, linear
 
-# Blocks before the first check, and how much longer the chain is at the next one at most, or at
-# least if it is not draws that are missing. A proposal is fitted again to so many more at least.
+# Blocks before the first check; the largest growth of the chain up to the next one; and its growth
+# if it is not draws that are missing, which is also the least before a proposal is fitted again.
 FIRST_CHECK = 2
 MAX_STRETCH = 3.0
 LEAST_STRETCH = 1.2
 
-# Another proposal is worth the draws where what is left takes this much longer, as effective draws
-# grow now, than all of it at the best rate so far; or where more draws show that this much more of
-# them are needed than fewer did.
+# Draws are given up for another proposal if the rest takes this much longer, at the present growth
+# of effective draws, than everything at the best rate so far; or if more draws raise the estimate
+# of the number of blocks that are needed by this factor.
 MAX_SLOWDOWN = 1.2
 
-# Of the two checks that a chain must pass: for the first, this part of the draws that are to be
-# reached is enough, and the second comes on so much longer a chain; checks of nearly the same draws
-# would be one.
+# A chain must pass two checks. The first needs this part of the required draws; the second comes
+# when the chain is longer by this factor, because checks of nearly the same draws would be one.
 FIRST_PART = 0.5
 MIN_CHECK_GROWTH = 1.2
 
@@ -136,7 +135,7 @@ class _Sampling:
         while (outcome := self._sampled()) is None:
             history, proposal = chain.history("sampling"), None
             if self._is_early:
-                # To all blocks of the sampling, whether they count or not.
+                # Fit to all blocks of the sampling, whether they count or not.
                 fitted_to = Chain(chain.starts)
                 fitted_to.freeze("pilot", chain.proposals["pilot"])
                 for blocks in history:
@@ -149,19 +148,19 @@ class _Sampling:
 
     @property
     def _is_early(self) -> bool:
-        """Whether there is budget enough for one more proposal."""
+        """True if the rest of the budget is enough for one more proposal."""
         return len(self.chain.history("sampling")) * self.plan.block <= self.plan.max_steps / 2
 
     def _extend(self, phase: Phase) -> None:
-        """Advance every ensemble by a block, wherever the executor likes."""
+        """Advance every ensemble by a block, in the executor's workers."""
         plan, chain = self.plan, self.chain
         proposal = _in_use(chain, phase, self.posterior)
-        # Only where draws count has a step several tries.
+        # A step has several tries only in the phase whose draws count.
         tries = plan.tries if phase == "sampling" else 1
         futures, ends = [], chain.ends
         size = plan.ensembles_per_task
         for group in (ends[i : i + size] for i in range(0, len(ends), size)):
-            # Moves of its own for each: they keep what they have drawn.
+            # Each ensemble gets separate moves, because moves keep the tries that they have drawn.
             moves = [
                 pilot_moves(proposal, plan.ahead)
                 if phase == "pilot"
@@ -177,10 +176,10 @@ class _Sampling:
         chain.append(phase, blocks)
 
     def _pilot_is_done(self) -> bool:
-        """Tell whether the ensembles have met.
+        """Tell whether the ensembles agree.
 
-        After 500 steps it is enough if each stays where it is: in modes far apart differential
-        evolution would keep them for ever, and a proposal fitted to all of them will not.
+        After 500 steps it is enough if each one is stationary: differential evolution would keep
+        them in distant modes for ever, but a proposal fitted to all of them will not.
         """
         plan, steps = self.plan, self.chain.steps("pilot")
         if steps < plan.min_pilot_steps or steps >= plan.max_pilot_steps:
@@ -195,11 +194,11 @@ class _Sampling:
         )
 
     def _tune(self) -> None:
-        """Tune in rounds, each with a fit to the last one's draws; freeze the fit to the last.
+        """Tune in rounds, each with a fit to the draws of the last one; freeze the last fit.
 
-        The first is one block; others follow until walkers take half of the places, at most four
-        blocks in all: where these do not suffice, the sampling will tell. A run that goes on within
-        a round fits again to what that round had begun with.
+        The first round is one block; others follow until walkers accept half of the proposed
+        places, with four blocks at most in all: if these do not suffice, the sampling shows it. A
+        run that resumes within a round repeats the fit with which that round began.
         """
         plan, chain = self.plan, self.chain
         proposal = self._fitted(chain, "pilot", slice(chain.steps("pilot") // 2, None))
@@ -225,8 +224,8 @@ class _Sampling:
     ) -> StudentMixture | None:
         """Fit a proposal to the draws of these steps of a phase, if they span the space.
 
-        Where fewer places of the one ``before`` it are taken than of differential evolution, whose
-        steps are small, it is fitted with slope and level for coordinates; and so are others then.
+        If walkers accept fewer places of the proposal ``before`` it than of differential evolution,
+        whose steps are small, slope and level become coordinates of this fit and of later ones.
         """
         draws = chain.coordinates(phase, thin)[steps]
         log_density = chain.log_density(phase, thin)[steps].ravel()
@@ -244,14 +243,14 @@ class _Sampling:
     def _sampled(self) -> SamplingResult | None:
         """Sample to the end, or until the proposal turns out not to cover the draws: then None.
 
-        A chain that has blocks already is judged where it was, or would have been, on its way.
+        A chain that already has blocks is checked at the lengths at which a new one would be.
         """
         plan, chain = self.plan, self.chain
-        # A chain may be longer than its budget, if that was made smaller.
+        # A chain may be longer than its budget, if the budget was reduced.
         budget = max(-(-plan.max_steps // plan.block), chain.blocks("sampling"))
         fitted_to = chain.set_aside if chain.refit else 0
         blocks, passed = FIRST_CHECK, 0  # blocks at the first of the checks in a row that passed
-        needed, best = math.inf, 0.0  # blocks, and most effective draws of a block, as told so far
+        needed, best = math.inf, 0.0  # estimated blocks, most effective draws of a block so far
         judged = 0, 0.0  # blocks and effective draws of the last check
         while True:
             blocks = min(blocks, budget)
@@ -262,7 +261,7 @@ class _Sampling:
             may_refit = at_end and drawn >= 2 * fitted_to and self._is_early
             judgment = _Judgment(self.posterior, plan, chain, blocks)
             required = judgment.blocks_needed(1.0 if passed else FIRST_PART)
-            # A tenth of the budget has had several proposals, and tells whether all of it may do.
+            # A tenth of the budget allows several proposals, and shows whether all may suffice.
             is_early = drawn < budget / 10
             if required > blocks and is_early:
                 if may_refit and not passed and required > MAX_SLOWDOWN * needed:
@@ -275,7 +274,7 @@ class _Sampling:
                 chain.publish()
             self.watcher("sampling", latest)
             missing = latest.failures(plan.ess)
-            # One whose target was made smaller has converged before its end.
+            # A chain whose target was reduced may have converged before its end.
             done = not missing and 0 < MIN_CHECK_GROWTH * passed <= blocks
             if done and at_end:
                 return SamplingResult(True, "converged (two consecutive checks)", latest)
@@ -304,10 +303,10 @@ class _Sampling:
 
 
 class _Judgment:
-    """What the first ``blocks`` blocks that count tell; what costs little is worked out at once.
+    """Check of the first ``blocks`` blocks that count; the cheap part is worked out at once.
 
-    Of many draws every second step is taken, or every fourth, and so on, to bound the memory; but
-    far more draws than are to be effective, so that none is missed.
+    Long chains are thinned by powers of two to bound the memory, but keep several times the target
+    of effective draws, so that none is lost.
     """
 
     def __init__(self, posterior: Posterior, plan: SamplingPlan, chain: Chain, blocks: int) -> None:
@@ -324,31 +323,32 @@ class _Judgment:
             self.pareto_k = pareto_k((density - proposal.log_density(coordinates)).ravel())
 
     def blocks_needed(self, fraction: float) -> float:
-        """Return how many blocks make a ``fraction`` of the autocorrelation times that are needed.
+        """Return the number of blocks for a ``fraction`` of the required autocorrelation times.
 
-        Mostly the last thing that is missing, and cheap to see. None if the proposal does not cover
-        the draws, because more would not help.
+        This is mostly the last requirement, and cheap to test. It is 0 if the proposal does not
+        cover the draws, because more would not help.
         """
         if self.pareto_k is not None and not self.pareto_k < MAX_PARETO_K:
             return 0.0
         return fraction * LENGTH * float(np.max(self.times)) / self.block
 
     def check(self) -> ConvergenceDiagnostics:
-        """Judge everything, which costs as much as many steps."""
+        """Compute all diagnostics, which costs as much as many steps."""
         return check(self.draws, self.accepted, self.block, self.thin, self.times, self.pareto_k)
 
 
 def _next_check(
     plan: SamplingPlan, blocks: int, passed: int, latest: ConvergenceDiagnostics
 ) -> int:
-    """Predict the blocks at which a chain, judged at ``blocks``, will be long enough.
+    """Predict the number of blocks at which a chain, checked at ``blocks``, is long enough.
 
-    Effective draws grow with the steps. Once there are enough by that, a fifth more may bring what
-    else is missing. After the first check that ``passed``, at so many blocks, comes the second.
+    Effective draws grow with the steps. If they are enough already, a fifth more blocks may satisfy
+    the other requirements. The second check follows the first one that ``passed``, at so many
+    blocks.
     """
     fraction = 1.0 if passed else FIRST_PART
     with np.errstate(divide="ignore"):
-        draws = np.divide(latest.steps * plan.ess, latest.lowest_ess)  # of none, where none moves
+        draws = np.divide(latest.steps * plan.ess, latest.lowest_ess)  # by zero if none moves
         steps = np.maximum(draws, LENGTH * np.max(latest.autocorrelation))
     following = max(fraction * steps / plan.block, MIN_CHECK_GROWTH * passed)
     if not following > blocks:  # nan too
@@ -357,25 +357,25 @@ def _next_check(
 
 
 def _agree(draws: FloatArray) -> bool:
-    """Tell whether ensembles of a pilot (steps, ensembles, walkers, free) are at one place."""
+    """Tell whether ensembles of a pilot (steps, ensembles, walkers, free) agree."""
     return bool((nested_rhat(draws) < 1.1).all())
 
 
 def _accepted(history: Sequence[Sequence[Block]], move: str) -> float:
-    """Return which part of what a move proposed in blocks was accepted; 1 without any."""
+    """Return the acceptance rate of a move in blocks; 1 without proposals."""
     counts = [block.moves.get(move, (0, 0)) for blocks in history for block in blocks]
     proposed, accepted = np.sum(counts, axis=0) if counts else (0, 0)
     return float(accepted / proposed) if proposed else 1.0
 
 
 def _in_use(chain: Chain, phase: Phase, posterior: Posterior) -> StudentMixture | None:
-    """Return the proposal that a phase goes on with, its maps those of the posterior."""
+    """Return the proposal that a phase goes on with, with the posterior set in its maps."""
     proposal = chain.proposal_in_use(phase)
     return None if proposal is None else proposal.of_posterior(posterior)
 
 
 def _remarks(chain: Chain) -> tuple[str, ...]:
-    """Say what a user should know of the moves, and that a long chain is not used as a whole."""
+    """Return remarks for the user: on the moves, and on the thinning of a long chain."""
     remarks = []
     if chain.proposal_in_use("sampling") is None:
         remarks.append(

@@ -1,11 +1,12 @@
-"""Coordinates in which a record fixes what it shows: a model's mean slope and its mean level.
+"""Coordinates that a record determines: a model's mean slope and its mean level.
 
-Readings that leave the hysteresis open still tell how far the actuator moves, and about what: d
-less the slope of the hysteresis, the offset less its mean. With β far above 1/U the slope is none,
-with β far below it is α: so the posterior has legs along d, α, β and h₀, each a thousand times as
-long as wide and around a corner from the next. With slope and level in place of d and the offset
-all others are as free as the prior leaves them, and no leg has a corner. A :class:`SecantMap` takes
-slope and level from what a model does, which costs a simulation for each place.
+Readings that do not determine the hysteresis still determine the amplitude and the center of the
+motion: d less the slope of the hysteresis, the offset less its mean. With β far above 1/U that
+slope is zero, with β far below it is α: so the posterior has legs along d, α, β and h₀, each a
+thousand times as long as wide and around a corner from the next. With slope and level in place of d
+and the offset, all other parameters are as free as the prior leaves them, and no leg has a corner.
+A :class:`SecantMap` takes slope and level from a model's displacement, which costs a simulation for
+each place.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from bwbayes.inference.parameters import JointPrior
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
-# What a displacement is linear in, of every operator that has a gain.
+# Parameters that the displacement of every operator with a gain is linear in.
 LINEAR = "d", "offset"
 
 
@@ -30,21 +31,21 @@ LINEAR = "d", "offset"
 class SecantMap:
     """The map between coordinates x of the prior and those with secant gain and level, y.
 
-    With θ the free parameters, L those of them that are :data:`LINEAR`, and w(θ) the displacement
-    at the readings,
+    With the free parameters θ, the set L of those that are :data:`LINEAR`, and the displacement
+    w(θ) at the readings,
 
         t = θ_L + B⁺ (w(θ with θ_L = c) − w₀),   B = ∂w/∂θ_L,
 
-    c, B and w₀ those of the reference. y_L is t in the units of x there; other coordinates are
-    scores of θ under its prior, without bounds that others set to what is measured in um. t differs
-    from θ_L by what other parameters do: so this map keeps volumes, as far as priors do.
+    with c, B and w₀ of the reference. y_L is t in the units of x there; other coordinates are
+    scores of θ under its prior, without the bounds by other parameters on those measured in um. t
+    minus θ_L depends on the other parameters alone: so this map keeps volumes, as far as priors do.
 
     Parameters
     ----------
     reference
         The coordinates of a place in the posterior, (free,).
     posterior
-        What is sampled. A map read from a file has none, and maps nothing, until it is given one.
+        The sampled posterior. A map from a file has none, and cannot map until it is given one.
     """
 
     reference: FloatArray
@@ -64,7 +65,7 @@ class SecantMap:
     def inverse(self, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x (..., free) of y (..., free), and log |∂x/∂y| (...).
 
-        x is nan where no model is, whose d would be below α, say.
+        x is nan where no model exists, for instance with d below α.
         """
         y = whitened.reshape(-1, whitened.shape[-1]).copy()
         moved = (y[:, self._rows] - self.reference[self._rows]) * self._scale
@@ -91,12 +92,12 @@ class SecantMap:
 
     @cached_property
     def _rows(self) -> list[int]:
-        """Which of the free parameters are linear."""
+        """Indices of the free parameters that are linear."""
         return linear(self._known)
 
     @cached_property
     def _unbound(self) -> JointPrior:
-        """The prior without bounds that depend on others, of what is measured in um."""
+        """The prior without bounds by other parameters on those measured in um."""
         return JointPrior(
             replace(p, declared=replace(p.declared, bounds=None)) if p.unit[:2] == "um" else p
             for p in self._prior.parameters
@@ -110,7 +111,7 @@ class SecantMap:
 
     @cached_property
     def _readout(self) -> tuple[FloatArray, FloatArray]:
-        """B (readings, linear) and w₀ (readings,)."""
+        """The derivative B (readings, linear) and the displacement w₀ (readings,)."""
         steps = 0.01 * self._scale
         places = np.repeat(self._center[np.newaxis], 1 + len(steps), axis=0)
         places[1 + np.arange(len(steps)), self._rows] += steps
@@ -119,12 +120,12 @@ class SecantMap:
 
     @cached_property
     def _pseudoinverse(self) -> FloatArray:
-        """B⁺, (linear, readings)."""
+        """The pseudoinverse B⁺, (linear, readings)."""
         return np.linalg.pinv(self._readout[0])
 
     @cached_property
     def _scale(self) -> FloatArray:
-        """∂θ_L/∂x (linear,) at the reference."""
+        """The derivative ∂θ_L/∂x (linear,) at the reference."""
         center = self._center[np.newaxis]
         log_slopes = self._log_slopes(center, self._unbound.unconstrain(center))
         scale: FloatArray = np.exp(log_slopes[0])
@@ -146,7 +147,7 @@ class SecantMap:
         return stretch
 
     def _levels(self, free: FloatArray) -> FloatArray:
-        """Return B⁺ (w − w₀) (models, linear) of free parameters, the linear ones as at c."""
+        """Return B⁺ (w − w₀) (models, linear) of free parameters, with the linear ones at c."""
         places = free.copy()
         places[:, self._rows] = self._center[self._rows]
         size = max(1, (1 << 22) // len(self._readout[1]))  # displacements take memory
@@ -161,7 +162,7 @@ class SecantMap:
 
 
 def linear(posterior: Posterior) -> list[int]:
-    """Return which free parameters a displacement is linear in; none if there are more stages."""
+    """Return the indices of linear free parameters; none if the actuator has further stages."""
     rows = [row for row, p in enumerate(posterior.prior.free) if p.plain in LINEAR]
     if rows and any(dataset.actuator.stages for dataset in posterior.datasets):
         return []

@@ -1,8 +1,8 @@
 """The chain on disk: a folder of NumPy files that grows by one file a block.
 
-A file gets its name only when it is written, so that a process killed at any moment loses the block
-in hand and nothing else. The files are of NumPy's own format, whose members carry checksums: of a
-chain that a disk has damaged, what comes before the damage is used. This module alone knows them:
+A file gets its name only when it is written, so that a process killed at any moment loses the
+current block and nothing else. The files are of NumPy's own format, whose members carry checksums:
+if a disk has damaged a chain, the part before the damage is used. This module alone uses the files:
 
     start.npz                        starts of the ensembles, the point fit, the pilot's proposal,
                                      and what was run, as JSON
@@ -12,9 +12,9 @@ chain that a disk has damaged, what comes before the damage is used. This module
     set-aside.npz                    how many blocks of the sampling were set aside, and the
                                      proposal that was fitted to them
 
-Beside the folder stands ``chain.h5``: what counts of the sampling so far, as emcee stores it, one
-group an ensemble. ``emcee.backends.HDFBackend("chain.h5", name="ensemble_1")`` opens it, during a
-run and after it. It is written anew at each check of the chain, and read by nothing here.
+Beside the folder stands ``chain.h5``: the draws that count so far, in emcee's format, with a group
+for each ensemble. ``emcee.backends.HDFBackend("chain.h5", name="ensemble_1")`` opens it, during a
+run and after it. It is rewritten at each check of the chain, and nothing in the package reads it.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ Arrays = Mapping[str, Any]
 class ChainFile(Chain):
     """A chain that is written to files as it grows.
 
-    Open one with :meth:`create` or :meth:`resume`. One process may write it; that is for the caller
-    to see to (a run locks its folder). Readers need no permission: see :meth:`read`.
+    Open one with :meth:`create` or :meth:`resume`. Only one process may write it; the caller has to
+    ensure that (a run locks its folder). Any process may read it: see :meth:`read`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class ChainFile(Chain):
         Raises
         ------
         InputError
-            It is missing, or damaged where it says what it is.
+            It is missing, or its description is damaged.
 
         Warns
         -----
@@ -114,7 +114,7 @@ class ChainFile(Chain):
             load = partial(_load, path)
             chain = cls._begun(path, load("start"))
             chain._read_blocks(load)
-        except Exception as error:  # a damaged file fails in whatever way its reader stumbles
+        except Exception as error:  # a damaged file may raise any exception
             damage = one_line(str(error)) or type(error).__name__
             if chain is None:
                 raise InputError(
@@ -134,10 +134,10 @@ class ChainFile(Chain):
     def resume(
         cls, path: Path, check: Callable[[Mapping[str, str | int]], None] | None = None
     ) -> ChainFile:
-        """Read a chain to go on with, from the last block that counts.
+        """Read a chain to resume it from the last block that counts.
 
         ``check`` is given the attributes first, and may refuse them: the files then stay as they
-        are. What comes after a damage is deleted.
+        are. Blocks after a damaged one are deleted.
 
         Raises
         ------
@@ -162,11 +162,11 @@ class ChainFile(Chain):
         return chain
 
     def attributes(self) -> dict[str, str | int]:
-        """Return what was run: config, versions, platform, seed, hash of the data."""
+        """Return the facts of the run: config, versions, platform, seed, hash of the data."""
         return dict(self._attributes)
 
     def append(self, phase: Phase, blocks: Sequence[Block]) -> None:
-        """Add the next block of every ensemble; when this returns it is on the disk.
+        """Add the next block of every ensemble; it is on the disk when this returns.
 
         Raises
         ------
@@ -195,7 +195,7 @@ class ChainFile(Chain):
         super().fall_back(blocks, refit)
 
     def publish(self) -> None:
-        """Write the draws that count, so far, as emcee's ``HDFBackend`` does, to ``chain.h5``.
+        """Write the draws that count so far to ``chain.h5``, in the format of ``HDFBackend``.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class ChainFile(Chain):
                         group.attrs[f"random_state_{row}"] = element
                     for name, series in (("chain", coordinates), ("log_prob", log_density)):
                         values = series[:, number]
-                        # Not of a fixed length: emcee's sampler may go on with it.
+                        # The data sets can grow: emcee's sampler may go on with them.
                         group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]))
                     group["accepted"] = accepted[number].astype(np.float64)
             draft.replace(file)
@@ -248,7 +248,7 @@ class ChainFile(Chain):
         return chain
 
     def _read_blocks(self, load: Callable[[str], Arrays | None]) -> None:
-        """Read what is there, in its order; the set aside last, since it is of blocks."""
+        """Read the existing files in their order; the one about blocks set aside comes last."""
         for phase in PHASES:
             if (arrays := load(f"{phase}-proposal")) is not None:
                 Chain.freeze(self, phase, StudentMixture.of_arrays(arrays))
@@ -269,7 +269,7 @@ class ChainFile(Chain):
                 ]
                 Chain.append(self, phase, blocks)
         aside = load("set-aside")
-        # Blocks are lost from the end: then all that are left count again.
+        # If blocks at the end are lost, all remaining ones count again.
         if aside is not None and aside["blocks"] <= len(self.history("sampling")):
             Chain.fall_back(self, int(aside["blocks"]), StudentMixture.of_arrays(aside))
 
