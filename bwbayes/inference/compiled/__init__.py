@@ -1,9 +1,9 @@
-"""The likelihood on the compiled engine: the same numbers as with NumPy, ten times faster.
+"""Likelihood on the compiled engine: the same numbers as with NumPy, ten times faster.
 
 Coefficients of the dynamics and of the noise's filter come from the same functions that the NumPy
-likelihood uses; :mod:`~bwbayes.inference.compiled.kernels` walks through the samples. Operators
-with a compiled stage (:mod:`~bwbayes.inference.compiled.stages`) are walked through with it; for
-others the drive comes from NumPy, and the rest of the work is compiled still.
+likelihood uses; :mod:`~bwbayes.inference.compiled.kernels` goes through the samples. Operators with
+a compiled stage (:mod:`~bwbayes.inference.compiled.stages`) run on it; for others the drive comes
+from NumPy, and the rest of the work is still compiled.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 __all__ = ["products", "warm_up", "whiten"]
 
-# States of the noise that the lanes hold; more are filtered by :mod:`whitening` alone.
+# Largest number of noise states that the lanes hold; :mod:`whitening` filters noise with more.
 LANE_STATES = 2
 
 
 def warm_up(posterior: Posterior) -> None:
-    """Simulate and whiten one model, which compiles what :func:`products` does not need.
+    """Simulate and whiten one model, to compile functions that :func:`products` does not need.
 
-    What one process has compiled is there for others, such as one that is at the products.
+    Functions that one process has compiled are cached for others, such as one at the products.
     """
     prior, likelihood = posterior.prior, posterior.likelihoods[0]
     center, _ = prior.constrain(np.zeros((1, prior.dimensions)))
@@ -48,12 +48,12 @@ def products(
 ) -> tuple[FloatArray, FloatArray]:
     """Return Σ zᵢ zⱼ of whitened series, and log determinants, as the NumPy likelihood does.
 
-    At θ (models, parameters) inside the model's domain: (models, series, series) and (models,).
+    They are (models, series, series) and (models,), at θ (models, parameters) inside the domain.
     ``displacement`` is as in :meth:`~bwbayes.inference.likelihood.Likelihood.score`.
     """
     actuator, noise, gaps = likelihood.actuator, likelihood.spaced, likelihood.gaps
     readings, is_known = likelihood.readings, displacement is not None
-    # Where readings are few, to pass over all samples takes longer than to whiten the readings.
+    # If readings are few, a pass over all samples takes longer than whitening the readings.
     if noise.states > LANE_STATES or (is_known and 2 * readings.rows.size < readings.samples):
         return likelihood.products_of_series(theta, np.empty((0, readings.rows.size)), displacement)
     voltage = likelihood.inputs_read.voltage
@@ -66,7 +66,7 @@ def products(
     unknowns = offset, free - slow, slow
     sums = np.empty((lanes.SUMS, len(theta)))
     record, sections = (voltage, likelihood.values, gaps), actuator.sections(column)
-    # What is simulated beforehand only follows here.
+    # A displacement that is simulated beforehand only passes the filter here.
     simulates = bool(actuator.stages) or is_known
     core, make = (actuator.linear, simulated) if simulates else (actuator, physics)
     together = shared(core, voltage)
@@ -94,14 +94,14 @@ def whiten(
     gaps: tuple[FloatArray, IntArray],
     sensor: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what :meth:`~bwbayes.inference.state_space.Noise.whiten` does, of a noise with states.
+    """Whiten as :meth:`~bwbayes.inference.state_space.Noise.whiten` does, for noise with states.
 
-    Arguments as there: θ (models, parameters) of the noise, series (models, series, readings), um;
-    and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
+    The arguments are the same: θ (models, parameters) of the noise, series (models, series,
+    readings), um; and the readings' gaps (:attr:`~bwbayes.inference.readings.Readings.gaps`).
     """
     steps = [_step(noise, theta, 1.0 + number) for number in gaps[0].tolist()]
     transitions, gained = (np.stack(matrices) for matrices in zip(*steps, strict=True))
-    # Each layout of an array would be compiled by itself.
+    # Numba would compile the function for each layout of an array.
     return whitening.whitened(
         transitions, gained, noise.stationary(theta), noise.observe,
         np.ascontiguousarray(theta[:, :1] ** 2 if sensor is None else sensor), gaps[1],
@@ -114,11 +114,12 @@ def _filtering(
 ) -> tuple[dict[str, FloatArray], bool | None, FloatArray]:
     """Return the filter's usual step and the variances, (models,), by the names of ``PARAMETERS``.
 
-    Then whether there is a second state, what is None being left out when it is compiled, and the
-    steps over all gaps but the first, which misses none, side by side (models, gaps times rows).
+    Also returns whether there is a second state, None for no, which leaves it out of the compiled
+    code, and the steps over all gaps but the first, which misses no reading, side by side (models,
+    gaps times rows).
 
-    The lanes see the first of two states alone, which have a stationary covariance of one size:
-    other states x are turned into T x.
+    The lanes observe the first of two states alone, whose stationary covariance is a multiple of
+    the unit matrix: other states x are turned into T x.
     """
     stationary, observe, states = noise.stationary(theta), noise.observe, noise.states
     variance = observe @ stationary @ observe
@@ -179,9 +180,9 @@ def _over_gaps(steps: FloatArray) -> FloatArray:
 def _staged(
     likelihood: Likelihood, column: Values, voltage: FloatArray, displacement: FloatArray | None
 ) -> Iterator[tuple[IntArray | slice, CompiledDrive]]:
-    """Yield which models go together, and the stage that makes their drive.
+    """Yield groups of models, and the stage that makes their drive.
 
-    That is the ``displacement`` where it is known.
+    A known ``displacement`` takes the place of the drive.
     """
     actuator, from_rest = likelihood.actuator, likelihood.from_rest
     if displacement is not None:
@@ -200,7 +201,7 @@ def _staged(
     if stage is not None:
         yield slice(None), stage
         return
-    # Elements (models x samples) of the drive that is worked out beforehand, at a time.
+    # Limit the elements (models x samples) of the drive that are worked out at a time.
     size = max((1 << 23) // voltage.size, 1)
     for rows in (others[i : i + size] for i in range(0, others.size, size)):
         values = {name: column[name][rows] for name in actuator.parameters}

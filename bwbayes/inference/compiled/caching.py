@@ -1,7 +1,7 @@
-"""Compile and keep what is compiled on disk, where a place can be written.
+"""Compilation with a cache on disk, if one can be written.
 
-numba looks for changes in the file of the function that is called alone, and has compiled into it
-what other files say. So what is kept is named after all sources that may be compiled in.
+numba looks for changes only in the file of the function that is called, but compiles functions of
+other files into it. So the name of a cached function contains a digest of all these sources.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ SOURCES = _digest()
 
 
 def compile_cached[Function: Callable[..., Any]](**options: Any) -> Callable[[Function], Function]:
-    """Return numba's decorator with a cache; without one, and a warning, if none can be written."""
+    """Return numba's decorator with a cache; if none can be written, without one, and warn."""
 
     def decorate(function: Function) -> Function:
         name = function.__qualname__
         try:
-            function.__qualname__ = f"{name}-{SOURCES}"  # numba names what it keeps after it
+            function.__qualname__ = f"{name}-{SOURCES}"  # numba names the cached code after it
             return cast("Function", njit(nogil=True, cache=True, **options)(function))
         except RuntimeError as error:
             if "cannot cache" not in str(error):
                 raise
         finally:
             function.__qualname__ = name
-        # At one place for all functions, so that it is shown once.
+        # Warn at one place for all functions, so that the warning is shown once.
         warnings.warn(
             "numba: no cache can be written, so that every process compiles anew; set "
             "NUMBA_CACHE_DIR to a writable folder",

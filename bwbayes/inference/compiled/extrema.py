@@ -1,8 +1,8 @@
-"""The stage of operators that remember extrema: each brings its Everett function alone.
+"""The stage of operators that remember extrema: each provides its Everett function alone.
 
-One model after the other, each with a stack of its own: the voltages of the extrema that still
-count, and the displacements there. What lies between two changes of that stack is one branch, whose
-samples are worked out together.
+Models are worked out one after the other, each with a stack: the voltages of the extrema that still
+count, and the displacements there. The samples between two changes of that stack are one branch and
+are worked out together.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from bwbayes.inference.compiled.lanes import LANES
 from bwbayes.model.compiled import formula
 from bwbayes.model.operators.extremum_memory import Memory, RemembersExtrema
 
-# Rows: a model's number in the plan, w₀, w of the last sample, the direction, how many extrema
-# there are; then the voltages of these, and the displacements there.
+# Rows: a model's number in the plan, w₀, w of the last sample, the direction, the number of
+# extrema; then the voltages of the extrema, and the displacements there.
 FIXED = 5
 NUMBER, REST, LAST, SIGN, DEPTH, STACK = (LANES * row for row in range(FIXED + 1))
 
 
 def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
-    """Return what the stage starts from, (models, rows), w₀ second; its plan are the numbers."""
+    """Return the stage's initial rows, (models, rows), with w₀ second; its plan are the numbers."""
     models, extrema = memory.displacement.size, memory.extrema
     slots = deepest(voltage, np.array([extremum.voltage for extremum in extrema]), memory.direction)
     group = np.zeros((models, FIXED + 2 * slots))
@@ -37,9 +37,9 @@ def rows(voltage: FloatArray, memory: Memory) -> FloatArray:
 
 @compile_cached()
 def deepest(voltage: FloatArray, levels: FloatArray, direction: float) -> int:
-    """Return how many extrema are remembered at most: the largest ones that models have, at first.
+    """Return the largest number of extrema in memory, from the models' largest initial extrema.
 
-    A lower one is forgotten earlier.
+    A lower extremum is forgotten earlier.
     """
     stack = np.empty(levels.size + voltage.size)
     stack[: levels.size] = levels
@@ -61,7 +61,7 @@ def deepest(voltage: FloatArray, levels: FloatArray, direction: float) -> int:
 def _closing(stack: FloatArray, depth: int, s: float) -> float:
     """Return the voltage at which the branch from the last extremum is forgotten, V, times s.
 
-    As :meth:`RemembersExtrema.advance` has it.
+    It is the same as in :meth:`RemembersExtrema.advance`.
     """
     if depth == 1:
         return np.inf
@@ -71,7 +71,7 @@ def _closing(stack: FloatArray, depth: int, s: float) -> float:
 
 @compile_cached()
 def _remaining(stack: FloatArray, depth: int, s: float, u: float) -> int:
-    """Return how many extrema remain once a voltage has come to u in direction s."""
+    """Return the number of extrema that remain once a voltage has reached u in direction s."""
     while s * u >= _closing(stack, depth, s):
         depth -= 2 if depth > 2 else 1
     return depth
@@ -79,7 +79,7 @@ def _remaining(stack: FloatArray, depth: int, s: float, u: float) -> int:
 
 @compile_cached()
 def _ends(voltage: FloatArray, first: int, last: int) -> IntArray:
-    """Return, for samples ``first`` to ``last`` that the voltage moves to, where it turns next."""
+    """Return the index of the voltage's next reversal, for samples ``first`` to ``last``."""
     ends = np.full(last - first, last)
     direction, following = 0.0, last
     for t in range(last - 1, max(first, 1) - 1, -1):
@@ -144,7 +144,7 @@ def _branch(
     voltage: FloatArray,
     w: FloatArray,
 ) -> None:
-    """Write w along a branch from an extremum on; along the first one it moves half as far."""
+    """Write w along a branch from an extremum on; on the first branch it moves half as far."""
     first = depth == 1
     half_step = 0.5 * s if first else s
     for t in range(voltage.size):

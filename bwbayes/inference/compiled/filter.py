@@ -1,13 +1,14 @@
 """The noise's Kalman filter for ``LANES`` models side by side, and the sums its density needs.
 
-Most of a record passes :func:`follow`: each sample has a reading, and the filter has settled. Where
-readings are missing, or it has not settled, or still hears of the start of the dynamics, readings
-pass :func:`gain` and :func:`innovate`. Where ``second`` is None, the second state of the noise is
-left out when it is compiled.
+Most of a record passes :func:`follow`: each sample has a reading, and the filter has settled. If
+readings are missing, or the filter has not settled, or the initial state of the dynamics still
+affects it, readings pass :func:`gain` and :func:`innovate`. If ``second`` is None, the second state
+of the noise is left out of the compiled code.
 
-An offset never dies out, and the slowest lags of the creep hardly do. But a response r that keeps
-the part ρ of itself from reading to reading has, once the filter has settled and forgotten how r
-began, estimates c r and c₂ r, so that its innovation is (1 − c) r: nothing is filtered for it then.
+An offset never dies out, and the slowest lags of the creep hardly do. But consider a response r
+that keeps the part ρ of itself from reading to reading. Once the filter has settled and forgotten
+the start of r, the estimates are c r and c₂ r, so that its innovation is (1 − c) r, and r needs no
+filter.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ def follow(
     decays: FloatArray,
     series: IntArray,
 ) -> None:
-    """Let a filter that has settled go on along readings (samples,) that are all there.
+    """Advance a settled filter along complete readings (samples,).
 
-    ``displacement`` is that of the models. ``decays`` is ρ of each response that is heard still,
-    and ``series`` says which they are: as their innovations follow them, only Σ ρᵗ η of the
+    ``displacement`` is that of the models. ``decays`` is ρ of each response that still matters, and
+    ``series`` are their indices: as their innovations are in proportion to them, only Σ ρᵗ η of the
     residual's innovations η has to be added up.
     """
     count = series.size
@@ -86,9 +87,10 @@ def _fold(
     decays: FloatArray,
     series: IntArray,
 ) -> None:
-    """Add what a number of samples brought to the products, and move the responses on.
+    """Add the contributions of some samples to the products, and advance the responses.
 
-    ``weight`` is what remains of each response after them; products of two are geometric sums.
+    ``weight`` is the part of each response that remains after them; products of two are geometric
+    sums.
     """
     count = series.size
     for k in range(count):
@@ -122,7 +124,7 @@ def _fold(
 
 @inner(error_model="numpy")
 def _parts(state: FloatArray, second: bool | None, i: int, rho: float) -> tuple[float, float]:
-    """Return c and c₂, the estimates of a response that keeps ρ of itself, over the response."""
+    """Return c and c₂, the ratios of both estimates to a response that keeps ρ of itself."""
     gain, first = float(state[GAIN + i]), rho - state[F + i]
     if second is None:
         return gain / (first + gain), 0.0
@@ -136,7 +138,7 @@ def _parts(state: FloatArray, second: bool | None, i: int, rho: float) -> tuple[
 def is_tracked(
     state: FloatArray, second: bool | None, decays: FloatArray, series: IntArray
 ) -> bool:
-    """Tell whether the estimates of all those responses only follow them, to their rounding."""
+    """Tell whether the estimates of all these responses are proportional to them, to rounding."""
     for k in range(series.size):
         at = series[k] * LANES
         for i in range(LANES):
@@ -152,7 +154,7 @@ def is_tracked(
 
 @inner()
 def is_settled(state: FloatArray) -> bool:
-    """Tell whether no model's covariance changed by the last reading, but for rounding."""
+    """Tell whether the last reading changed no model's covariance, except for rounding."""
     settled = True
     for i in range(LANES):
         settled &= state[CHANGE + i] <= 2e-15 * state[COVARIANCE + i]
@@ -169,14 +171,14 @@ def gain(
     gains_2: FloatArray,
     inverse: FloatArray,
 ) -> None:
-    """Take the covariance along samples (samples,), and write both gains and 1/variance of each.
+    """Advance the covariance along samples (samples,); write both gains and 1/variance of each.
 
     ``gaps`` and ``steps`` are as in :func:`bwbayes.inference.compiled.kernels.sums`, the others
     (samples times lanes,). Where there is no reading, nothing is written.
     """
     for t in range(gaps.size):
         if gaps[t] > 0:
-            # Over the missing readings by the filter's step over them.
+            # Predict over the missing readings by the filter's step over this gap.
             over = steps[gaps[t] - 1]
             _take_logs(state)
             for i in range(over.size):
@@ -204,10 +206,10 @@ def innovate(
     other: FloatArray,
     values: FloatArray,
 ) -> None:
-    """Turn a series' values, (samples times lanes,), into innovations, 0 where no reading is.
+    """Turn a series' values, (samples times lanes,), into innovations, 0 without a reading.
 
     ``step`` is the filter's step from reading to reading, ``estimate`` and ``other`` (lanes,) are
-    what it expects of both states of the noise. All arrays are apart, so that a compiler may take
+    its estimates of both states of the noise. All arrays are separate, so that a compiler may take
     several lanes at once.
     """
     for t in range(gaps.size):
@@ -237,7 +239,7 @@ def innovate(
 
 @inner(error_model="numpy")
 def _advance(state: FloatArray, second: bool | None) -> None:
-    """Take the covariance to the next reading, with the gain of this one on the way."""
+    """Advance the covariance to the next reading, and write the gain of this one."""
     for i in range(LANES):
         p, sensor = state[COVARIANCE + i], state[SENSOR + i]
         variance = p + sensor
@@ -254,7 +256,7 @@ def _advance(state: FloatArray, second: bool | None) -> None:
             state[GAIN_2 + i] = state[F_22 + i] * g_2 + state[F_21 + i] * g
             state[COVARIANCE + i], state[COVARIANCE_12 + i] = p * remainder, across * remainder
             state[COVARIANCE_22 + i] -= across * g_2
-        # What it was, to be held against.
+        # Keep the former covariance for a comparison.
         state[CHANGE + i] = p
     _predict(state, second, F)
     for i in range(LANES):
@@ -263,7 +265,7 @@ def _advance(state: FloatArray, second: bool | None) -> None:
 
 @inner(error_model="numpy")
 def _predict(state: FloatArray, second: bool | None, step: int) -> None:
-    """Take the covariance on by a step, whose rows begin there."""
+    """Advance the covariance by a step, whose rows begin at ``step``."""
     for i in range(LANES):
         a, p = state[step + i], state[COVARIANCE + i]
         gained = state[step + 4 * LANES + i]
@@ -290,7 +292,7 @@ def _take_logs(state: FloatArray) -> None:
 
 @inner()
 def gather(state: FloatArray, readings: int) -> None:
-    """Add to the sums what so many readings with one variance brought."""
+    """Add the contributions of so many readings with one variance to the sums."""
     if readings == 0:
         return
     for i in range(LANES):

@@ -1,9 +1,9 @@
 """The compiled likelihood's loop: one pass over the samples for a group of models side by side.
 
-What :mod:`bwbayes.model` and :mod:`bwbayes.inference.state_space` do with arrays is done here
-sample by sample, for ``LANES`` models at once, so that a processor's vector instructions take
-several models a step and nothing larger than a cache is written. A few dozen samples at a time pass
-three stages:
+The loop does the work of :mod:`bwbayes.model` and :mod:`bwbayes.inference.state_space` sample by
+sample instead of by arrays, for ``LANES`` models at once, so that a processor's vector instructions
+take several models a step and nothing larger than a cache is written. A few dozen samples at a time
+pass three stages:
 
     drive         the hysteresis (:mod:`bwbayes.inference.compiled.stages`)
     displacement  nonlinearity, linear dynamics, creep (:mod:`bwbayes.inference.compiled.motion`)
@@ -47,11 +47,11 @@ def _one_by_one(
     free: int,
     work: FloatArray,
 ) -> None:
-    """Let the filter take the readings of samples one by one, with all responses of the start.
+    """Filter the readings of samples one by one, with all responses to the initial state.
 
     ``work`` (3 + SERIES, samples times lanes) is room for gains and innovations.
     """
-    # Whole rows, which a compiler can tell to lie without gaps.
+    # Take whole rows, which a compiler knows to be contiguous.
     gain, gain_2, inverse = work[0], work[1], work[2]
     noise.gain(state, second, gaps, steps, gain, gain_2, inverse)
     step = state[F : F + 4 * LANES]
@@ -68,7 +68,7 @@ def _one_by_one(
             a1, a2 = state[A1 : A1 + LANES], state[A2 : A2 + LANES]
             _respond(gaps.size, a1, a2, response, later, values)
         else:
-            # A slow response of the creep keeps a part of itself, and nothing of what was before.
+            # A slow response of the creep keeps a part of itself, and nothing of the sample before.
             keeping[:] = -lags[k - 1 - offset - free, 2]
             _respond(gaps.size, keeping, nothing, response, later, values)
         estimate = state[ESTIMATE + at : ESTIMATE + at + LANES]
@@ -81,7 +81,7 @@ def _one_by_one(
 
 @inner()
 def _subtract(displacement: FloatArray, simulated: FloatArray, residual: FloatArray) -> None:
-    """Write readings (samples,) less what models do (samples times lanes,)."""
+    """Write readings (samples,) less the models' displacement (samples times lanes,)."""
     for t in range(displacement.size):
         row = t * LANES
         for i in range(LANES):
@@ -97,7 +97,7 @@ def _respond(
     later: FloatArray,
     values: FloatArray,
 ) -> None:
-    """Write a free response along samples (samples times lanes,), and move it on (lanes,)."""
+    """Write a free response along samples (samples times lanes,), and advance it (lanes,)."""
     for t in range(samples):
         row = t * LANES
         for i in range(LANES):
@@ -121,11 +121,11 @@ def _add_products(
 
 @inner()
 def _is_heard(state: FloatArray, series: int) -> bool:
-    """Tell whether any model's filter still hears of the unknown start in one of its series.
+    """Tell whether the unknown initial state still matters to any model in one of its series.
 
-    What is below 10⁻¹⁸ of its size at the start adds nothing. What a model no longer hears is
-    nothing from now on: numbers that decay for ever come below the normal ones, with which a
-    processor takes ten times as long.
+    A response below 10⁻¹⁸ of its initial size adds nothing. A response that no longer matters is
+    set to zero: numbers that decay for ever become subnormal, with which a processor takes ten
+    times as long.
     """
     has_reading = False
     for i in range(series * LANES, (series + 1) * LANES):
@@ -141,7 +141,7 @@ def _is_heard(state: FloatArray, series: int) -> bool:
 
 @inner()
 def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
-    """Put all that a model remembers to the record's first sample."""
+    """Set the memory of all models to the record's first sample."""
     for i in range(len(PARAMETERS) * LANES, STATE):
         state[i] = 0.0
     for i in range(LANES):
@@ -160,7 +160,7 @@ def _begin(state: FloatArray, offset: int, free: int, slow: int) -> None:
 
 @inner()
 def _copy(values: FloatArray, row: FloatArray) -> None:
-    """Write values to the beginning of a row: a slice's shape would be checked, by much code."""
+    """Write values to the beginning of a row: a slice would need much code to check its shape."""
     for i in range(values.size):
         row[i] = values[i]
 
@@ -191,48 +191,49 @@ def sums(
     free: int,
     slow: int,
 ) -> FloatArray:
-    """Return what the noise's density needs, (SUMS, lanes of all groups).
+    """Return the sums that the noise's density needs, (SUMS, lanes of all groups).
 
-    First Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of series:
-    the residual (um), the offset's response if ``offset`` is one, ``free`` free responses of the
-    dynamics and ``slow`` ones of the creep. Then Σ log S, less that of Q₁₁ + s².
+    The first are Σ eᵢ eⱼ / S of the innovations e and their variances S, for the pairs i ≥ j of
+    series: the residual (um), the offset's response if ``offset`` is one, ``free`` free responses
+    of the dynamics and ``slow`` ones of the creep. The last is Σ log S, less that of Q₁₁ + s².
 
     Parameters
     ----------
     voltage, displacement
         (samples,), V and um.
     gaps
-        (samples,) which of the gaps is just before a reading: −1 where there is no reading, 0 if
-        none is, else its number.
+        (samples,) index of the gap just before a reading: −1 at a sample without a reading, 0
+        without a gap.
     models, steps
         (groups, lanes times parameters), in the order of ``PARAMETERS``, and (groups, gaps, lanes
         times rows) of the filter's step over each gap, as from ``F`` on.
     second
         None unless the noise has two states.
     kind, groups, plan
-        The stage that makes the drive, what models are in it (groups, lanes times rows), and what
-        it knows of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
+        The stage that makes the drive, its rows of the models (groups, lanes times rows), and its
+        plan of the voltage, as in :mod:`bwbayes.inference.compiled.stages`.
     curve, lags, growth
         Constants of nonlinearity and creep, as in :mod:`bwbayes.inference.compiled.motion`.
     """
     result, state = np.empty((SUMS, len(models) * LANES)), _aligned(STATE)
     group, drive = _aligned(groups.shape[1]), _aligned(PIECE * LANES)
     work = np.empty((3 + SERIES, PIECE * LANES))
-    # Responses that stay: the offset, and those of the creep that are heard still.
+    # Responses that remain: the offset, and those of the creep that still matter.
     decays, series = np.ones(offset + slow), np.ones(offset + slow, dtype=np.int64)
     for number in range(len(models)):
         _copy(models[number], state)
         _copy(groups[number], group)
         _begin(state, offset, free, slow)
-        # Not literals, for which numba would compile all that follows for a second time.
+        # Avoid literals, for which numba would compile the rest for a second time.
         now, pending = int(np.int64(0)), int(np.int64(0))
         staying, steady = 0, False
         while now < voltage.size:
-            # Short until the filter has settled and forgotten the start, as it is asked after each.
+            # Pieces are short until the filter has settled and forgotten the initial state, which
+            # is checked after each.
             last = min(now + (PIECE if steady else 32), voltage.size)
             complete = steady and gaps[now] == 0
             if complete:
-                # As far as every sample has a reading.
+                # End the piece at the first sample without a reading.
                 end = now
                 while end < last and gaps[end] == 0:
                     end += 1
@@ -272,10 +273,10 @@ def sums(
 
 
 def compile_common() -> bool:
-    """Compile what :func:`sums` needs of every operator, with a noise of one state.
+    """Compile the functions that :func:`sums` needs for every operator, with a noise of one state.
 
-    What one process has compiled is there for others, such as one that compiles the operator.
-    Returns whether all was there already.
+    Functions that one process has compiled are cached for others, such as one that compiles the
+    operator. Returns whether all were cached already.
     """
     flat, table, integers = float64[::1], float64[:, ::1], int64[::1]
     _begin.compile((flat, int64, int64, int64))

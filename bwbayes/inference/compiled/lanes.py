@@ -1,8 +1,8 @@
-"""The layout of the compiled likelihood's state: what each model is, and what it remembers.
+"""Layout of the compiled likelihood's state: the numbers of each model, and its memory.
 
 The state of ``LANES`` models is one flat array of rows of ``LANES`` numbers, because a compiler can
-tell that rows of one array do not overlap. Each name here is where a row begins. Numba freezes
-these numbers into what it compiles, so whoever changes them deletes what it has cached.
+tell that rows of one array do not overlap. Each name here is the offset of a row. Numba freezes
+these numbers into the compiled code, so delete its cache after a change of them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bwbayes.model.creep import MOST_TIMES
 
 
 def inner(**options: Any) -> Any:
-    """Compile what compiled functions alone call, without what Python would call it by."""
+    """Compile a function that only compiled functions call, without the wrappers for Python."""
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return compile_cached(**options)
 
@@ -26,7 +26,7 @@ def inner(**options: Any) -> Any:
 # Models side by side: four vector registers of eight numbers, which hide each other's latency.
 LANES = 32
 
-# Rows of the state. First what a model is, in the order of `PARAMETERS`, then what it remembers.
+# Rows of the state: the numbers of a model in the order of `PARAMETERS`, then its memory.
 PARAMETERS = (
     "level", "b0", "b1", "b2", "a1", "a2",
     "f_11", "f_12", "f_21", "f_22", "q_11", "q_12", "q_22", "stationary", "sensor",
@@ -42,8 +42,8 @@ PARAMETERS = (
     STRENGTH,
 ) = (LANES * row for row in range(len(PARAMETERS) - MOST_TIMES + 1))  # fmt: skip
 
-# The filter's step over a gap, as from `F` on; states of the dynamics; covariance and gains of
-# the filter, and the sums of a piece.
+# The filter's step over a gap, in the order of the rows from `F` on; states of the dynamics;
+# covariance and gains of the filter, and the sums of a piece.
 STEP = 7
 MEMORY = STEP + 14 + MOST_TIMES
 (
@@ -54,8 +54,8 @@ MEMORY = STEP + 14 + MOST_TIMES
 )  # fmt: skip
 
 # The series that are filtered: the residual, the record's own offset, two free responses of the
-# dynamics, those of the creep. Each has a value, estimates of both states of the noise, an
-# innovation; the responses two numbers that their recursion keeps.
+# dynamics, those of the creep. Each has a value, estimates of both states of the noise and an
+# innovation; a response also has the two numbers of its recursion.
 SERIES = 4 + MOST_TIMES
 VALUE, ESTIMATE, ESTIMATE_2, INNOVATION, RESPONSE, RESPONSE_2 = (
     LANES * (len(PARAMETERS) + MEMORY + SERIES * row) for row in range(6)
@@ -71,7 +71,7 @@ STATE = PRODUCTS + LANES * PAIRS
 
 
 def by_rows(named: Mapping[str, FloatArray], size: int = len(PARAMETERS)) -> FloatArray:
-    """Return models (models, size) of what is known by the names of `PARAMETERS`; others are 0."""
+    """Return models (models, size) with values by the names of `PARAMETERS`; others are 0."""
     models = np.zeros((max(values.size for values in named.values()), size))
     for name, values in named.items():
         models[:, PARAMETERS.index(name)] = values
@@ -81,7 +81,7 @@ def by_rows(named: Mapping[str, FloatArray], size: int = len(PARAMETERS)) -> Flo
 def in_lanes(models: FloatArray) -> FloatArray:
     """Put models (..., models, rows) side by side, (..., groups, rows times lanes).
 
-    Lanes to spare repeat the last model.
+    Spare lanes repeat the last model.
     """
     *others, count, rows = models.shape
     if spare := -count % LANES:

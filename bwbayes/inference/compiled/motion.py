@@ -1,8 +1,8 @@
-"""From the operator's drive to the displacement, for ``LANES`` models side by side.
+"""Displacement from the operator's drive, for ``LANES`` models side by side.
 
-The nonlinearity adds to the drive, the dynamics follow it, and the lags of the creep beside them.
-All of them see the drive's distance from that of the first sample, at which they may have been at
-rest.
+The nonlinearity adds to the drive, and the dynamics and the lags of the creep follow it. The input
+of all of them is the drive's difference from that of the first sample, at which they may have been
+at rest.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PIECE = 64
 
 
 def shared(actuator: Actuator, voltage: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what :func:`displace` takes of nonlinearity and creep for all models alike."""
+    """Return the arguments of :func:`displace` for nonlinearity and creep that all models share."""
     curve, lags, growth = np.empty((0, 2)), np.empty((0, 3)), np.zeros(voltage.size)
     if actuator.nonlinearity is not None:
         x = actuator.nonlinearity.scaled(voltage)
@@ -50,7 +50,7 @@ def physics(
     equilibrium: FloatArray,
     voltage: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return what models (models,) are without a noise, by the names of ``PARAMETERS``.
+    """Return the numbers of models (models,) without a noise, by the names of ``PARAMETERS``.
 
     ``sections`` are the actuator's; ``equilibrium`` (models,) is w₀ without nonlinearity, um.
     """
@@ -73,16 +73,16 @@ def physics(
 
 
 def simulated(
-    actuator: Actuator,  # noqa: ARG001  # all that it does is done
+    actuator: Actuator,  # noqa: ARG001  # its work is done
     sections: Sections,
     column: Values,  # noqa: ARG001
     first: FloatArray,
     voltage: FloatArray,  # noqa: ARG001
 ) -> dict[str, FloatArray]:
-    """Return the same of models whose displacement is known, and ``first`` (models,) of it, um.
+    """Return the same for models with a known displacement; ``first`` (models,) is its start, um.
 
-    It passes dynamics whose numerator is their denominator, which leave it as it is; free responses
-    go on by the denominator alone.
+    The displacement passes dynamics whose numerator is their denominator, which leave it as it is;
+    free responses use the denominator alone.
     """
     dynamics, rows = sections.recursions[0], {"level": first, "b0": np.ones_like(first)}
     rows |= dict(zip(("b1", "b2"), dynamics.denominator.T[1:], strict=False))
@@ -102,11 +102,11 @@ def displace(
     last: int,
     drive: FloatArray,
 ) -> None:
-    """Put the displacement where the drive's distance from rest is, of samples first to last.
+    """Replace the drive's difference from rest by the displacement, at samples first to last.
 
-    ``curve`` (samples, 2) are x² − x₀² and x³ − x₀³ of the nonlinearity, or empty; ``lags`` (times,
-    3) each lag's two coefficients of the drive and the part that it keeps of itself; ``growth``
-    (samples,) is |u| / U, or zero.
+    ``curve`` (samples, 2) holds x² − x₀² and x³ − x₀³ of the nonlinearity, or is empty; ``lags``
+    (times, 3) holds each lag's two coefficients of the drive and the part that it keeps of itself;
+    ``growth`` (samples,) is |u| / U, or zero.
     """
     if curve.size > 0:
         _bend(state, curve, first, last, drive)
@@ -128,7 +128,7 @@ def _bend(state: FloatArray, curve: FloatArray, first: int, last: int, drive: Fl
 
 @inner(fastmath={"contract", "nsz"})
 def _follow(state: FloatArray, samples: int, drive: FloatArray) -> None:
-    """Let the dynamics follow."""
+    """Apply the dynamics."""
     for t in range(samples):
         row = t * LANES
         for i in range(LANES):
@@ -148,7 +148,7 @@ def _creep(
     last: int,
     drive: FloatArray,
 ) -> None:
-    """Let dynamics and creep follow."""
+    """Apply dynamics and creep."""
     followed = np.empty_like(drive[: (last - first) * LANES])
     for t in range(first, last):
         row = (t - first) * LANES
@@ -172,7 +172,7 @@ def _lag(
     lag: FloatArray,
     drive: FloatArray,
 ) -> None:
-    """Add one of the creep's lags. The arrays are apart: a compiler may take lanes together."""
+    """Add one of the creep's lags. Separate arrays let a compiler take several lanes at once."""
     now, later, keep = coefficients
     for t in range(followed.size // LANES):
         row = t * LANES

@@ -1,8 +1,8 @@
-"""The Jiles-Atherton and the domain wall model compiled: model by model, stretch by stretch.
+"""The compiled Jiles-Atherton and domain wall model: model by model, stretch by stretch.
 
-The same functions as NumPy's engine has, of one model. An integrator's steps do not end at samples,
-so this is not a stage that takes samples as they come: it makes the drive of a whole record, which
-is then taken as given.
+The functions are those of the NumPy engine, for one model. An integrator's steps do not end at
+samples, so this is not a stage that takes sample by sample: it makes the drive of a whole record,
+which is given to the other stages.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _follow(
     directions: FloatArray,
     state: FloatArray,
 ) -> FloatArray:
-    """Return w (models, samples) along stretches, and move irreversible displacements on."""
+    """Return w (models, samples) along stretches, and advance irreversible displacements."""
     result = np.empty((state.size, voltage.size))
     stages, knots = np.zeros(STAGES), np.empty((KNOTS, LINES))
     for model in range(state.size):

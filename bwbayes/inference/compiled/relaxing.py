@@ -1,8 +1,8 @@
 """The stage of loops that relax: sample by sample, models side by side.
 
-Bouc-Wen with n = 1, asymmetric or not, backlash-like and Duhem loops, by the formulas of
-:mod:`bwbayes.model.relaxing`. Their φ functions are a series for all models at once where the
-fastest of them moves little in a sample, and doubled from there elsewhere.
+These are Bouc-Wen with n = 1, asymmetric or not, backlash-like and Duhem loops, by the formulas of
+:mod:`bwbayes.model.relaxing`. Their φ functions are a series for all models at once if the fastest
+of them moves little in a sample; otherwise they are doubled from a smaller argument.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ relax, bent = compiled(formulas.relax), compiled(formulas.bent)
 series, third = compiled(formulas.series), compiled(formulas.third)
 relaxed = compiled(formulas.relaxed)
 
-# Rows of what a model is and remembers; each name is where a row begins. There are three rows of D
-# and ALPHA. Of the rates, for voltages that fall and rise, below zero and above, those that hold
-# are copied to rows of their own: a compiler makes vectors of rows whose places it knows.
+# Rows of a model's numbers and memory; each name is the offset of a row. D and ALPHA have three
+# rows each. The rates that apply, of those for falling and rising voltages below zero and above,
+# are copied to separate rows: a compiler makes vectors of rows at known places.
 REST, H, D, ALPHA, RATES, BEFORE, Z, PHI_1, PHI_2, PHI_3, AGAINST, AHEAD, PAIR, W, FASTEST = (
     LANES * row for row in (0, 1, 2, 5, 8, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25)
 )
 
 
 def rows(step: RelaxingStep, memory: FloatArray, voltage: float) -> FloatArray:
-    """Return what the stage starts from, (models, rows), w₀ first, where the step's memory is."""
+    """Return the stage's initial rows, (models, rows), with w₀ first, for the step's memory."""
     numbers, h = step.parameters, memory[:, 1]
     group = np.zeros((h.size, FASTEST // LANES + 1))
     d = numbers.T
@@ -40,7 +40,7 @@ def rows(step: RelaxingStep, memory: FloatArray, voltage: float) -> FloatArray:
 
 
 def planned(step: RelaxingStep) -> FloatArray:
-    """Return whether any model's f or a is curved, and any one's rate knows a sign."""
+    """Return whether f or a of any model is curved, and whether a rate depends on a sign."""
     curved = step.parameters[:, [1, 2, 4, 5]].any()
     return np.array([[curved, step.signed]], dtype=np.float64)
 
@@ -64,7 +64,7 @@ def relaxing(
         u = voltage[t]
         before = voltage[t - 1] if t > 0 else u
         row = (t - first) * LANES
-        # Where the rates know the voltage's sign, to zero volts and on from there.
+        # If the rates depend on the voltage's sign, go to zero volts and on from there.
         end = 0.0 if signed and before * u < 0.0 else u
         while True:
             if signed:
@@ -79,7 +79,7 @@ def relaxing(
 
 @inner()
 def _take(group: FloatArray, before: float, u: float) -> None:
-    """Let the rates hold that do between two voltages."""
+    """Select the rates that apply between two voltages."""
     pair = 2 * int(u > before) + int(before + u > 0.0)
     if group[PAIR] == pair:
         return
@@ -108,7 +108,7 @@ def _straight(group: FloatArray, s: float, u: float, v: float, short: bool) -> i
     passed = 0
     for i in range(LANES):
         g = s * group[H + i]
-        # All are read first: a compiler does not make vectors of what is read on a condition.
+        # Read all rows first: a compiler does not make vectors of conditional reads.
         slow, fast, phi = group[AGAINST + i], group[AHEAD + i], group[PHI_1 + i]
         rate = slow if g < 0.0 else fast
         new = relax(g, v, group[ALPHA + i], rate, series(rate * v) if short else phi)
@@ -194,7 +194,7 @@ def steps_moved(
     after: FloatArray,
     w: FloatArray,
 ) -> None:
-    """Move models to voltages (lanes,) of their own; write w and the memory after them.
+    """Move models to individual voltages (lanes,); write w and the memory after them.
 
     ``numbers`` have a further row, whether any model's f, a or rate is more than a constant.
     """
@@ -202,7 +202,7 @@ def steps_moved(
     passed = 0 if each else _moved_apart(numbers, memory, voltage, after, w)
     if each or passed > 0:
         for i in range(LANES):
-            # Where h passed zero its rate has changed on the way.
+            # If h passed zero, its rate has changed on the way.
             if each or memory[1, i] * after[1, i] < 0.0:
                 w[i], _ = formula(step, numbers[:, i], memory[:, i], voltage[i], after[:, i])
 
@@ -226,7 +226,7 @@ def _moved_apart(
         rate = against if g < 0.0 else ahead
         z = rate * v
         is_short = abs(z) <= SHORT
-        # As in phi, h has left any start long before a negative rate has grown it by so much.
+        # As in `_phi`, h forgets its initial state long before a negative rate has grown it so far.
         far = gone(max(z, -100.0)) / (1.0 if is_short else z)
         new = relax(g, v, alpha, rate, series(z) if is_short else far)
         passed += (g < 0.0) & (new > 0.0)

@@ -1,10 +1,10 @@
-"""The hysteresis stages of the compiled likelihood: which operators have one, and who calls it.
+"""The hysteresis stages of the compiled likelihood, and their choice for an operator.
 
-A stage writes the drive's distance from that of the first sample, w − w₀, of a piece of a record
-for ``LANES`` models side by side. What a model is and remembers stands in rows of ``LANES`` numbers
-of one flat array, ``group``; what the stage may know of the voltage beforehand is its ``plan``. An
-operator that has a step (:mod:`bwbayes.model.step`) is walked through with it; one that has none,
-and no stage, is worked out beforehand, and its drive is the plan.
+A stage writes the drive's difference from that of the first sample, w − w₀, for a piece of a record
+and for ``LANES`` models side by side. The numbers and the memory of a model are in rows of
+``LANES`` numbers of one flat array, ``group``; ``plan`` holds numbers that the stage needs in
+advance. An operator that has a step (:mod:`bwbayes.model.step`) is advanced by it; the drive of an
+operator with neither step nor stage is worked out beforehand, and is the plan.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Kind = HysteresisStep | RemembersExtrema | None
 
 
 class CompiledDrive(NamedTuple):
-    """What a compiled stage starts from.
+    """Initial state of a compiled stage.
 
-    ``kind`` is what brings its formula, None where the drive is known; ``rest`` (models,) is w₀,
-    um; ``group`` (models, rows) and ``plan`` are the stage's own.
+    ``kind`` is the object with its formula, None for a known drive; ``equilibrium`` (models,) is
+    w₀, um; ``group`` (models, rows) and ``plan`` depend on the stage.
     """
 
     kind: Kind
@@ -46,7 +46,7 @@ class CompiledDrive(NamedTuple):
 def prepared(
     operator: Operator, column: Values, voltage: FloatArray, memory: Any
 ) -> CompiledDrive | None:
-    """Return the stage of an operator's models; None if that is left to NumPy."""
+    """Return the stage for an operator's models; None if NumPy has to make the drive."""
     if isinstance(operator, RemembersExtrema):
         group = extrema.rows(voltage, memory)
         return CompiledDrive(operator, memory.displacement, group, operator.numbers(column))
@@ -63,26 +63,26 @@ def prepared(
 
 
 def advance_of(operator: Operator) -> Callable[..., tuple[FloatArray, Any]]:
-    """Return what makes the drive of a whole piece at once, as the operator's class advances."""
+    """Return a function that makes the drive of a whole piece, like ``advance`` of the class."""
     integrated = type(operator) in (JilesAtherton, DomainWall)
     return pinned.drive if integrated else type(operator).advance
 
 
 def given(drive: FloatArray, models: int | None = None) -> CompiledDrive:
-    """Take a known drive (models, samples), um; so many ``models`` may take fewer in turn."""
+    """Return a stage for a known drive (models, samples), um; ``models`` may share fewer drives."""
     number = np.arange(models or len(drive)) % len(drive)
     equilibrium = drive[number, 0]
     group = np.stack([number, equilibrium], axis=1)
-    # All that follows would be compiled once more for another layout.
+    # Keep one layout: numba would compile all functions once more for another one.
     return CompiledDrive(None, equilibrium, group, np.ascontiguousarray(drive))
 
 
 def drive_of(
     kind: Any, group: Any, plan: Any, voltage: Any, first: Any, last: Any, out: Any
 ) -> None:
-    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and move the memory on.
+    """Write w − w₀ of samples ``first`` to ``last`` to ``out``, and advance the memory.
 
-    By the stage of a kind, which is chosen by its type, so that no other is compiled.
+    The type of ``kind`` selects the stage, so that no other one is compiled.
     """
     raise NotImplementedError
 
@@ -105,10 +105,10 @@ def _compiled_drive_of(
 
 
 def move_lanes(kind: Any, numbers: Any, memory: Any, values: Any, after: Any, result: Any) -> None:
-    """Write what comes out of a sample's values (lanes,), and the memory after it.
+    """Write the result for a sample's values (lanes,), and the memory after it.
 
-    Of a stage, or of an operator's step along voltages of the models' own; ``numbers``, ``memory``
-    and ``after`` are (any, lanes).
+    ``kind`` is a stage, or an operator's step along individual voltages of the models; ``numbers``,
+    ``memory`` and ``after`` are (any, lanes).
     """
     raise NotImplementedError
 
@@ -162,7 +162,7 @@ def _given(
     last: int,
     out: FloatArray,
 ) -> None:
-    """Take a drive that is known: row i of the plan for the model whose number is own[0][i]."""
+    """Copy a known drive: the row of the plan whose index is the first number of a model."""
     for i in range(LANES):
         drive = plan[int(group[i])]
         for t in range(first, last):
@@ -181,7 +181,7 @@ def _stepped(
 ) -> None:
     """Step one model after the other, sample by sample.
 
-    Rows are a model's number in the plan, w₀, and what its step remembers.
+    Rows are a model's number in the plan, w₀, and its step's memory.
     """
     memory = np.empty(group.size // LANES - 2)
     after = np.empty(memory.size)

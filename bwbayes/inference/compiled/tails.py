@@ -14,11 +14,11 @@ from bwbayes.inference.heavy_tails import Steps
 
 
 def run(steps: Steps, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
-    """Do what :func:`bwbayes.inference.heavy_tails.run` does."""
+    """Run the filter as :func:`bwbayes.inference.heavy_tails.run` does."""
     models, _, readings = steps.series.shape
     log_density = np.full(models, -0.5 * readings * np.log(2 * np.pi))
     error, spread, sensor = np.empty((3, models, readings))
-    # Each layout of an array would be compiled by itself.
+    # Numba would compile the function for each layout of an array.
     arrays: list[Any] = [*map(np.ascontiguousarray, steps)]
     _run(*[*arrays, mean, covariance, log_density, error, spread, sensor])
     return log_density, error, spread, sensor
@@ -40,7 +40,7 @@ def _run(
     spreads: FloatArray,
     sensors: FloatArray,
 ) -> None:
-    """Add to the log densities, and write what else is found; arguments as of :class:`Steps`."""
+    """Add to the log densities, and write the other results; arguments are as in :class:`Steps`."""
     models, count, readings = series.shape
     states, size = observe.size, means.shape[1]
     row, gain, cross = np.zeros(size), np.empty(size), np.empty(size)
@@ -78,7 +78,7 @@ def _go_on(
     after: FloatArray,
     product: FloatArray,
 ) -> None:
-    """Take the discrepancy's states on, x ← F x, P ← F P Fᵀ + Q; sizes stay as they are."""
+    """Advance the discrepancy's states, x ← F x, P ← F P Fᵀ + Q; sizes stay as they are."""
     for i in range(states):
         after[i] = 0.0
         for k in range(states):
@@ -107,7 +107,7 @@ def _update(
     gain: FloatArray,
     cross: FloatArray,
 ) -> None:
-    """Take a reading into the states, as in NumPy; ``shared`` is P c."""
+    """Update the states by a reading, as in NumPy; ``shared`` is P c."""
     size, (error, rate, doubt, sensor) = row.size, reading
     for i in range(size):
         gain[i] = shared[i] * rate
@@ -127,7 +127,7 @@ def _update(
 
 @inner(error_model="numpy")
 def _times(matrix: FloatArray, vector: FloatArray, product: FloatArray) -> None:
-    """Write a matrix (states, states) times a vector (states,)."""
+    """Write the product of a matrix (states, states) and a vector (states,)."""
     for i in range(vector.size):
         product[i] = 0.0
         for j in range(vector.size):
@@ -140,7 +140,7 @@ def _weigh(
 ) -> tuple[float, float, float, float]:
     """Return log p(e), E[1/V], e² Var[1/V] and R of a reading.
 
-    The largest part is found without an exponential, the others are taken over it.
+    The largest part is found without an exponential; the others are relative to it.
     """
     count, squares, top = variances.size, error * error, -np.inf
     for k in range(count):
@@ -149,7 +149,7 @@ def _weigh(
         work[1, k] = logs[k] - 0.5 * squares * inverse
         top = max(top, work[1, k])
     for k in range(count):
-        # exp(x) as exp(x/1024) to the power 1024, of which a compiler can take several at once.
+        # Compute exp(x) as exp(x/1024) to the power 1024, since a compiler can vectorize that.
         x = max(work[1, k] - top, -60.0) / 1024.0
         x = 1.0 + x * (1.0 + x / 2 * (1.0 + x / 3 * (1.0 + x / 4 * (1.0 + x / 5 * (1.0 + x / 6)))))
         x *= x

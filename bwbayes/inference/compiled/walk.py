@@ -1,9 +1,9 @@
-"""The displacement on the compiled engine: models that walk along a voltage, piece by piece.
+"""Displacement on the compiled engine: models advance along a voltage, piece by piece.
 
-What the likelihood does sample by sample, without its noise: the same stages, nonlinearity and
-dynamics, for ``LANES`` models side by side. Further stages, and the hysteresis where stages before
-it give each model a voltage of its own, take whole pieces one after the other, models side by side
-too: what is seldom there is not worth a place in the loop that all others share.
+The loop is that of the likelihood without its noise: the same stages, nonlinearity and dynamics,
+sample by sample, for ``LANES`` models side by side. Further stages, and the hysteresis if stages
+before it give each model an individual voltage, take whole pieces one after the other, with models
+side by side, too: such rare parts are not worth a place in the loop that all models share.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ def walk(
     *,
     from_rest: bool = False,
 ) -> Callable[[int], FloatArray]:
-    """Put models to the inputs' first sample; what is returned walks them on to a sample.
+    """Set models to the inputs' first sample; return a function that advances them to a sample.
 
-    Called with growing numbers of samples, it returns the displacement (models, samples), um, from
-    where they are. Parameters and errors are those of
-    :meth:`~bwbayes.model.actuator.Actuator.advance`, but that the inputs are known up to the end.
+    Called with growing numbers of samples, the function returns the displacement (models, samples),
+    um, from the present sample on. Parameters and errors are those of
+    :meth:`~bwbayes.model.actuator.Actuator.advance`, but the inputs are known up to the end.
     """
     column = actuator.columns(theta)
     actuator.check(column)
     if not actuator.stages:
         return _walk_core(actuator, column, inputs, initial_transient, from_rest)
-    # The offset comes last.
+    # Add the offset last.
     without_offset = column | {"offset": np.zeros(len(theta))}
     core = _walk_core(actuator, without_offset, inputs, initial_transient, from_rest)
     memories: tuple[FloatArray, ...] | None = None
@@ -81,11 +81,11 @@ def _walk_core(
     initial_transient: FloatArray | None,
     from_rest: bool,
 ) -> Callable[[int], FloatArray]:
-    """Walk along the way up to creep and dynamics."""
+    """Return the function of :func:`walk` for the path up to creep and dynamics."""
     operator, voltage, compiled = actuator.hysteresis, inputs.voltage, None
     if actuator.inputs:
         advance, memory = _of_own(actuator, column, inputs, from_rest)
-        actuator = actuator.linear  # the nonlinearity is in the drive
+        actuator = actuator.linear  # the drive includes the nonlinearity
     else:
         along = advance_of(operator)
 
@@ -129,16 +129,16 @@ def _walk_core(
 def _of_own(
     actuator: Actuator, column: Values, inputs: Inputs, from_rest: bool
 ) -> tuple[Callable[[Inputs, Any], tuple[FloatArray, Any]], Any]:
-    """Return what makes the drive along the next inputs, of models with voltages of their own.
+    """Return a function that makes the drive of models with individual voltages, and its memory.
 
-    And what it remembers at the first sample: the stages' memories, and the operator's.
+    The memory is that at the first sample, of the stages and of the operator.
     """
     operator = actuator.hysteresis
     before = actuator.begin_inputs(column, inputs, from_rest=from_rest)
     first, _ = actuator.pass_inputs(column, inputs[:1], before)
     span = actuator.range_of(inputs.voltage)
     step, memory = None, None
-    # Those that remember extrema have another memory than their step has.
+    # Operators that remember extrema have another memory than their step.
     if type(operator).step is not Operator.step and not isinstance(operator, RemembersExtrema):
         step = operator.step(column)
     if isinstance(operator, OneState) and isinstance(step, OneStateStep):
@@ -178,7 +178,7 @@ def _walk(
     last: int,
     displacement: FloatArray,
 ) -> None:
-    """Move all models on from sample ``first`` to ``last``; write what they do on the way."""
+    """Advance all models from sample ``first`` to ``last``; write their displacement."""
     drive = np.empty(PIECE * LANES)
     for group in range(state.shape[0]):
         models = min(LANES, displacement.shape[0] - group * LANES)
@@ -198,11 +198,11 @@ def _advance_stage(
     values: FloatArray,
     seen: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what :meth:`~bwbayes.model.stage.Stage.advance` does."""
+    """Return the result of :meth:`~bwbayes.model.stage.Stage.advance`."""
     if type(stage).advance is not Stage.advance:
-        return stage.advance(numbers, memory, values, seen)  # of all samples at once
+        return stage.advance(numbers, memory, values, seen)  # takes all samples at once
     result, after = np.empty(values.shape), memory.copy()
-    seen = np.empty(0) if seen is None else seen.copy()  # of one type, for which one is compiled
+    seen = np.empty(0) if seen is None else seen.copy()  # numba compiles for this type alone
     _pass(stage, numbers.copy("C"), after, np.ascontiguousarray(values), seen, result)
     return result, after
 
@@ -210,13 +210,13 @@ def _advance_stage(
 def _drive_of_own(
     step: HysteresisStep, memory: FloatArray, voltage: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the drive (models, samples), um, along voltages (models, samples), V.
+    """Return the drive (models, samples), um, along voltages (models, samples), V, and the memory.
 
-    And what the step remembers after them, (models, any), as ``memory`` is before.
+    The memory after them is (models, any), like ``memory`` before.
     """
     drive, after, numbers = np.empty(voltage.shape), memory.copy(), step.parameters
     if isinstance(step, RelaxingStep):
-        # Its lanes know which of them are straight and unsigned.
+        # Add the row that tells its lanes whether any model is curved or depends on a sign.
         numbers = np.column_stack([numbers, np.full(len(numbers), planned(step).any())])
     _pass(step, numbers, after, np.ascontiguousarray(voltage), np.empty(0), drive)
     return drive, after
@@ -231,7 +231,7 @@ def _pass(
     seen: FloatArray,
     result: FloatArray,
 ) -> None:
-    """Write what comes out of values (models, samples), and move the memory on."""
+    """Write the result for values (models, samples), and advance the memory."""
     models, samples = values.shape
     rows = np.empty((numbers.shape[1], LANES))
     now, after = np.empty((memory.shape[1], LANES)), np.empty((memory.shape[1], LANES))
@@ -255,7 +255,7 @@ def _pass(
 def _enter(rows: FloatArray, group: int, first: int, lanes: FloatArray) -> None:
     """Put columns of some models (models, any) side by side, (columns, lanes).
 
-    Lanes to spare repeat the last model.
+    Spare lanes repeat the last model.
     """
     for i in range(LANES):
         model = min(group + i, rows.shape[0] - 1)
@@ -265,7 +265,7 @@ def _enter(rows: FloatArray, group: int, first: int, lanes: FloatArray) -> None:
 
 @inner()
 def _leave(lanes: FloatArray, group: int, first: int, rows: FloatArray) -> None:
-    """Put what is side by side (columns, lanes) back into rows (models, any)."""
+    """Put columns side by side (columns, lanes) back into rows (models, any)."""
     for i in range(min(LANES, rows.shape[0] - group)):
         for k in range(lanes.shape[0]):
             rows[group + i, first + k] = lanes[k, i]

@@ -1,8 +1,8 @@
 """The noise's filter along series that come from NumPy: their innovations themselves, not sums.
 
-As :meth:`~bwbayes.inference.state_space.Noise.filter` does, for any number of states: a model's
-covariance goes on once for all of its series. The series of some models are taken side by side, so
-that no reading of one waits for the one before it.
+It works like :meth:`~bwbayes.inference.state_space.Noise.filter`, for any number of states: a
+model's covariance advances once for all of its series. The series of some models are side by side,
+so that no reading of one waits for the one before it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.inference.compiled.lanes import inner
 
-# Readings whose series are put side by side at a time, and models that go together.
+# Number of readings whose series are put side by side at a time, and of models in a group.
 PIECE, TOGETHER = 16, 32
 
 
@@ -39,7 +39,7 @@ def whitened(
         P (models, states, states), h (states,), and the sensor's variance, um², (models, 1), or
         that of each reading (models, readings).
     gaps
-        (readings,) which of the gaps is just before a reading; 0 if none is.
+        (readings,) index of the gap just before a reading; 0 without a gap.
     series
         (models, series, readings), um.
     """
@@ -65,14 +65,14 @@ def _whiten(
     white: FloatArray,
     logs: FloatArray,
 ) -> None:
-    """Write what is whitened of models that go together; their covariance goes on in its place."""
+    """Write the whitened series of a group of models, and advance their covariance in place."""
     models, count, readings = series.shape
     varies = sensor.shape[1] > 1
     states, columns = observe.size, models * count
     work, shared = np.empty((3, states, states)), np.empty((models, states))
     variance, log_variance = np.ones(models), np.zeros(models)
     settled, before = np.zeros(models, np.bool_), -1
-    # Of each series: what is expected of its states, its model's F and gain, one over its sd.
+    # For each series: the estimates of its states, its model's F and gain, one over its sd.
     mean, after = np.zeros((states, columns)), np.zeros((states, columns))
     f_matrix, gain = np.empty((states, states, columns)), np.empty((states, columns))
     scale, values = np.empty(columns), np.empty((PIECE, columns))
@@ -103,7 +103,7 @@ def _whiten(
             mean, after = after, mean
             for model in range(models):
                 if not settled[model] or step > 0:
-                    # After a gap the covariance is another one, and so are its gains.
+                    # A gap changes the covariance and its gains.
                     settled[model] = _advance(
                         covariance[model], transitions[step, model], gained[step, model],
                         shared[model], observe, sensor[model, first + t if varies else 0],
@@ -147,7 +147,7 @@ def _innovate(
 ) -> None:
     """Turn a reading of each series (series,) into its innovation over its sd.
 
-    ``mean`` (states, series) is expected of it, and ``after`` written: what is of the next one.
+    ``mean`` (states, series) is the estimate for it, and ``after`` receives that for the next one.
     """
     states, count = mean.shape
     for i in range(states):
@@ -188,10 +188,10 @@ def _advance(
     variance: float,
     work: FloatArray,
 ) -> bool:
-    """Take a reading into the covariance and go on by F and Q; tell whether it stays as it is.
+    """Update the covariance by a reading, advance it by F and Q, and tell whether it is unchanged.
 
-    By Joseph's form, which has no negative eigenvalue however it is rounded: with K = P h / S,
-    F ((1 − K h) P (1 − K h)ᵀ + s² K Kᵀ) Fᵀ + Q.
+    The update is Joseph's form, which has no negative eigenvalue however it is rounded: with
+    K = P h / S, F ((1 − K h) P (1 − K h)ᵀ + s² K Kᵀ) Fᵀ + Q.
     """
     states = observe.size
     reduced, updated = work[0], work[1]
