@@ -23,7 +23,7 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.words import circumstances, symbol, unit_text
 
-# Ranked quantities besides parameters: their names and units.
+# Names and units of the ranked quantities besides parameters.
 EXTRA_WORDS = {
     "log_likelihood": ("log likelihood", "-"),
     "loop_area": ("loop area", "um V"),
@@ -32,14 +32,14 @@ EXTRA_WORDS = {
 
 
 def outcome(passed: bool, telling: bool) -> tuple[Kind, str]:
-    """Return how good a calibration's outcome is, and what it is called."""
+    """Return the banner's kind and headline for a calibration's outcome."""
     if not passed:
         return "bad", "CALIBRATION FAILED"
     return ("good", "Passed") if telling else ("note", "Passed, with too few replicates")
 
 
 def calibration_report(calibration: Calibration) -> Report:
-    """Return what a calibration says: whether it has passed, the tests, and what was run."""
+    """Return a calibration's report: its outcome, the tests, and the facts of the run."""
     bands, unconverged = _bands(calibration), calibration.unconverged
     counts = f"{calibration.replicates} replicates, {len(unconverged)} not converged"
     kind, headline = outcome(calibration.passed, calibration.telling)
@@ -81,7 +81,7 @@ def calibration_report(calibration: Calibration) -> Report:
 
 
 def _statistics(calibration: Calibration) -> Table:
-    """Return a row for each statistic, and the limits of its intervals' coverage."""
+    """Return a table with a row for each statistic, and the limits of the intervals' coverage."""
     words = {p.name: (p.description, p.unit) for p in calibration.parameters} | EXTRA_WORDS
     rows = []
     for name, uniformity in calibration.statistics.items():
@@ -111,7 +111,7 @@ def _statistics(calibration: Calibration) -> Table:
 
 
 def _bands(calibration: Calibration) -> Table:
-    """Return a row for each kind of band of held-out windows and of other records, if any."""
+    """Return a table with a row for each kind of band of held-out windows and other records."""
     rows = []
     for record, kind in product(calibration.predicted, KINDS):
         coverages = [calibration.bands[f"{record} {kind} {level}".strip()] for level in LEVELS]

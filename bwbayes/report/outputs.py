@@ -1,7 +1,7 @@
 """The files of a report and of a finished run: page, pictures, posterior, bands, numbers.
 
-Each is written under another name and renamed when it is whole, so a reader never sees half a
-file.
+Each file is written under another name and renamed when it is complete, so that a reader never sees
+half a file.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def posterior_tree(
 ) -> Any:
     """Return the draws as arviz groups, an xarray.DataTree, and whether they have converged.
 
-    Groups: posterior, sample_stats, log_likelihood (of all readings together, (steps, ensembles,
-    walkers), nats), observed_data and constant_data. A chain is a walker; the coordinates
-    ``ensemble`` and ``walker`` along it say which. With several training records, variables and
-    times have their record's name behind their own: ``displacement_loops``. The attribute
-    ``converged`` is 1 or 0: without convergence the draws are none of the posterior.
+    The groups are posterior, sample_stats, log_likelihood (of all readings together, (steps,
+    ensembles, walkers), nats), observed_data and constant_data. A chain is a walker; the
+    coordinates ``ensemble`` and ``walker`` identify it. With several training records, variables
+    and times have their record's name appended: ``displacement_loops``. The attribute ``converged``
+    is 1 or 0: without convergence the draws are not from the posterior.
     """
     import xarray as xr  # noqa: PLC0415  # slow to load
 
@@ -91,7 +91,7 @@ def write_bands(
 ) -> None:
     """Write bands as CSV; of several sets, a first column ``set`` names each.
 
-    What some of the sets do not have is nan there. Every column has seven digits of its range,
+    Columns that a set does not have are nan there. Every column has seven digits of its range,
     however far from zero it lies. ``watch`` is called with the share that is done.
     """
     more = counted(sum(predicted.time.size for predicted in bands), watch)
@@ -139,11 +139,11 @@ def save(
 ) -> list[Path]:
     """Write a report's files to a folder, and return those named after it: JSON, CSV, page.
 
-    Pictures as PNG, in a folder below it if ``pictures`` names one, ``NAME.html``, ``NAME.csv`` and
-    ``NAME.json`` if it has such; the JSON last, as the sign that all is there. ``watch`` is called
-    with the share of the pictures that is drawn.
+    The files are pictures as PNG, in a folder below it if ``pictures`` names one, ``NAME.html``,
+    and ``NAME.csv`` and ``NAME.json`` if the report has them; the JSON comes last, as the sign that
+    all files exist. ``watch`` is called with the share of the pictures that is drawn.
 
-    Raises InputError: the folder cannot be written.
+    Raises InputError if the folder cannot be written.
     """
     numbers, table, page = (folder / f"{name}.{kind}" for kind in ("json", "csv", "html"))
     with refuse_unwritable(folder, "choose another folder"):
@@ -164,7 +164,7 @@ def save(
 
 
 def refuse_existing(files: Sequence[Path], *, overwrite: bool) -> None:
-    """Refuse to replace a file, with an InputError, unless that is asked for."""
+    """Refuse to replace a file, with an InputError, unless ``overwrite`` allows it."""
     for path in files:
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists; choose another name, or give `overwrite=True`")

@@ -1,7 +1,7 @@
-"""Reports as a page: one HTML file that needs nothing else, with one template for all of them.
+"""Pages of reports: one self-contained HTML file each, with one template for all of them.
 
-The numbers of a table come twice: rounded, to be read, and as they are, in the CSV behind its
-button. No script runs in a page but its own, and nothing is fetched.
+The page holds the numbers of a table twice: rounded, for reading, and exactly, in the CSV behind
+its button. A page runs no scripts except its own, and fetches nothing.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from bwbayes.report.report import Report, Table
 
 
 class PagePlots(NamedTuple):
-    """Plots to zoom and hover, JSON by the name of the picture that shows the same, and scripts.
+    """Interactive plots, JSON by the name of the picture that shows the same, and their scripts.
 
-    ``bwbayes.report.figures.interactive`` makes either.
+    ``bwbayes.report.figures.interactive`` makes both.
     """
 
     drawn: Mapping[str, Markup]
@@ -36,7 +36,7 @@ NO_PLOTS = PagePlots({}, ())
 
 
 def render(report: Report, pictures: Mapping[str, bytes], plots: PagePlots = NO_PLOTS) -> str:
-    """Return a report's page, with pictures (PNG by name), and plots in their place for scripts.
+    """Return a report's page, with pictures (PNG by name), which scripts replace by plots.
 
     A picture of the report without a PNG is left out.
     """
@@ -50,13 +50,13 @@ def render(report: Report, pictures: Mapping[str, bytes], plots: PagePlots = NO_
 
 
 def fragment(report: Report) -> str:
-    """Return what a notebook shows of a report, as HTML: what a screen shows."""
+    """Return a report as HTML for a notebook, with the parts that a screen shows."""
     return _environment({}, NO_PLOTS).get_template("notebook.html.j2").render(report=report.said())
 
 
 def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment:
-    """Return the room of the templates, which know pictures and plots by name."""
-    # The beginning of a cell with a number, or the sign for an unknown number.
+    """Return the environment of the templates, which get pictures and plots by name."""
+    # Matches the beginning of a cell with a number, or the sign for an unknown number.
     number = re.compile(r"[-+−±]?[\d.]|nan$|[-+]?inf$|–?$")
     environment = Environment(
         loader=PackageLoader("bwbayes.report"),
@@ -68,16 +68,16 @@ def _environment(pictures: Mapping[str, bytes], plots: PagePlots) -> Environment
     environment.globals |= {"pictures": pictures, "plots": plots.drawn}
     filters: dict[str, Callable[..., Any]] = {
         "data_uri": lambda png: "data:image/png;base64," + b64encode(png).decode("ascii"),
-        # The digest by which a Content-Security-Policy allows a script.
+        # Digest by which a Content-Security-Policy allows a script.
         "digest": lambda script: "sha256-" + b64encode(sha256(script.encode()).digest()).decode(),
-        # A picture's width and height, if it is a whole one.
+        # Width and height of a picture, if it is complete.
         "pixels": lambda png: struct.unpack(">2I", png[16:24]) if len(png) > 24 else None,
         "csv_link": csv_link,
-        # Whether each column holds words, which go to the left.
+        # True for each column that holds words, which are aligned to the left.
         "is_wordy": lambda rows: [
             not all(map(number.match, column)) for column in zip(*rows, strict=True)
         ],
-        # The titles above those of the columns, but the first, with how many each spans.
+        # Titles above those of the columns except the first, with the number of columns of each.
         "spans": lambda columns: [
             (title, len(list(spanned)))
             for title, spanned in groupby(columns[1:], key=attrgetter("group"))

@@ -2,8 +2,8 @@
 
 A :class:`Product` describes itself by a :class:`Report`. :func:`show` shows it on a terminal of 80
 columns, :mod:`~bwbayes.report.page` as a page, and :mod:`~bwbayes.report.outputs` writes its files.
-The page has all of it. The screen has the banners, and those tables and texts that are meant for
-it. A text is escaped where it is shown; a :class:`~markupsafe.Markup` is taken as HTML.
+The page shows the whole report. The screen shows the banners, and the tables and texts that are
+meant for it. A text is escaped when it is shown; a :class:`~markupsafe.Markup` counts as HTML.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ type Block = Table | Picture | Facts | Text | Glossary | Section | SideBySide
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column of a table: its title, that of the columns about it, and where it is shown.
+    """A column of a table: its title, the title of its group, and where it is shown.
 
-    ``text`` is what a cell says of the row's item, a format with the names of what the item has, as
-    ``"{mean:.3g}"``, or a function of the item; see :meth:`Table.of`.
+    ``text`` gives a cell's text for the row's item: a format with the names of the item's fields,
+    such as ``"{mean:.3g}"``, or a function of the item; see :meth:`Table.of`.
     """
 
     title: str
@@ -57,7 +57,7 @@ class TableColumn:
     text: str | Callable[[Any], str] = str
 
     def cell(self, item: Any) -> str:
-        """Return the text of a row's item; a dash where a number is not known."""
+        """Return the text for a row's item; a dash if a number is not known."""
         if callable(self.text):
             return self.text(item)
         try:
@@ -70,10 +70,10 @@ class TableColumn:
 class Table:
     """A table with a header for each row and column.
 
-    ``name`` names it within the page, and its CSV; ``caption`` says what it holds. ``columns`` are
-    a column each, or its title; the first one shown holds the headers of the rows. ``rows`` are the
-    texts of each row, one for each column; ``records`` the rows of the CSV behind the page's
-    button, by column, numbers as they are, by default the texts that are shown. ``note`` is said
+    ``name`` names it within the page, and its CSV; ``caption`` describes its content. ``columns``
+    are columns or their titles; the first one shown holds the headers of the rows. ``rows`` are the
+    texts of each row, one for each column; ``records`` are the rows of the CSV behind the page's
+    button, by column, with exact numbers, by default the texts that are shown. ``note`` stands
     below it on the page; ``on`` is where it is shown.
     """
 
@@ -98,7 +98,7 @@ class Table:
     ) -> Self:
         """Return a table with a row for each item, whose texts the columns write.
 
-        Columns that are shown everywhere may be texts by their titles.
+        Columns that are shown everywhere may be given as texts by their titles.
         """
         if isinstance(columns, Mapping):
             columns = [TableColumn(title, text=text) for title, text in columns.items()]
@@ -116,11 +116,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with what is said below it.
+    """A picture with its caption.
 
-    ``name`` names it within the page, ``#loop``, and its file; ``title`` and ``caption`` say what
-    it shows, in a few words and at length; ``draw`` draws it; ``alt`` is what one would see, for
-    those who do not, by default the title.
+    ``name`` names it within the page, ``#loop``, and its file; ``title`` and ``caption`` describe
+    it in a few words and at length; ``draw`` draws it; ``alt`` is the alternative text, by default
+    the title.
     """
 
     kind: ClassVar = "picture"
@@ -134,7 +134,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Facts:
-    """Subjects, and what is said of each: a table of two columns."""
+    """Subjects with a text each: a table of two columns."""
 
     kind: ClassVar = "facts"
 
@@ -154,7 +154,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Glossary:
-    """Terms and what they mean, in small letters."""
+    """Terms and their meanings, in small letters."""
 
     kind: ClassVar = "glossary"
 
@@ -164,7 +164,7 @@ class Glossary:
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks below a heading; folded, they are closed until the reader opens them."""
+    """Blocks below a heading; if folded, they are closed until the reader opens them."""
 
     kind: ClassVar = "section"
 
@@ -175,7 +175,7 @@ class Section:
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Columns of blocks: beside each other where there is room."""
+    """Columns of blocks, side by side if there is room."""
 
     kind: ClassVar = "side"
 
@@ -184,7 +184,7 @@ class SideBySide:
 
 @dataclass(frozen=True)
 class Banner:
-    """How something came out: a headline in a color, with paragraphs, items of a list, and blocks.
+    """An outcome: a headline in a color, with paragraphs, items of a list, and blocks.
 
     On the screen the first line follows the headline, and ``label`` stands before each item, by
     default the headline; ``blocks`` are for the page alone; ``name`` is for links to the banner.
@@ -202,14 +202,14 @@ class Banner:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """All that a product says.
+    """The whole report of a product.
 
     ``title`` stands on the browser's tab, and at the top of the page unless ``heading``, the page's
-    name, does; ``about`` says in a line what it is about. ``banners`` say how it came out, the
-    first thing to see; ``blocks`` have the answer, then why one may believe it, then what only some
-    readers ask for. ``numbers`` are what the JSON file holds, if there is one, and ``csv`` is the
-    text of the CSV file, if there is one. All of it is written for voltage and displacement, and
-    shown in the words and units of its ``quantities``.
+    name, does; ``about`` describes the subject in a line. ``banners`` state the outcome, and come
+    first; ``blocks`` hold the answer, then the evidence for it, then details for some readers.
+    ``numbers`` are the content of the JSON file, if there is one, and ``csv`` is the text of the
+    CSV file, if there is one. All of it is written for voltage and displacement, and shown in the
+    words and units of its ``quantities``.
     """
 
     title: str
@@ -239,7 +239,7 @@ class Report:
         return replace(self, **changes, quantities=DEFAULT)
 
     def all_blocks(self) -> Iterator[Block]:
-        """Yield all blocks, those within others too, in their order."""
+        """Yield all blocks, including those within others, in their order."""
         yield from _flat(self.blocks)
 
 
@@ -279,12 +279,12 @@ def kind_of(standing: ValidationSummary, *, good: bool = True) -> Kind:
 
 
 def remarks_banner(remarks: Sequence[str], headline: str = "Remarks") -> list[Banner]:
-    """Return a banner with what a user should know, if there is anything."""
+    """Return a banner with the remarks for the user, if there are any."""
     return [Banner("note", headline, items=remarks, label="note", name="remarks")] * bool(remarks)
 
 
 def standing_banner(standing: ValidationSummary, on: Target = "both") -> list[Banner]:
-    """Return a banner with what does not hold of the run that a product builds on, if anything."""
+    """Return a banner if the validation of a product's run failed or is inconclusive."""
     if not standing.lines:
         return []
     about = [Text("Validation of the run that this report builds on:")]
@@ -315,7 +315,7 @@ def show(report: Report, console: Console) -> None:
 
 
 def _grids(table: Table, width: int) -> Iterator[Grid]:
-    """Yield a table for a screen: as many columns at a time as fit beside that of the rows' names.
+    """Yield a table for a screen, by groups of columns that fit beside the rows' names.
 
     A short text stays on one line, a title and a longer text are wrapped at their blanks.
     """
@@ -346,7 +346,7 @@ def _grids(table: Table, width: int) -> Iterator[Grid]:
 
 
 def as_text(report: Report, width: int = 110) -> str:
-    """Return a report as it is shown on a screen of so many columns."""
+    """Return a report as text for a screen of so many columns."""
     text = StringIO()
     show(report, Console(file=text, width=width, force_jupyter=False, color_system=None))
     return text.getvalue().rstrip()
@@ -357,15 +357,15 @@ def _say(text: str, console: Console) -> None:
 
 
 def _plain(text: str) -> str:
-    """Return a text in characters that every terminal has, without tags."""
+    """Return a text without tags, in characters that every terminal shows."""
     text = Markup(text).striptags() if isinstance(text, Markup) else text
     return text.replace("µ", "u").replace("–", "-")
 
 
 class Shown:
-    """An object shown by its report: its head as a repr, all of it in print and a notebook."""
+    """An object shown by its report: its head as a repr, all of it in print and in a notebook."""
 
-    quantities: Quantities = DEFAULT  # those of the run that it is of
+    quantities: Quantities = DEFAULT  # the quantities of its run
 
     @property
     def heading(self) -> str:
@@ -373,11 +373,11 @@ class Shown:
         return ""
 
     def report(self) -> Report:
-        """Return all that there is to say of it."""
+        """Return the report of the object."""
         raise NotImplementedError
 
     def said_in(self, quantities: Quantities) -> Self:
-        """Return this, shown in the words of these quantities from now on."""
+        """Return this object, shown in the words of these quantities from now on."""
         object.__setattr__(self, "quantities", quantities)  # most of these are frozen
         return self
 
@@ -402,11 +402,11 @@ class Product(Shown):
     """A product with a report; its files are called by its ``NAME``."""
 
     NAME: ClassVar[str]
-    remarks: Sequence[str] = ()  # what to know of it, which its report says too
+    remarks: Sequence[str] = ()  # notes for the user, which its report holds, too
 
     @property
     def shortfall(self) -> str:
-        """Why it is not what was asked for, the run's validation apart; empty if it is."""
+        """Reason why the product is not as requested, besides the run's validation; else empty."""
         return ""
 
     @property
@@ -415,12 +415,12 @@ class Product(Shown):
         return ExitStatus.SUCCESS
 
     def records(self) -> dict[str, Record]:
-        """Return what is saved beside the report, as CSV, by name."""
+        """Return the records that are saved beside the report, as CSV, by name."""
         return {}
 
     @classmethod
     def files(cls, folder: Path) -> list[Path]:
-        """Return the files that say that it is saved there already."""
+        """Return the files whose existence shows that the product is saved there already."""
         return [folder / f"{cls.NAME}.json"]
 
     def save(

@@ -1,7 +1,7 @@
 """A finished run in one object, and its summary in numbers.
 
 Everything that is written or drawn after sampling comes from a :class:`Result`. If the sampling
-has not converged, the result keeps the draws but speaks of no interval: no parameter table, no
+has not converged, the result keeps the draws but contains no interval: no parameter table, no
 bands, no scores.
 """
 
@@ -41,7 +41,7 @@ class Result:
     Parameters
     ----------
     name, outcome
-        The run's name, and how the sampling ended.
+        The run's name, and the outcome of the sampling.
     parameters
         All parameters, fixed ones included.
     draws, log_density
@@ -49,18 +49,19 @@ class Result:
         walkers), nats. Where a voltage has noise, or the instruments' scales are unsure, the draws
         are the chain's made wider, and the density is that of the chain's own.
     moves
-        How often each kind of move was proposed to a walker for these draws, and accepted.
+        Numbers of proposals to a walker for these draws, and of acceptances, by kind of move.
     predictions, scores, validation
-        All that was predicted; by the bands' names, for those with a measurement, their scores,
-        and whether they hold. Empty unless converged, as is all that was worked out below.
+        All predicted bands; scores and validation of those with readings, by the bands' names.
+        They are empty unless converged, and so are all results below.
     innovations, drive_locks, consistency, explanations, posterior_checks
-        By fitted record: the innovation of each reading at the most probable draw; whether what the
-        model misses follows the drive; of several, how it agrees with the others; what may explain
-        it better, the best first; where it lies among replicated records.
+        By fitted record: the innovation of each reading at the most probable draw; the test whether
+        the model's error follows the drive; for several records, its consistency with the others;
+        explanations that may describe it better, the best first; its place among replicated
+        records.
     loops, step_responses
         The loops of the actuator, measured, and its responses to the predicted steps by name.
     uncertainty_budgets
-        Which source has which share of what is not known of the main quantities.
+        Shares of the sources in the uncertainty of the main quantities.
     information_gain
         Information gained from the data: prior against posterior.
     facts
@@ -70,7 +71,7 @@ class Result:
     truth
         The true parameters, of a simulated record.
     quantities
-        What the records are of, in whose words the run is shown.
+        Quantities of the records, in whose words the run is shown.
     """
 
     __repr__ = brief
@@ -123,7 +124,7 @@ class Result:
 
     @property
     def standing(self) -> ValidationSummary:
-        """Whether all bands hold."""
+        """Validation of all bands together."""
         return ValidationSummary.of(self.validation.values())
 
     @property
@@ -197,7 +198,7 @@ def summary(result: Result) -> dict[str, object]:
         return numbers | dict.fromkeys(sections)
     innovations: Mapping[str, object] = {n: s.numbers for n, s in result.innovations.items()}
     if len(innovations) == 1:
-        # Those of one record stand alone, those of several by their names.
+        # The innovations of a single record have no name above them.
         innovations = next(iter(result.innovations.values())).numbers
     if result.consistency:
         numbers["agreement"] = {n: record.numbers for n, record in result.consistency.items()}
@@ -205,7 +206,7 @@ def summary(result: Result) -> dict[str, object]:
     return numbers | {
         "parameters": result.estimates,
         "validation": result.validation_numbers,
-        # No other drives: what a model lacks is of another size there.
+        # The validation is for these drives alone: on others the model's error has another size.
         "validated_drives": result.facts.get("drive") if result.standing.passed else None,
         "innovations": innovations or None,
         "loops": None if result.loops is None else result.loops.numbers,

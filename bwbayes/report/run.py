@@ -1,6 +1,6 @@
 """Report of a run: the answer, its validation, and the details.
 
-Failures come first. Without convergence nothing is said of parameters or displacement.
+Failures come first. Without convergence the report contains no parameters or displacement.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from bwbayes.report.words import circumstances, coverage_text, error_text, lengt
 
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
-    """Return what a run says.
+    """Return the report of a run.
 
     The report shows ``seed``, ``wall_s``, ``versions`` and ``data_sha256`` of its ``numbers`` if
-    they are there, and without convergence ``go_on``, the command that goes on.
+    they exist, and without convergence ``go_on``, the command that resumes the run.
     """
     if result.validation and all(verdict.training for verdict in result.validation.values()):
         nothing = (
@@ -89,7 +89,7 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
 
 
 def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]:
-    """Return how the run came out, on the page and on the screen."""
+    """Return the banners with the outcome of the run, for the page and for the screen."""
     standing = result.standing
     if not result.outcome.converged:
         return [_not_converged(result, numbers)]
@@ -120,7 +120,7 @@ def _verdict_banners(result: Result, numbers: Mapping[str, Any]) -> list[Banner]
 
 
 def _calibration_banner(numbers: Mapping[str, Any]) -> list[Banner]:
-    """Return how a calibration around the posterior came out, if there was one."""
+    """Return a banner with the outcome of a calibration around the posterior, if there was one."""
     calibration = numbers.get("calibration")
     if not calibration:
         return []
@@ -133,7 +133,7 @@ def _calibration_banner(numbers: Mapping[str, Any]) -> list[Banner]:
 
 
 def drives_like(facts: Mapping[str, str]) -> str:
-    """Return what a validation that passed speaks for: no other drives than those of training."""
+    """Return the scope of a validation that passed: drives like those of training alone."""
     return f"for drives like the training record's ({facts['drive']})"
 
 
@@ -169,7 +169,7 @@ def _sampled(result: Result) -> str:
 
 
 def _results(result: Result) -> list[Text]:
-    """Return what the bands did on readings that were not fitted, or else on those that were."""
+    """Return the bands' results on readings that were not fitted, or else on fitted ones."""
     texts = []
     scored = [bands for bands in result.predictions if bands.name in result.scores]
     for bands in [bands for bands in scored if not bands.training] or scored:

@@ -31,7 +31,7 @@ from bwbayes.report.words import (
     unit_text,
 )
 
-# A parameter in words, with its symbol; and the columns of names, bare on a screen.
+# A parameter in words, with its symbol; and the columns of names, without them on a screen.
 WORDS = Markup("{words}")
 NAME = (
     TableColumn("Parameter", on="page", text=WORDS),
@@ -40,7 +40,7 @@ NAME = (
 
 
 def parameters_table(result: Result) -> Table:
-    """Return the estimate of each free parameter."""
+    """Return a table with the estimate of each free parameter."""
     estimates = result.estimates
     is_simulated = any("truth" in estimate for estimate in estimates.values())
     columns = (
@@ -63,7 +63,7 @@ def parameters_table(result: Result) -> Table:
 
 
 def sampling_table(result: Result) -> Table:
-    """Return how well each free parameter was sampled; without convergence that alone."""
+    """Return a table of each free parameter's diagnostics, and of its estimates if converged."""
     check = result.outcome.check
     estimates = result.estimates if result.outcome.converged else {}
     agreement = "R\N{COMBINING CIRCUMFLEX ACCENT}"
@@ -85,7 +85,7 @@ def sampling_table(result: Result) -> Table:
 
 
 def moves_table(result: Result) -> Table:
-    """Return how often each kind of move was proposed, and accepted."""
+    """Return a table with the numbers of proposals and acceptances for each kind of move."""
     rows = [
         {"name": name, "proposed": proposed, "share": accepted / proposed}
         for name, (proposed, accepted) in result.moves.items()
@@ -98,7 +98,7 @@ def moves_table(result: Result) -> Table:
 
 
 def learned_table(result: Result, learned: InformationGain) -> Table:
-    """Return how far the record narrowed each parameter, and what its posterior depends on."""
+    """Return a table of each parameter's contraction, and of the dependence on its prior."""
     rows = []
     for parameter in result.free:
         about = learned.parameters[parameter.name]
@@ -122,7 +122,7 @@ def learned_table(result: Result, learned: InformationGain) -> Table:
 
 
 def replicated_tables(result: Result) -> list[Table]:
-    """Return the numbers of each fitted record among those of replicated records."""
+    """Return a table for each fitted record, with its statistics among those of replicated ones."""
     columns = {
         "Number": "{words}",
         "Observed": "{observed:.4g}",
@@ -150,12 +150,12 @@ def scores_table(
     titles: Mapping[str, str],
     records: Sequence[Mapping[str, object]] = (),
 ) -> Table:
-    """Return how the bands turned out on readings: a row for each of the bands.
+    """Return a table of the bands' scores on readings: a row for each of the bands.
 
     Parameters
     ----------
     scores, verdicts, titles
-        By the bands' names, in their order; the titles are for the page.
+        Each by the bands' names, in their order; the titles are for the page.
     records
         The rows of the CSV.
     """
@@ -222,7 +222,7 @@ def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
 
 
 def correction_texts(predictions: Iterable[Bands]) -> list[Text]:
-    """Return a line for each of the bands that failed: how wide it has to be, if that is known."""
+    """Return a line for each of the bands that failed: the width it needs, if that is known."""
     corrected = [(bands.name, bands.correction) for bands in predictions]
     return [Text(f"{name}: {c}", on="both") for name, c in corrected if c is not None]
 
@@ -230,7 +230,7 @@ def correction_texts(predictions: Iterable[Bands]) -> list[Text]:
 def other_scores_table(
     scores: Mapping[str, Scores], titles: Mapping[str, str], records: Sequence[Mapping[str, object]]
 ) -> Table:
-    """Return the other scores: a column for each of the bands, rows where anything is known."""
+    """Return a table of the other scores: a column for each of the bands, rows of known scores."""
     judged = scores.values()
     rows = [["CRPS", *(length_text(score.crps_um) for score in judged)]]
     for level in sorted(LEVELS, reverse=True):
@@ -252,7 +252,7 @@ def other_scores_table(
 
 
 def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
-    """Return the share of each source in the variance of some quantities, a column for each."""
+    """Return a table of the sources' shares in the variance of some quantities, by columns."""
     rows = [
         [
             source,
@@ -279,7 +279,7 @@ def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
 
 
 def loops_table(loops: Loops) -> Table:
-    """Return what was measured of the loops."""
+    """Return a table of the measures of the loops."""
     estimates = {
         f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V": loop.estimates
         for name, loop in (("Major", loops.major), ("Minor", loops.minor))
@@ -299,7 +299,7 @@ def loops_table(loops: Loops) -> Table:
 
 
 def steps_table(steps: Mapping[str, StepResponse]) -> Table:
-    """Return what was measured of the steps."""
+    """Return a table of the measures of the steps."""
     estimates = {
         f"{name}: {response.step.height:.4g} V for {response.step.held:.4g} s": response.estimates
         for name, response in steps.items()
@@ -322,7 +322,7 @@ def _measured(
     records: Sequence[Mapping[str, object]],
     note: str,
 ) -> Table:
-    """Return mean ± SD and interval of each measure that any loop or step has."""
+    """Return a table with mean ± SD and interval of each measure that any loop or step has."""
     columns: list[str | TableColumn] = ["Quantity"]
     for title in estimates:
         columns += [TableColumn("Mean ± SD", title, on="page"), TableColumn("95% interval", title)]
@@ -354,7 +354,7 @@ def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any
 
 
 def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what tables say of a parameter: its names, its unit, and estimates as known."""
+    """Return a parameter's entries for tables: its names, its unit, and the known estimates."""
     row = dict(numbers)
     for key in {"mean", "sd", "median", "lower_95", "upper_95"} & numbers.keys():
         row[key] = digits(numbers[key], numbers["sd"])
@@ -363,11 +363,11 @@ def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str,
 
 
 def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) -> Table:
-    """Return each parameter's prior, stated and in effect, or its fixed value.
+    """Return a table of each parameter's stated and effective prior, or its fixed value.
 
-    The prior in effect is what the physical constraints leave of the stated one: median and 95%
-    interval under the joint prior. On the screen it stands below the stated one where it differs.
-    ``point`` has the parameters of a point fit, if there is one.
+    The effective prior is the stated one after the physical constraints: median and 95% interval
+    under the joint prior. On the screen it stands below the stated one if it differs. ``point`` has
+    the parameters of a point fit, if there is one.
     """
     in_effect = dict(
         zip(prior.free_names, effective(prior, np.random.default_rng(0)).T, strict=True)
@@ -383,7 +383,7 @@ def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) ->
             edges = {"at least": parameter.lower, "at most": parameter.upper}
             cuts = (f", {words} {x:.6g}" for words, x in edges.items() if math.isfinite(x))
             row["stated"] = "".join([str(parameter.prior), *cuts])
-            # Constraints that move a quantile by less are not told from the draws' own error.
+            # A smaller move of a quantile cannot be distinguished from the draws' own error.
             moved = np.abs(parameter.prior.frozen.cdf(at) - [0.025, 0.5, 0.975]).max()
             effect = f"\n  effective: {row['effect']}" if moved > 0.03 else ""
             row["short"] = f"{parameter.prior}{effect}"

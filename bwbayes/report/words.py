@@ -1,4 +1,4 @@
-"""How numbers and symbols are written: as exactly as they are known, in plain characters."""
+"""Formats of numbers and symbols: numbers as exactly as they are known, in plain characters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.report import Kind
 
-# The kind of banner that goes with how a validation, or a record of a campaign, ended; else "bad".
+# Kind of banner for the outcome of a validation or of a record of a campaign; "bad" for others.
 STATUS_KINDS: Mapping[str, Kind] = {
     "passed": "good",
     "inconclusive": "note",
@@ -23,7 +23,7 @@ STATUS_KINDS: Mapping[str, Kind] = {
 
 
 def symbol(parameter: Parameter) -> Markup:
-    r"""Return a parameter's LaTeX label as HTML, or its name if that cannot be done.
+    r"""Return a parameter's LaTeX label as HTML, or its name if that is impossible.
 
     Greek letters, one subscript and ``\mathrm`` are understood.
     """
@@ -58,7 +58,7 @@ def label_with_unit(name: str, unit: str) -> str:
 def digits(value: float, sd: float) -> str:
     """Write a value as exactly as its standard deviation with two digits is written.
 
-    ``digits(0.69712, 0.0061234)`` is ``0.6971``. Far from one, with a power of ten.
+    ``digits(0.69712, 0.0061234)`` is ``0.6971``. A value far from one gets a power of ten.
     """
     if not (math.isfinite(value) and math.isfinite(sd) and sd > 0):
         return f"{value:.6g}"
@@ -71,22 +71,22 @@ def digits(value: float, sd: float) -> str:
 
 
 def with_error(value: float, sd: float) -> str:
-    """Write a value and its standard error, both as exactly as that is known."""
+    """Write a value and its standard error, both to two digits of the error."""
     return f"{digits(value, sd)} ± {digits(sd, sd)}"
 
 
 def length_text(um: float) -> str:
-    """Write a length or an error, um, with three digits: of nanometers there are as many."""
+    """Write a length or an error, um, with three significant digits, also of nanometers."""
     return f"{digits(um, abs(um) / 10)} µm"
 
 
 def mark(status: str) -> Markup:
-    """Write how something ended: on green if it passed, amber if inconclusive, red otherwise."""
+    """Write an outcome: on green if it passed, amber if inconclusive, red otherwise."""
     return Markup('<span class="mark {}">{}</span>').format(STATUS_KINDS.get(status, "bad"), status)
 
 
 def coverage_text(scores: Scores, kind: str, level: int) -> str:
-    """Write how much a band covers, with its standard error; nothing if that is not known."""
+    """Write a band's coverage with its standard error; nothing if it is not known."""
     share, error = scores.coverage[kind], scores.coverage_error[kind]
     if share is None:
         return ""
@@ -95,16 +95,16 @@ def coverage_text(scores: Scores, kind: str, level: int) -> str:
 
 
 def error_text(scores: Scores) -> str:
-    """Write the NRMSE, of the training range too where that is another than the record's own."""
+    """Write the NRMSE, also relative to the training range if that differs from the record's."""
     text, full = f"{100 * scores.nrmse:.2f}%", scores.nrmse_full
-    # A range is another where it differs by more than this part.
+    # Ranges count as different if they differ by more than this part.
     if full is None or abs(full - scores.nrmse) <= 0.05 * scores.nrmse:
         return text
     return f"{text} ({100 * full:.2f}% of the training range)"
 
 
 def circumstances(numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield what the summary knows of the run besides its results."""
+    """Yield the facts of the run in the summary besides its results."""
     if "seed" in numbers:
         yield "seed", str(numbers["seed"])
     if isinstance(wall := numbers.get("wall_s"), int | float):

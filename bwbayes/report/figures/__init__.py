@@ -1,9 +1,9 @@
 """Pictures: of a run's loops, bands along time, parameters, chains and coverage, and of products.
 
-:func:`~bwbayes.report.figures.pictures.pictures` says what there is to see of a run, and
-:func:`picture_of` draws it as PNG. This package alone knows matplotlib, Bokeh, Pillow and corner;
-it opens no window and touches no global figure. They are loaded when something is drawn: whoever
-leaves that to another process need not wait.
+:func:`~bwbayes.report.figures.pictures.pictures` lists the pictures of a run, and
+:func:`picture_of` draws one as PNG. This package alone uses matplotlib, Bokeh, Pillow and corner;
+it opens no window and touches no global figure. The libraries are loaded when something is drawn,
+so that a process that leaves drawing to another one need not wait.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["draw_styled", "picture_of", "plots_of", "prepare", "save_pictures"]
 def draw_styled(
     draw: Callable[..., Figure], *shown: Any, quantities: Quantities = DEFAULT
 ) -> Figure:
-    """Draw a figure with the look that all have, and in the words of its quantities."""
+    """Draw a figure with the common style, and in the words of its quantities."""
     import matplotlib as mpl  # noqa: PLC0415
     from matplotlib.text import Text  # noqa: PLC0415
 
@@ -44,7 +44,7 @@ def draw_styled(
 
 
 def prepare() -> None:
-    """Load what is slow to load, before there is anything to draw."""
+    """Load the slow libraries before there is anything to draw."""
     from matplotlib.backends import backend_agg  # noqa: F401, PLC0415
 
     from bwbayes.report.figures import chain, interactive  # noqa: F401, PLC0415
@@ -53,7 +53,7 @@ def prepare() -> None:
 
 
 def plots_of(result: Result) -> PagePlots:
-    """Return a run's plots to zoom and hover, and the scripts that draw them, if there are any."""
+    """Return a run's interactive plots, and the scripts that draw them, if there are any."""
     from bwbayes.report.figures import interactive  # noqa: PLC0415
     from bwbayes.report.page import NO_PLOTS, PagePlots  # noqa: PLC0415
 
@@ -64,8 +64,8 @@ def plots_of(result: Result) -> PagePlots:
 def picture_of(draw: Callable[[], Figure], quantities: Quantities = DEFAULT) -> bytes:
     """Draw a figure and return it as PNG, laid out and drawn once: ``savefig`` does either twice.
 
-    It has thousands of colors, nearly all from smooth edges. Those that come nearest to all are
-    kept: nobody sees the difference, and the file has a third of the size.
+    The figure has thousands of colors, nearly all from smooth edges. The PNG keeps the palette that
+    comes nearest to all: nobody sees the difference, and the file has a third of the size.
     """
     import matplotlib as mpl  # noqa: PLC0415
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
@@ -87,7 +87,7 @@ def picture_of(draw: Callable[[], Figure], quantities: Quantities = DEFAULT) -> 
 def save_pictures(pictures: Mapping[str, bytes], folder: Path) -> None:
     """Write pictures, PNG by name, to ``folder/NAME.png``.
 
-    The folder is made if need be; what a file name may not hold is percent-encoded.
+    The folder is made if need be; characters that a file name may not hold are percent-encoded.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():

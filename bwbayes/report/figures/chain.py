@@ -20,7 +20,7 @@ from bwbayes.report.result import Result
 
 RANK_BINS = 20
 
-# How corner draws a pair: contours whose fillings are opaque, and so hide the draws below them.
+# Options of corner for a pair: the contours are filled and opaque, and so hide the draws below.
 CONTOURS: style.Look = {
     "levels": (0.5, 0.9),
     "color": style.COLORS[0],
@@ -51,8 +51,8 @@ def pair_contours() -> Callable[..., None]:
 def draw_corner(result: Result) -> Figure:
     """Draw every pair of free parameters, with contours that hold 50 and 90% of the draws.
 
-    The true values, where they are known, are lines. All is in one panel, where each parameter has
-    a cell of side one in each direction: panels of their own would take many times as long.
+    Lines mark the true values, if they are known. One panel holds all, and each parameter has a
+    cell of side one in each direction: separate panels would take many times as long.
     """
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
@@ -100,13 +100,13 @@ def draw_corner(result: Result) -> Figure:
 
 
 def _scale(values: Any, limits: tuple[float, float]) -> Any:
-    """Return where values are within their cell: 0 at its lower limit, 1 at its upper."""
+    """Return the positions of values in their cell: 0 at its lower limit, 1 at its upper."""
     low, high = limits
     return (values - low) / (high - low)
 
 
 def _label(axis: Axis, starts: Iterable[int], ranges: Sequence[tuple[float, float]]) -> None:
-    """Label the cells along an axis with their values, away from where they meet."""
+    """Label the cells along an axis with their values, away from the cells' corners."""
     ticks, texts = [], []
     for start, (low, high) in zip(starts, ranges, strict=True):
         for value in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high):
@@ -128,16 +128,17 @@ def _range(draws: FloatArray, truth: float | None) -> tuple[float, float]:
 
 
 def draw_trace(result: Result) -> Figure:
-    """Draw, step by step, each ensemble's mean over its walkers and where 90% of them are.
+    """Draw each ensemble's mean over its walkers, and the range of 90% of them, by steps.
 
-    All parameters, and the log density. Ensembles that stay apart or drift have not converged.
+    The figure shows all parameters, and the log density. Ensembles that stay apart or drift have
+    not converged.
     """
     names = [*map(style.axis_label, result.free), "log density (nats)"]
     steps = style.starts(result.draws.shape[0], 400)
     series = np.concatenate([result.draws[steps], result.log_density[steps][..., None]], axis=-1)
     series = np.where(np.isfinite(series), series, np.nan)
     mean = np.mean(series, axis=2)
-    # The quantiles are those of fifty stretches of steps; the last one's stand at its end, too.
+    # The quantiles are those of fifty segments of steps; the last ones also stand at its end.
     cuts = np.append(style.starts(steps.size, 50), steps.size)
     spread = [
         np.quantile(series[a:b], [0.05, 0.95], axis=(0, 2)) for a, b in itertools.pairwise(cuts)
@@ -163,7 +164,7 @@ def _look(ensemble: int) -> style.Look:
 
 
 def _limits(*drawn: FloatArray) -> tuple[float, float]:
-    """Return the limits of a cell that holds all that is drawn, below its name."""
+    """Return the limits of a cell with room for all lines, below its name."""
     values = np.concatenate([x[np.isfinite(x)] for x in drawn])
     low, high = (values.min(), values.max()) if values.size else (0.0, 0.0)
     size = float(high - low) or abs(low) or 1.0
@@ -173,9 +174,9 @@ def _limits(*drawn: FloatArray) -> tuple[float, float]:
 def _columns_of_cells(
     names: Sequence[str], limits: Sequence[tuple[float, float]], xlabel: str
 ) -> tuple[Figure, list[tuple[Axes, int]]]:
-    """Return a figure with named cells in two columns: the panel of each, and its bottom there.
+    """Return a figure with named cells in two columns, and each cell's panel and bottom.
 
-    A column is one panel, in which the cells, each of height one, have values of their own.
+    A column is one panel, in which the cells, each of height one, have separate values.
     """
     rows = -(-len(names) // 2)
     figure, (panels,) = style.new_figure(11, 1.4 * rows + 0.9, 1, 2)
@@ -192,12 +193,12 @@ def _columns_of_cells(
 
 
 def draw_ranks(result: Result) -> Figure:
-    """Draw, for each parameter, how the ranks of each ensemble's draws among all are spread.
+    """Draw the distribution of the ranks of each ensemble's draws among all, by parameter.
 
-    Ensembles that draw from the same distribution have ranks that are spread evenly: each line
-    stays near one, 19 times out of 20 inside the gray band. The band is what independent draws
-    show, one for each autocorrelation time τ of each walker: with n draws of E ensembles in B bins
-    its half width is 1.96 √((B − 1)(E − 1) τ/n).
+    Ensembles that draw from the same distribution have uniform ranks: each line stays near one, 19
+    times out of 20 inside the gray band. The band is that of independent draws, one for each
+    autocorrelation time τ of each walker: with n draws of E ensembles in B bins its half width is
+    1.96 √((B − 1)(E − 1) τ/n).
     """
     steps, ensembles, walkers, free = result.draws.shape
     # About 100,000 draws are ranked.
@@ -223,9 +224,9 @@ def draw_ranks(result: Result) -> Figure:
 
 
 def _rank_heights(draws: FloatArray) -> FloatArray:
-    """Return (ensembles, bins) counts of ranks, over what they are expected to be.
+    """Return counts of ranks (ensembles, bins), relative to the expected counts.
 
-    ``draws`` is (steps, ensembles, walkers); what is not a number has no rank.
+    ``draws`` is (steps, ensembles, walkers); nan has no rank.
     """
     _, order, equal = np.unique(draws, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(equal) - equal / 2)[order] / draws.size

@@ -22,8 +22,8 @@ from bwbayes.report.figures import style
 COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.Color.MEAN}
 
 
-# By name, "uncompensated" and "compensated": what has the command's ``voltage`` (samples,), V, its
-# ``bands`` of the displacement, and its ``rms`` errors (draws,), um.
+# Commands by name, "uncompensated" and "compensated": objects with ``voltage`` (samples,), V,
+# ``bands`` of the displacement, and ``rms`` errors (draws,), um.
 type Commands = Mapping[str, Any]
 
 
@@ -32,7 +32,7 @@ def draw_command(
 ) -> Figure:
     """Draw voltage, displacement and error along time, beside those without compensation.
 
-    ``reference`` (samples,), um, is what was asked for; ``limit``, um, that of the error.
+    ``reference`` (samples,), um, is the desired displacement; ``limit``, um, that of the error.
     """
     figure, panels = style.new_figure(10, 6.5, 3, gap=0.15, sharex=True, height_ratios=(1, 2, 2))
     top, center, below = panels[:, 0]
@@ -52,11 +52,11 @@ def draw_command(
 
 
 def draw_error(reference: FloatArray, commands: Commands, limit: float | None) -> Figure:
-    """Draw the error along time with its bands, and what its rms may be over the draws."""
+    """Draw the error along time with its bands, and the distribution of its rms over the draws."""
     figure, ((along, spread),) = style.new_figure(10, 3.6, 1, 2, width_ratios=(2, 1))
     _draw_errors(along, reference, {"compensated": commands["compensated"]}, limit)
     rms = np.concatenate([command.rms for command in commands.values()])
-    # Errors are mostly far from zero; where they are not, all of them may be zero, or alike.
+    # Errors are mostly far from zero; if they are not, all of them may be zero, or equal.
     low = max(float(rms.min()), 1e-9)
     bins = np.geomspace(low, max(float(rms.max()), 1.1 * low), 61)
     for label, command in commands.items():
@@ -99,7 +99,7 @@ def _draw_errors(
 
 
 def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
-    """Draw the rms errors of the controllers: mean over the draws, and where 95% of them lie.
+    """Draw the rms errors of the controllers: mean over the draws, and the range of 95% of them.
 
     The table is a pandas.DataFrame with a row for each signal, frequency and controller.
     """
@@ -125,7 +125,7 @@ def draw_tracking(table: Any, controllers: Iterable[str]) -> Figure:
 def draw_promises(
     names: Sequence[str], remaining: FloatArray, error: FloatArray, label: str
 ) -> Figure:
-    """Draw a dot with two standard errors for each candidate; nothing new at 100%.
+    """Draw a dot with two standard errors for each candidate; one at 100% adds no information.
 
     ``remaining`` and ``error`` (candidates,) are parts, the best first.
     """

@@ -1,4 +1,4 @@
-"""A fit in pictures, besides series and draws: coverage, residuals, measured loops and steps."""
+"""Figures of a fit, besides series and draws: coverage, residuals, measured loops and steps."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ BAND = "95% parameters"
 def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) -> Figure:
     """Draw the coverage of the 50, 90 and 95% bands, and the histogram of the PIT.
 
-    Whiskers are one block-bootstrap standard error either way. Where the sensor's distribution is
-    right the PIT, its probability below each reading, is spread evenly: a hump tells of bands that
-    are too wide, a bowl of bands that are too narrow, a slope of a bias.
+    Whiskers are one block-bootstrap standard error either way. If the sensor's distribution is
+    right the PIT, its probability below each reading, is uniform: a hump means bands that are too
+    wide, a bowl bands that are too narrow, a slope a bias.
     """
     scored = [bands for bands in predictions if bands.name in scores]
     figure, ((nominal, pit),) = style.new_figure(11, 4.2, 1, 2)
@@ -36,7 +36,7 @@ def draw_coverage(predictions: Sequence[Bands], scores: Mapping[str, Scores]) ->
     for i, bands in enumerate(scored):
         color, name = style.COLORS[i % len(style.COLORS)], style.plain(style.title(bands))
         score, center = scores[bands.name], x + 0.14 * (i - (len(scored) - 1) / 2)
-        # Filled is what a measurement can check, open what only a simulation can.
+        # Filled markers show bands that a measurement can check, open ones need a simulation.
         for kind, shift, marker, fill in (
             ("sensor", -0.03, "o", "full"),
             ("displacement", 0.03, "s", "none"),
@@ -99,7 +99,7 @@ def _draw_quantiles(panel: Axes, white: FloatArray) -> None:
     rows = np.arange(size)
     at = rows[(rows < 100) | (rows >= size - 100) | (rows % max(1, size // 600) == 0)]
     expected = scipy.special.ndtri((at + 0.5) / size)
-    # Where each of so many independent ones lies, pointwise, from the beta distribution.
+    # Pointwise limits of each of so many independent innovations, from the beta distribution.
     low, high = (
         scipy.special.ndtri(scipy.special.betaincinv(at + 1, size - at, level))
         for level in (0.025, 0.975)
@@ -133,7 +133,7 @@ def _draw_time(panel: Axes, time: FloatArray, white: FloatArray) -> None:
 
 
 def _draw_drive(panel: Axes, innovations: Innovations) -> None:
-    """Draw mean and sd in parts of the drive, with the errors that chance gives them."""
+    """Draw mean and sd in parts of the drive, with their standard errors."""
     ticks: dict[float, str] = {}
     sizes: list[tuple[float, float, int]] = []
     start = 0.0
@@ -171,7 +171,7 @@ def _draw_drive(panel: Axes, innovations: Innovations) -> None:
 def draw_spectrum(residual: tuple[FloatArray, FloatArray], noise: FloatArray) -> Figure:
     """Draw the amplitude spectral density of the residual and of the noise model, um/√Hz.
 
-    ``residual`` are its frequencies, Hz, and its density, ``noise`` is the model's density there.
+    ``residual`` is (frequencies, Hz, density), ``noise`` is the model's density there.
     """
     frequency, density = residual
     figure, ((panel,),) = style.new_figure(11, 4.2)
@@ -183,7 +183,7 @@ def draw_spectrum(residual: tuple[FloatArray, FloatArray], noise: FloatArray) ->
 
 
 def draw_agreement(agreements: Mapping[str, Consistency]) -> Figure:
-    """Draw each record's residuals, along time, in the joint fit and in a fit of its own."""
+    """Draw each record's residuals along time, in the joint fit and in its single fit."""
     count = len(agreements)
     figure, panels = style.new_figure(11, 0.9 + 1.9 * count, count, gap=0.5)
     for (panel,), (name, agreement) in zip(panels, agreements.items(), strict=True):
@@ -204,9 +204,9 @@ def draw_agreement(agreements: Mapping[str, Consistency]) -> Figure:
 
 
 def draw_loops(loops: Loops) -> Figure:
-    """Draw displacement against voltage, and on the right less the major loop's straight line.
+    """Draw displacement against voltage, and on the right minus the major loop's straight line.
 
-    On the scale of the whole loop its band is a line's width; less the line it can be seen.
+    On the scale of the whole loop its band is as thin as a line; without the line it can be seen.
     """
     figure, ((loop_axes, tilted),) = style.new_figure(11, 4.8, 1, 2)
     major, minor = loops.major, loops.minor

@@ -1,8 +1,8 @@
-"""Loop and time series to zoom and hover in the report, drawn by Bokeh in the reader's browser.
+"""Interactive loop and time series in the report, drawn by Bokeh in the reader's browser.
 
-:func:`draw` returns each plot as the JSON that goes into the page; :func:`scripts` what draws it
-there, Bokeh's own script and a few lines that hand it the plots. Long series are thinned to what a
-screen can show: each stretch keeps its least and its largest value.
+:func:`draw` returns each plot as JSON for the page; :func:`scripts` returns the scripts that draw
+it there, Bokeh's own and a few lines that hand it the plots. Long series are thinned to the
+resolution of a screen: each segment keeps its least and its largest value.
 """
 
 from __future__ import annotations
@@ -35,23 +35,24 @@ FONT_SIZE = "13px"
 
 
 def scripts() -> list[Markup]:
-    """Return what draws the plots: Bokeh, and the lines that hand it what is in the page."""
+    """Return the scripts for the plots: Bokeh, and the lines that hand it the page's plots."""
     script = files("bwbayes.report").joinpath("templates/plots.js").read_text(encoding="utf-8")
     core = INLINE.js_raw[0]  # without widgets, tables and mathematics
     return [Markup(text) for text in (core, script)]
 
 
 def draw(result: Result) -> dict[str, Markup]:
-    """Return a run's plots by the name of the figure that shows the same: JSON for the page.
+    """Return a run's plots, JSON for the page, by the name of the figure that shows the same.
 
-    ``loop`` and ``bands_NAME`` for each of the result's bands; nothing without convergence.
+    The names are ``loop``, and ``bands_NAME`` for each of the result's bands; there are no plots
+    without convergence.
     """
     plots: dict[str, models.Model] = {
         f"bands_{bands.name}": _series(bands) for bands in result.predictions
     }
     loops = [_loop(bands) for bands in sorted(result.looped, key=lambda b: b.training)]
     if loops:
-        # A row goes on below where it is too narrow.
+        # A row that is too narrow wraps.
         plots["loop"] = row(*loops, sizing_mode="stretch_width", styles={"flex-wrap": "wrap"})
     say = result.quantities.say
     return {name: _page_json(plot, i, say) for i, (name, plot) in enumerate(plots.items())}
@@ -62,7 +63,7 @@ def _said(node: Any, say: Callable[[str], str], key: str = "") -> Any:
     if isinstance(node, str):
         return say(node) if key in ("axis_label", "text", "value", "tooltips") else node
     if isinstance(node, list):
-        # Of a tooltip the label; what it shows is a column of the source.
+        # Change a tooltip's label, not its value, which names a column of the source.
         is_pair = key == "tooltips" and len(node) == 2 and isinstance(node[0], str)
         return [say(node[0]), node[1]] if is_pair else [_said(item, say, key) for item in node]
     if isinstance(node, dict):
@@ -71,9 +72,9 @@ def _said(node: Any, say: Callable[[str], str], key: str = "") -> Any:
 
 
 def _page_json(plot: models.Model, number: int, say: Callable[[str], str]) -> Markup:
-    """Return a plot as JSON that may stand in HTML, and is the same whenever it is drawn.
+    """Return a plot as JSON that is safe in HTML, and the same whenever it is drawn.
 
-    Bokeh numbers its models on through a process; here they are numbered through the plot.
+    Bokeh numbers its models throughout a process; here they are numbered within the plot.
     """
     document = Document()
     document.add_root(plot)
@@ -185,7 +186,7 @@ def _dots(x: str, y: str, size: float, alpha: float) -> models.Scatter:
 
 
 def _tips(bands: Bands) -> str:
-    """Return what hovering shows: each number of the sample below the pointer."""
+    """Return the tooltip: each number of the sample below the pointer."""
     tips = {"time": "@time{0.0000} s", "voltage": "@voltage{0.00} V"}
     if bands.measured is not None:
         tips["measured"] = "@measured{0.000} µm"
@@ -196,10 +197,10 @@ def _tips(bands: Bands) -> str:
 
 
 def kept(bands: Bands, samples: int, count: int = 500) -> IntArray:
-    """Return the samples to draw of a window: the ends, and the extremes of each stretch.
+    """Return the samples to draw of a window: the ends, and the extremes of each segment.
 
-    Those of voltage, mean, and readings minus mean: no excursion is lost, and what hovering shows
-    are samples as they are. A record of so many ``samples`` has at most ``count`` stretches, each
+    The extremes are those of voltage, mean, and readings minus mean: no excursion is lost, and
+    tooltips show real samples. A record of so many ``samples`` has at most ``count`` segments, each
     with up to six samples: more in all than a screen has pixels.
     """
     size = bands.time.size
@@ -208,13 +209,13 @@ def kept(bands: Bands, samples: int, count: int = 500) -> IntArray:
     chosen = [np.array([0, size - 1])]
     residual = bands.mean if bands.measured is None else bands.measured - bands.mean
     for values in (bands.mean, bands.voltage, np.nan_to_num(residual)):
-        # Sorted by stretch and value, each stretch begins with its least.
+        # Sorted by segment and value, each segment begins with its least value.
         chosen += [np.lexsort((order * values, stretch))[first] for order in (1, -1)]
     return np.unique(np.concatenate(chosen))
 
 
 def _columns(bands: Bands, *, residuals: bool) -> dict[str, FloatArray]:
-    """Return all that is drawn, by name, in single precision; less the mean, too, if need be."""
+    """Return all series to draw by name, single precision; ``residuals`` adds them minus mean."""
     series = {"mean": bands.mean}
     if bands.measured is not None:
         series["measured"] = bands.measured
@@ -235,7 +236,7 @@ def _loop(bands: Bands) -> figure:
         430,
         "displacement (µm)",
         x_axis_label="voltage (V)",
-        title=style.title(bands).replace(" (", "\n("),  # a narrow plot cuts off what does not fit
+        title=style.title(bands).replace(" (", "\n("),  # a narrow plot cuts off its title
         toolbar_location="above",
         styles={"flex": "1 1 240px"},
     )

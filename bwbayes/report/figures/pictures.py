@@ -1,4 +1,4 @@
-"""The pictures of a run, in the order in which one looks at them, and what is said of each."""
+"""The pictures of a run, in reading order, with their titles and captions."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ type Pictures = dict[str, Picture]
 
 
 def pictures(result: Result) -> Pictures:
-    """Return the pictures of a run by name, as far as what they show is known by now.
+    """Return the pictures of a run by name, those whose content is known so far.
 
-    ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME`` for each of
-    the result's bands, ``coverage``, ``innovations`` and ``spectrum`` (of several records
-    ``innovations_NAME`` and so on), ``corner``, ``trace`` and ``ranks``. Without convergence only
-    the last two; without bands or a measurement to hold them against, what needs them is left out.
+    The names are ``loop``, ``agreement`` (of several records), ``loops``, ``steps``, ``bands_NAME``
+    for each of the result's bands, ``coverage``, ``innovations`` and ``spectrum`` (for several
+    records ``innovations_NAME`` and so on), ``corner``, ``trace`` and ``ranks``. Without
+    convergence there are only the last two; without bands or readings, pictures that need them are
+    left out.
     """
     shown: dict[str, tuple[Any, ...]] = {}
     if result.outcome.converged:
@@ -34,7 +35,7 @@ def pictures(result: Result) -> Pictures:
         for name, innovations in result.innovations.items():
             shown[f"innovations_{name}" if several else "innovations"] = (innovations,)
         for name, innovations in result.innovations.items():
-            # Taken here: whoever draws need not load what takes them.
+            # Compute the densities here, so that a drawing process need not load their modules.
             residual = innovations.residual_density()
             noise = innovations.noise_density(residual[0])
             shown[f"spectrum_{name}" if several else "spectrum"] = residual, noise
@@ -60,8 +61,8 @@ def draw_kind(kind: str, *shown: Any) -> Figure:
     return figure
 
 
-# By the first word of a picture's name: the module that draws it, its title, how to read it, and
-# what to say to those who do not see it.
+# Module that draws a picture, its title, its caption and its alternative text, by the first word of
+# the picture's name.
 PICTURES = {
     "loop": (
         "series",

@@ -19,10 +19,10 @@ from bwbayes.report.report import Picture
 def record_pictures(
     record: Record, training: Sequence[slice], findings: Sequence[Finding], name: str = ""
 ) -> dict[str, Picture]:
-    """Return the pictures of a record: ``time``, ``loop``, ``drive``; ``name`` is one of several.
+    """Return the pictures of a record: ``time``, ``loop``, ``drive``; ``name`` is set for several.
 
-    Readings outside of the ``training`` windows are shown in gray; where only a part of the record
-    has a finding, the part is marked.
+    Readings outside of the ``training`` windows are shown in gray; a part of the record that has a
+    finding is marked.
     """
     kinds: dict[str, tuple[str, str, Callable[[], Figure]]] = {
         "time": (
@@ -63,7 +63,7 @@ def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Fin
         if rows.size < 2000:
             panels[1].plot(time, values, ".", color=style.Color.MEASURED, ms=2.5, mew=0)
         else:
-            # More readings are shown as a line, which ends at a gap that is longer than usual.
+            # Show more readings as a line, which ends at a gap that is longer than usual.
             steps = np.diff(rows, prepend=rows[0])
             values = np.where(steps > 3 * np.median(steps), np.nan, values)
             panels[1].plot(*style.zigzag(time, values), color=style.Color.MEASURED, lw=0.7)
@@ -78,7 +78,7 @@ def _draw_time(record: Record, training: Sequence[slice], findings: Sequence[Fin
 def _mark(
     panel: Axes, record: Record, training: Sequence[slice], findings: Sequence[Finding]
 ) -> None:
-    """Show what is not fitted, and the parts of the record with which something is wrong."""
+    """Mark the parts of the record that are not fitted, and those with a finding."""
     at, end = record.start, record.start + record.duration
     fitted = [
         (record.time[window.start], record.start + window.stop * record.interval)
@@ -112,19 +112,19 @@ def _draw_loop(record: Record) -> Figure:
 
 
 def _draw_drive(record: Record, points: int = 1500) -> Figure:
-    """Draw the spectrum of the voltage, above its mean, from one period a record on."""
+    """Draw the spectrum of the voltage minus its mean, from one period in a record on."""
     frequency, power = scipy.signal.periodogram(
         record.voltage, 1 / record.interval, "hann", scaling="spectrum"
     )
     frequency, amplitude = frequency[1:], np.sqrt(2 * power[1:])
     top, bottom = float(amplitude.max()), float(amplitude.min())
     if frequency.size > points:
-        # The largest of each of some stretches that look alike on a log axis.
+        # Take the largest value of each of some segments of equal width on a log axis.
         first = np.unique(np.geomspace(1, frequency.size, points).astype(np.int64)) - 1
         frequency, amplitude = frequency[first], np.maximum.reduceat(amplitude, first)
     figure, ((panel,),) = style.new_figure(6.4, 3.8)
     panel.loglog(frequency, amplitude, color=style.COLORS[0], lw=0.9)
-    # Six decades below the peak.
+    # Show six decades below the peak.
     panel.set_ylim(max(top * 10.0**-6, bottom / 2, 1e-12), 3 * top)
     panel.set(xlabel="frequency (Hz)", ylabel="amplitude of the voltage (V)")
     return figure

@@ -1,4 +1,4 @@
-"""Bands in pictures: along time, whole and where the error is largest, and as hysteresis loops."""
+"""Figures of bands: along time, whole and around the largest error, and as hysteresis loops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import Bands, Kind
 from bwbayes.report.figures import style
 
-# A series with fewer samples than this shows dots and the truth, a longer one only pixels.
+# Number of samples below which a series shows dots and the truth.
 DOTS = 2000
 
 
@@ -85,10 +85,10 @@ def _draw_readings(panel: Axes, time: FloatArray, readings: FloatArray) -> None:
 
 
 def _around_largest_error(bands: Bands, height: float = 8.0, min_samples: int = 40) -> slice:
-    """Return the judged samples about the largest error, within their window.
+    """Return the scored samples around the largest error, within their window.
 
-    As many as show at most ``height`` sensor bands of displacement, and a tenth of all samples, but
-    at least ``min_samples`` to either side.
+    They show at most ``height`` sensor bands of displacement, and a tenth of all samples, but at
+    least ``min_samples`` samples to either side.
     """
     judged = slice(min(bands.scored_from, bands.time.size - 1), None)
     error = np.abs(bands.mean if bands.measured is None else bands.measured - bands.mean)
@@ -109,15 +109,15 @@ LOOP_KINDS: tuple[Kind, ...] = ("sensor", "parameter")
 def draw_loop(predictions: Sequence[Bands]) -> Figure:
     """Draw displacement against voltage, one column for each of the bands.
 
-    Above the whole loop, below its tip at the largest voltage, where a band that is thin on the
-    loop's scale can be seen.
+    The upper panel shows the whole loop, the lower one its tip at the largest voltage, where a band
+    that is thin on the loop's scale can be seen.
     """
     columns = len(predictions)
     figure, axes = style.new_figure(max(3.6 * columns, 6.0), 7.2, 2, columns)
     for (full, tip), bands in zip(axes.T, predictions, strict=True):
         _draw(full, bands, ",")
         _draw(tip, bands, ".")
-        # The tip's panel is as high as four sensor bands, or half the loop if that is less, and a
+        # The tip's panel has the height of four sensor bands, or of half the loop if less, and a
         # tenth of it lies beyond the tip.
         inside = slice(None) if bands.inside is None else bands.inside
         voltage = bands.voltage[inside]
@@ -141,7 +141,7 @@ def draw_loop(predictions: Sequence[Bands]) -> Figure:
 def _draw(panel: Axes, bands: Bands, dot: str) -> None:
     for segment in map(path, style.segments(bands)):
         for kind in LOOP_KINDS:
-            # Opaque: what overlaps where the path turns must not look like a denser band.
+            # Bands are opaque: their overlap at a reversal must not look like a denser band.
             look: style.Look = {
                 "facecolor": style.BAND_COLORS[kind],
                 "edgecolor": style.BAND_COLORS[kind],
@@ -153,7 +153,7 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
         panel.plot(segment.voltage, segment.mean, color=style.Color.MEAN, lw=0.7, label="mean")
     if bands.measured is not None:
         panel.plot([], [], ".", color=style.Color.MEASURED, label="measured")
-        # Few readings have large and dark dots.
+        # Draw few readings as large and dark dots.
         size, alpha, marker = (3.0, 0.7, ".") if bands.measured.size <= 5000 else (2.0, 0.25, dot)
         dots: style.Look = {"ls": "", "ms": size, "mew": 0.0, "zorder": 1.5, "alpha": alpha}
         panel.plot(bands.voltage, bands.measured, marker=marker, color=style.Color.MEASURED, **dots)
@@ -162,10 +162,10 @@ def _draw(panel: Axes, bands: Bands, dot: str) -> None:
 
 
 def path(bands: Bands, density: int = 300) -> Bands:
-    """Return the samples of a window that are drawn: one for each small step along the loop.
+    """Return the samples of a window to draw: one for each small step along the loop.
 
     A fast signal keeps its samples, a slow one loses those that fall on the same spot: there are
-    ``density`` points in a unit of length, the ranges of voltage and displacement being one each.
+    ``density`` points in a unit of length, which is the range of voltage or displacement.
     """
     steps = [np.diff(x) / max(float(np.ptp(x)), 1e-300) for x in (bands.voltage, bands.mean)]
     length = np.append(0.0, np.cumsum(np.hypot(*steps)))
@@ -174,7 +174,7 @@ def path(bands: Bands, density: int = 300) -> Bands:
 
 
 def polygons(bands: Bands, kind: Kind) -> Iterator[FloatArray]:
-    """Yield the corners (corners, 2) of a 95% band along a path, from each turn to the next."""
+    """Yield the corners (corners, 2) of a 95% band along a path, between each two reversals."""
     voltage, lower, upper = bands.voltage, bands.lower[kind, 95], bands.upper[kind, 95]
     rising = np.diff(voltage) > 0
     turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1

@@ -1,4 +1,4 @@
-"""Studies of many fits: whether ranks are even and bands cover; records with their population."""
+"""Figures of many fits: uniformity of ranks, coverage of bands, records with their population."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from bwbayes.report.words import label_with_unit
 
 
 def draw_histograms(calibration: Calibration, bins: int = 20) -> Figure:
-    """Draw how the ranks of each statistic are spread, over what is expected.
+    """Draw the rank histogram of each statistic, relative to the expected counts.
 
-    The gray band holds each bar of an even statistic with a probability of 99%.
+    The gray band holds each bar of a uniform statistic with a probability of 99%.
     """
     count = calibration.positions.shape[0]
     low, high = (x * bins / count for x in scipy.stats.binom.interval(0.99, count, 1 / bins))
@@ -38,7 +38,7 @@ def draw_histograms(calibration: Calibration, bins: int = 20) -> Figure:
 
 
 def draw_ecdf(calibration: Calibration) -> Figure:
-    """Draw each distribution function of ranks less that of even ones, and its band."""
+    """Draw each distribution function of ranks minus the uniform one, and its band."""
     count, limit = calibration.positions.shape[0], 100 * calibration.ecdf_limit
     figure, panels = _rank_panels(calibration, "ECDF less\neven ECDF (%)")
     steps = np.repeat(np.arange(count + 1) / count, 2)
@@ -118,9 +118,10 @@ def draw_parameters(
 ) -> Figure:
     """Draw a panel for each parameter: the records' 95% intervals in the order of their names.
 
-    ``records`` are the records' estimates by parameter, as ``campaign.json`` has them, ``new`` the
-    draws of a specimen not measured yet. Gray alone and blue with the population for a prior, the
-    population's median and where 95% of specimens not measured yet lie. Outliers are red.
+    ``records`` are the records' estimates by parameter, as in ``campaign.json``, ``new`` the draws
+    of a new specimen. Intervals of a single fit are gray, those with the population as the prior
+    blue; the panel also shows the population's median and the range of 95% of new specimens.
+    Outliers are red.
     """
     units = {
         name: estimate["unit"]

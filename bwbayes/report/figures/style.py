@@ -1,4 +1,4 @@
-"""Style of all figures: their look, axis labels, and how long series are thinned.
+"""Style of all figures: their look, their axis labels, and the thinning of long series.
 
 The colors are Okabe and Ito's, which color-blind readers can tell apart; bands differ by
 lightness besides.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# How something looks: keywords of what draws it.
+# Look of an artist: keyword arguments of the function that draws it.
 type Look = dict[str, Any]
 
 STYLE: dict[Any, Any] = {
@@ -57,13 +57,13 @@ class Color:
     TRUTH = "#E69F00"
     LEAD_IN = "#999999"
     EXPECTED = "#777777"
-    CHANCE = "#dddddd"  # what chance does
+    CHANCE = "#dddddd"  # range of chance
     ZOOM = "#CC79A7"
     EDGE = "#12344D"  # of the sensor band
     CORRECTED = "#009E73"
 
 
-# From the widest band, drawn first, to the narrowest.
+# Colors of the bands, from the widest one, drawn first, to the narrowest.
 BAND_COLORS: Mapping[Kind, str] = {
     "sensor": "#DCEAF4",
     "displacement": "#ACD0E8",
@@ -78,7 +78,7 @@ CORRECTED = "95% sensor reading, corrected"
 
 
 def plain(text: str) -> str:
-    """Return a text that matplotlib will not read as mathematics."""
+    """Escape a text so that matplotlib does not read it as mathematics."""
     return text.replace("$", r"\$")
 
 
@@ -95,17 +95,17 @@ def axis_label(parameter: Parameter) -> str:
 
 
 def title(bands: Bands) -> str:
-    """Return the bands' name, and what they are of."""
+    """Return the title of bands: their name and kind."""
     return title_of(bands.name, training=bands.training, separate=bands.separate)
 
 
 def time_label(offset: float) -> str:
-    """Return the label of a time axis; ``offset`` is what the file's own clock adds to it, s."""
+    """Return the label of a time axis; ``offset``, s, is added to it by the file's own clock."""
     return f"time after {offset:.15g} s (s)" if offset else "time (s)"
 
 
 def segments(bands: Bands) -> list[Bands]:
-    """Return the bands of each window by itself: no line or area goes from one to the next."""
+    """Return the bands of each window separately, so that no line or area joins two windows."""
     return [bands.within([window]) for window in bands.windows]
 
 
@@ -121,17 +121,17 @@ def choose(bands: Bands, rows: IntArray) -> Bands:
 
 
 def starts(samples: int, count: int) -> IntArray:
-    """Return the first samples of at most ``count`` stretches of nearly equal length."""
+    """Return the first samples of at most ``count`` segments of nearly equal length."""
     return np.linspace(0, samples, min(samples, count), endpoint=False).astype(np.int64)
 
 
 def envelope(
     time: FloatArray, lower: FloatArray, upper: FloatArray, count: int = 1500
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Thin a band to ``count`` stretches, each with its least and largest edge.
+    """Thin a band to ``count`` segments, each with its least and largest edge.
 
-    Every excursion stays visible, which it would not if samples were left out; a stretch of nothing
-    but nan stays a gap.
+    Every excursion stays visible, which it would not if samples were left out; a segment of nan
+    alone stays a gap.
     """
     first = starts(time.size, count)
     return time[first], np.fmin.reduceat(lower, first), np.fmax.reduceat(upper, first)
@@ -140,7 +140,7 @@ def envelope(
 def zigzag(
     time: FloatArray, values: FloatArray, count: int = 1500
 ) -> tuple[FloatArray, FloatArray]:
-    """Thin a line to the least and the largest value of ``count`` stretches."""
+    """Thin a line to the least and the largest value of ``count`` segments."""
     if time.size <= 2 * count:
         return time, values
     at, low, high = envelope(time, values, values, count)
@@ -152,8 +152,8 @@ def new_figure(
 ) -> tuple[Figure, Any]:
     """Return a figure, inches, and its panels (rows, columns); ``options`` are of ``subplots``.
 
-    Margins are fixed, with ``gap`` inches between the rows: to measure all labels takes as long as
-    to draw them. Where labels may be long the figure's layout should be constrained.
+    Margins are fixed, with ``gap`` inches between the rows: measuring all labels takes as long as
+    drawing them. If labels may be long the figure's layout should be constrained.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  # pages need words alone
 
@@ -161,7 +161,7 @@ def new_figure(
     panels = figure.subplots(rows, columns, squeeze=False, **options)
     left, right, bottom, top = 0.85, width - 0.15, 0.55, height - 0.3
     figure.subplots_adjust(left / width, bottom / height, right / width, top / height)
-    # Between panels, as a part of the size of one.
+    # The space between panels is a part of the size of one.
     figure.subplots_adjust(
         wspace=0.8 * columns / (right - left - 0.8 * (columns - 1)),
         hspace=gap * rows / (top - bottom - gap * (rows - 1)),
@@ -203,7 +203,7 @@ def draw_ribbons(
     about: float | FloatArray = 0.0,
     kinds: Sequence[Kind] = tuple(BAND_COLORS),
 ) -> None:
-    """Draw 95% bands along time less something, the widest first, the sensor's with an edge."""
+    """Draw 95% bands minus ``about`` along time, the widest first, the sensor's with an edge."""
     for kind in kinds:
         # Where the sensor's noise is small, its band would not be seen beside the displacement's.
         edge: Look = {"ec": Color.EDGE, "ls": "--"} if kind == "sensor" else {"lw": 0.0}
@@ -214,7 +214,7 @@ def draw_ribbons(
 
 
 def share_legend(figure: Figure, ncols: int = 8, band: str = "") -> None:
-    """Put one legend of all panels above them; ``band`` names what :func:`draw_band` fills."""
+    """Put one legend of all panels above them; ``band`` names the area of :func:`draw_band`."""
     if band:
         figure.axes[0].fill_between([], [], fc="#888888", alpha=0.3, lw=0, label=band)
     handles: dict[str, Artist] = {}
