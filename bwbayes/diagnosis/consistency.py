@@ -1,4 +1,4 @@
-"""Consistency of jointly fitted records: each under the joint fit, and under a fit of its own.
+"""Consistency of jointly fitted records: each under the joint fit, and under a single fit.
 
 A joint fit assumes that all its records are of one actuator. If one of them was measured with
 another gain or mounting, the joint posterior lies between them and fits none. So each record is

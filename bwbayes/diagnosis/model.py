@@ -146,7 +146,7 @@ def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 
 def heavy_tails(scene: ResidualAnalysis) -> Iterator[Explanation]:
-    """Try innovations of a Student t distribution, of whatever scale, if any is an outlier."""
+    """Try innovations of a Student t distribution of any scale, if there is an outlier."""
     white = scene.innovations
     far = np.abs(white) > 5
     if not far.any():

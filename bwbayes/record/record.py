@@ -4,7 +4,7 @@ A :class:`Record` is what every file is read into and what every later step star
 are volts, micrometers and seconds, its arrays cannot be written to, and its :attr:`Record.sha256`
 names the data exactly. Parts of a record are addressed by time: a window is the pair (start, stop).
 The voltage is known at every sample, since it drives the simulation; a displacement may be missing
-(nan), and what is missing is not judged.
+(nan), and missing readings are not scored.
 """
 
 from __future__ import annotations

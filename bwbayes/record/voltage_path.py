@@ -6,11 +6,11 @@ memory that the actuator still has. The real reversals of a path and their heigh
 and it has to be monotone between them:
 
 1. The noise's sd comes from differences of rising order p, sd(Δᵖ u) = s √C(2p, p) for noise alone:
-   the share of a smooth voltage dies out. While the estimates still fall, no noise can be told.
+   the share of a smooth voltage dies out. While the estimates still fall, noise cannot be detected.
 2. Given this sd, the real reversals and the path between them follow, see
    :mod:`bwbayes.record.monotone_path`.
 3. Lines of the residual's spectrum, such as mains hum, move the actuator too: they are set aside
-   before and added again. Hum of the monitor alone cannot be told from them.
+   before and added again. Hum of the monitor alone cannot be distinguished from them.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         size = float(np.std(more))
         if sqrt(2) * size < step / np.pi:  # the error of rounding a ramp has such a line
             break
-        # The path follows a part of the hum, so what is left of it falls by one factor each time.
+        # The path follows a part of the hum, so that the rest falls by one factor each time.
         ratio = size / last if is_known and last else 0.0
         last = 0.0 if ratio else size
         hum = hum + (more / (1 - ratio) if ratio < 0.95 else more)

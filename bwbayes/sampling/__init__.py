@@ -1,1 +1,1 @@
-"""From a posterior to its draws: ensembles of walkers, the chain on disk, convergence."""
+"""Sampling of a posterior: ensembles of walkers, the chain on disk, convergence."""

@@ -112,7 +112,7 @@ def _walk_core(
         displacement = np.empty((column["offset"].size, last - now))
         window, begin, plan = slice(0, None), now, stage.plan
         if compiled is None:
-            # The drive of this window is known, and what goes with it begins where it does.
+            # The drive of this window is known: its other inputs begin at the same sample.
             window, begin = slice(now, last), 0
             drive, memory = advance(inputs[window], memory)
             plan = np.ascontiguousarray(drive)

@@ -177,7 +177,7 @@ def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[Floa
     """Read a reference displacement: its samples, um, and their interval, s.
 
     The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes,
-    or as the ``naming`` says; a voltage in it does not count.
+    or those of the ``naming``; a voltage in it does not count.
 
     Raises
     ------

@@ -53,7 +53,7 @@ _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def read_hdf5(path: Path) -> Source:
-    """Return the series of numbers in an HDF5 file, whatever error it raises if it is damaged."""
+    """Return the series of numbers in an HDF5 file; a damaged file may raise any exception."""
     # HDF5 2.0 would follow two kinds of damaged lists for ever: the free blocks of a heap of names,
     # which may run in a circle and take all memory, and the texts in a collection, of which one may
     # have no length.

@@ -91,7 +91,7 @@ def _keys(header: str, separator: str) -> dict[str, list[str]]:
 
 
 def read_tdms(path: Path) -> Source:
-    """Return the channels of a TDMS file, whatever error npTDMS raises if it is damaged.
+    """Return the channels of a TDMS file; npTDMS may raise any exception for a damaged one.
 
     Raises
     ------

@@ -49,7 +49,7 @@ _IS_LOGICAL, _IS_COMPLEX = 0x0200, 0x0800
 
 
 def read_mat(path: Path) -> Source:
-    """Return the series of a MATLAB file of version 5, whatever error it raises if it is damaged.
+    """Return the series of a MATLAB file of version 5; a damaged file may raise any exception.
 
     Raises
     ------

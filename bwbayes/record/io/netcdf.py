@@ -14,7 +14,7 @@ from bwbayes.record.io.series import NOTES, RATES, Series, Source, note, vectors
 
 
 def read_netcdf(path: Path) -> Source:
-    """Return the variables of a classic netCDF file, whatever error SciPy raises if it is damaged.
+    """Return the variables of a classic netCDF file; a damaged file may raise any exception.
 
     Numbers are unpacked as those of HDF5 files are, by the CF conventions.
 

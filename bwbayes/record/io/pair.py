@@ -1,6 +1,6 @@
 """A record in two files: one has the voltage, the other the displacement of the same samples.
 
-Each has a column of its own, or several of which one is chosen as in any file, and times or none.
+Each file has one column, or several of which one is chosen as in any file, with or without times.
 """
 
 from __future__ import annotations

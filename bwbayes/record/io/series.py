@@ -267,7 +267,7 @@ def array_source(
 
 
 def read_numpy(path: Path) -> Source:
-    """Return the series of NumPy's ``.npy`` or ``.npz``, whatever error it raises if damaged."""
+    """Return the series of NumPy's ``.npy`` or ``.npz``; a damaged file may raise any exception."""
     with path.open("rb") as file:
         loaded = np.load(file, allow_pickle=False)
         arrays = {"array": loaded} if isinstance(loaded, np.ndarray) else {}

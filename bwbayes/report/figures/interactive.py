@@ -116,7 +116,7 @@ def _figure(height: int, ylabel: str, **options: Any) -> figure:
 def _add_legend(
     plot: figure, drawn: Mapping[str, list[GlyphRenderer[Glyph]]], columns: int
 ) -> None:
-    """Put a legend above the plot, where a click hides what it names."""
+    """Put a legend above the plot, in which a click on an entry hides its lines and areas."""
     legend = Legend()
     legend.update(items=[LegendItem(label=n, renderers=shown) for n, shown in drawn.items()])
     legend.update(ncols=columns, click_policy="hide", border_line_color=None, padding=0)
