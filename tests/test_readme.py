@@ -178,6 +178,18 @@ def test_what_drives_tell_is_what_the_last_full_run_found() -> None:
                 assert quotes(text.strip(), found[readings][name]), (drive, name)
 
 
+def test_what_other_methods_say_is_what_the_last_full_run_found() -> None:
+    names = ("error_um", "error_percent", "width_um", "covered_percent")
+    rows = [line.split("|")[2:-1] for line in block("numbers: beside others").strip().splitlines()]
+    methods = ("least squares", "plays, least squares", "emcee, white noise", "bwbayes")
+    for cells, found in zip(rows[2:], methods, strict=True):
+        row = measured()["beside others"][found]
+        for cell, name in zip(cells, names, strict=False):
+            for text, test in zip(cell.split("/"), ("large loops", "decay and hold"), strict=True):
+                assert quotes(text.strip(), row[test][name]), (found, test, name)
+        assert quotes(cells[-1].strip(), row["seconds"]), found
+
+
 METHODS = (ROOT / "runs" / "README.md").read_text(encoding="utf-8")
 
 

@@ -46,7 +46,7 @@ TYPES: Mapping[str, str] = {
 STEP = 1e-3
 
 
-class Quantity(NamedTuple):
+class Measurand(NamedTuple):
     """A quantity as the readings have it: ``values`` (draws,) in a ``unit`` of um and V.
 
     ``added`` are variances of sources beside the parameters, ``unexplained`` is the source of what
@@ -89,19 +89,19 @@ class Budget:
         return estimate | interval | {"sources": shares}
 
 
-def loop_width(posterior: Posterior, draws: FloatArray) -> Quantity:
+def loop_width(posterior: Posterior, draws: FloatArray) -> Measurand:
     """Return the largest width of the loop over the records' range of draws (draws, free)."""
     measured = measures(steady_loop(*driven(posterior, draws)))
     extent, percent = measured["range_um"], measured["widest_percent"]
     assert extent is not None
     assert percent is not None
-    return Quantity("max loop width", "um", np.abs(extent) * percent / 100)
+    return Measurand("max loop width", "um", np.abs(extent) * percent / 100)
 
 
 def uncertainty_budgets(
     posterior: Posterior,
     draws: FloatArray,
-    quantities: list[Quantity],
+    quantities: list[Measurand],
     instruments: Instruments,
     scales: Scales,
 ) -> tuple[Budget, ...]:

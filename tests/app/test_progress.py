@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bwbayes.app.fit.fitted import open_converged, open_finished
+from bwbayes.app.fit.calls import open_converged
+from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch

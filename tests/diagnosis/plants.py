@@ -91,7 +91,7 @@ def hysteresis(part: Plant, voltage: FloatArray, exponent: float = 1.0) -> Float
     h, values, top = 0.0, np.empty(voltage.size), part.alpha / (part.beta + part.gamma)
 
     def moved(step: float, h: float) -> float:
-        bent = (abs(h) / top) ** (exponent - 1)
+        bent = float((abs(h) / top) ** (exponent - 1))
         turned = part.beta * abs(step) * h * bent
         return part.alpha * step - turned - part.gamma * step * abs(h) * bent
 
@@ -190,7 +190,8 @@ def moved_by(
             return play(moved, abs(size) / 2)
         case "series plays":
             radii = np.ptp(moved) * np.array([0.03, 0.07, 0.16, 0.25, 0.4])
-            return moved - np.sum([0.016 * (moved - play(moved, r)) for r in radii], axis=0)
+            held_back = np.array([0.016 * (moved - play(moved, r)) for r in radii])
+            return np.asarray(moved - held_back.sum(axis=0))
         case "moving gain":
             along = np.minimum(np.arange(moved.size) / warming, 1.0)
             return moved * (1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.1) * along)

@@ -18,7 +18,7 @@ from bwbayes.prediction.budget import (
     NOISE,
     PRIOR,
     SENSOR,
-    Quantity,
+    Measurand,
     uncertainty_budgets,
 )
 from bwbayes.prediction.prediction import predict_windows
@@ -131,7 +131,7 @@ def test_budget_is_that_of_the_closed_form(linear: Linear) -> None:
     """The error of the posterior's mean has these parts of noise, discrepancy and prior."""
     draws = linear.exact.draw(4000, seed=4)
     instruments = Instruments(sensor_scale=0.01, amplifier_gain=0.005)
-    quantities = [Quantity("d", "um/V", draws[:, 0]), Quantity("offset", "um", draws[:, 1])]
+    quantities = [Measurand("d", "um/V", draws[:, 0]), Measurand("offset", "um", draws[:, 1])]
     scales = instruments.scales(4000, np.random.default_rng(1))
     budgets = uncertainty_budgets(linear.posterior, draws, quantities, EXACT, scales)
     rows, known = linear.rows, {p.name: p.fixed for p in linear.posterior.prior.parameters}

@@ -142,7 +142,7 @@ def _make_product(
     stem = "".join(path_text(Path(value).stem) for value in named if isinstance(value, str | Path))
     out = out or folder / (verb.below or verb.name).replace("NAME", stem)
     with working() as watch:
-        from bwbayes.app.fit.fitted import open_converged
+        from bwbayes.app.fit.calls import open_converged
         from bwbayes.report.outputs import refuse_existing
 
         # Refuse before the computation; saving refuses every single file.

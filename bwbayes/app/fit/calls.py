@@ -231,6 +231,17 @@ def open_run(folder: str | Path) -> Run:
     return open_finished(RunFolder.open(Path(folder)))
 
 
+def open_converged(folder: Path) -> Run:
+    """Return the run in a folder, if it is finished and has converged.
+
+    Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
+    """
+    fit = open_run(folder)
+    fit.folder.require_finished()
+    fit.require_converged()
+    return fit
+
+
 def resume(
     folder: str | Path,
     *,

@@ -694,14 +694,3 @@ def open_finished(folder: RunFolder) -> Run:
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
     return Run(chain, folder, folder.numbers().get("wall_s", 0.0))
-
-
-def open_converged(path: Path) -> Run:
-    """Return the fit in a folder, if it is finished and has converged.
-
-    Raises NotConvergedError if it has not, and InputError: no such run, or it is not finished.
-    """
-    fit = open_finished(RunFolder.open(path))
-    fit.folder.require_finished()
-    fit.require_converged()
-    return fit

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.prediction import budget
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.budget import Budget, Quantity, loop_width, uncertainty_budgets
+from bwbayes.prediction.budget import Budget, Measurand, loop_width, uncertainty_budgets
 from bwbayes.prediction.initial_state import (
     InitialStates,
     estimate_initial_states,
@@ -41,7 +41,7 @@ def run_budgets(
     )
     unit = next(p.unit for p in problem.parameters if p.name == name)
     quantities = [
-        Quantity(name, unit, draws[:, posterior.names.index(name)]),
+        Measurand(name, unit, draws[:, posterior.names.index(name)]),
         loop_width(posterior, draws),
         _displacement(problem, draws, shown),
     ]
@@ -57,7 +57,7 @@ def _is_actuators(posterior: Posterior, name: str) -> bool:
     return physical and free[name].declared.scope == "actuator"
 
 
-def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Quantity:
+def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Measurand:
     """Return the displacement beyond the sensor's zero at the highest voltage of some bands."""
     at = int(np.argmax(np.where(bands.scored(bands.mean), bands.voltage, -np.inf)))
     added, validation = dict[str, float](), problem.validations.get(bands.name)
@@ -102,4 +102,4 @@ def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Quantity
     added[budget.STATE] = float(np.mean(states.offset_sd**2))
     added[budget.CURVE] = problem.record.instruments.linearity_sd(dataset.extent) ** 2
     name = f"displacement at {bands.voltage[at]:.3g} V ({bands.name}, {bands.time[at]:.4g} s)"
-    return Quantity(name, "um", displacement, added, budget.STATE, states.rows)
+    return Measurand(name, "um", displacement, added, budget.STATE, states.rows)
