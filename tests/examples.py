@@ -76,6 +76,8 @@ LEAVES = {
     "compare": ("results/*comparison", "comparison.html comparison.json comparison.csv"),
     "compensate": ("{0}/compensation/*", "command.csv compensation.csv compensation.html"),
     "export": ("{0}/export", "actuator.c model.json"),
+    "budget": ("{0}/budget", "budget.html budget.json"),
+    "certificate": ("{0}/certificate", "certificate.html certificate.json"),
     "track": ("{0}/track", "track.html track.csv track.json track.png"),
     "design": ("{0}/design", "design.html design.json best.csv"),
     "config": ("", ""),
