@@ -67,7 +67,8 @@ class Defect:
         words = partial(self.words, scene)
         for sighting in self.sightings(scene):
             for explanation in scene.changed(self.kind, words, (self.stage,), sighting, flags):
-                yield replace(explanation, spec=None) if sighting.named_only else explanation
+                named_only = stage.named_only or sighting.named_only
+                yield replace(explanation, spec=None) if named_only else explanation
 
     def sightings(self, scene: ResidualAnalysis) -> Iterator[Sighting]:  # noqa: ARG002
         """Yield the starting points for a fit of the stage."""

@@ -61,6 +61,8 @@ class Stage(ABC):
     """
     advice: ClassVar[str] = ""
     """A remedy on the test stand, instead of a stage of the model."""
+    named_only: ClassVar[bool] = False
+    """Whether a run only names it where a record shows it, and leaves it to the user to add it."""
 
     @property
     @abstractmethod

@@ -37,6 +37,8 @@ class SeriesPlays(Stage):
     rate_independent: ClassVar = True
     remembers: ClassVar = PLAYS + 1
     starts: ClassVar = tuple({"series_radius": z} for z in (-1.0, 0.5))
+    # Beside a hysteresis that may open the same loops, it takes minutes to sample.
+    named_only: ClassVar = True
     advice: ClassVar = "look for friction between the actuator and what the sensor looks at"
 
     parameters: tuple[Declaration, ...] = (
