@@ -21,6 +21,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
+from bwbayes.shown import rounded
 
 # Part of the time between turning points over which a speed is averaged: a sine's peak speed is
 # then 0.4% too low, and noise of 1% of its range adds a tenth.
@@ -76,9 +77,9 @@ class Drive:
         text = f"{self.low:.4g} to {self.high:.4g} V"
         if self.depths is None:
             return text
-        smallest, largest = self.depths
+        smallest, largest = rounded(self.depths[0], 2), rounded(self.depths[1])
         return (
-            f"{text}, up to {self.frequency:.2g} Hz, reversals of {smallest:.2g} to {largest:.3g} V"
+            f"{text}, up to {rounded(self.frequency, 2)} Hz, reversals of {smallest} to {largest} V"
         )
 
 
