@@ -19,7 +19,6 @@ RUNS = Path(__file__).parents[1] / "runs"
 def test_the_default_errs_less_on_large_loops_than_three_usual_methods() -> None:
     """On large loops as were fitted. On a decay and a hold least squares may be better."""
     compared = run_path(str(RUNS / "beside_others.py"))["compare"](read_record(RECORD))
-    compared.draw(RUNS / "beside_others.png")
     table = compared.table
     keep("beside others", table)
     ours = table.pop("bwbayes")

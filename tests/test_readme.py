@@ -184,10 +184,9 @@ def test_what_other_methods_say_is_what_the_last_full_run_found() -> None:
     methods = ("least squares", "plays, least squares", "emcee, white noise", "bwbayes")
     for cells, found in zip(rows[2:], methods, strict=True):
         row = measured()["beside others"][found]
-        for cell, name in zip(cells, names, strict=False):
+        for cell, name in zip(cells, names, strict=True):
             for text, test in zip(cell.split("/"), ("large loops", "decay and hold"), strict=True):
                 assert quotes(text.strip(), row[test][name]), (found, test, name)
-        assert quotes(cells[-1].strip(), row["core s"]), found
 
 
 METHODS = (ROOT / "runs" / "README.md").read_text(encoding="utf-8")
