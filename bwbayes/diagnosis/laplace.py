@@ -27,7 +27,7 @@ class LocalFit:
     """A mode of a posterior of one record: ``coordinates`` (free,).
 
     ``log_evidence`` and ``log_density`` in nats; ``covariance`` (free, free) has no correlation of
-    noise and physical parameters; ``displacement`` (readings,) um.
+    noise and physical parameters; ``displacement`` (readings,) um, from the most probable start.
     """
 
     posterior: Posterior
@@ -68,8 +68,10 @@ class LocalFit:
             return np.nan
         record = self.posterior.single_record
         likelihood = self.posterior.likelihood
-        model = likelihood.table.actuator(self.posterior.prior.theta(self.free[np.newaxis]))
-        missed = record.displacement - likelihood.simulate(model, record.inputs)[0]
+        theta = self.posterior.prior.theta(self.free[np.newaxis])
+        start = likelihood.start(theta).mean if likelihood.unknowns else None
+        model = likelihood.table.actuator(theta)
+        missed = record.displacement - likelihood.simulate(model, record.inputs, start)[0]
         inside = np.concatenate([missed[window] for window in windows])
         return float(np.sqrt(np.nanmean(inside**2))) if np.isfinite(inside).any() else np.nan
 
@@ -89,11 +91,16 @@ def climb(
     target = Target(posterior)
     state = mode_finding.climb(target, np.atleast_2d(places), least, watch=watch)
     covariance, log_determinant = target.covariance(state)
+    displacement = state.displacement
+    if posterior.likelihood.unknowns:
+        # The climb's displacement is from rest, where the record may start moving.
+        theta = posterior.prior.theta(posterior.prior.constrain(state.coordinates[np.newaxis])[0])
+        displacement = posterior.simulate(theta, posterior.single_record.readings.rows)[0]
     return LocalFit(
         posterior,
         state.coordinates,
         covariance,
         state.density,
         state.density + log_determinant / 2,
-        state.displacement,
+        displacement,
     )

@@ -108,15 +108,8 @@ def fit_rivals(
             start = np.array([[known_values.get(name, 0.0) for name in posterior.names]])
             places = np.concatenate([start, map_estimate.local_minima(posterior, rng, 1)])
             fit = climb(posterior, places)
-            # Use the initial state estimated from the readings, which matters much for creep.
-            readings, theta = (
-                posterior.single_record.readings,
-                posterior.prior.theta(fit.free[np.newaxis]),
-            )
-            missed = readings.values - posterior.simulate(theta, readings.rows)[0]
-            rmse = float(np.sqrt(np.mean(missed**2)))
-            if rmse < np.std(readings.values):
-                rivals.append(Rival(spec, fit.coordinates, fit.covariance, rmse))
+            if fit.follows:
+                rivals.append(Rival(spec, fit.coordinates, fit.covariance, fit.rmse))
     return tuple(rivals)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from bwbayes.diagnosis import explanations, model
@@ -288,6 +289,32 @@ def test_a_cause_that_a_smooth_discrepancy_takes_up_is_found_beside_a_rough_one(
     assert beside_smooth < found[0].nats - 20
     assert [cause.kind for cause in likely_causes(found)] == ["slew limit"]
     assert {each.rmse[0] for each in found} == {slow.fit.rmse}
+
+
+def test_creep_that_began_before_the_record_errs_by_the_sensor_alone(tmp_path: Path) -> None:
+    """The start of slow lags is unknown: from rest, the right model would seem the worse one."""
+    rng = np.random.default_rng(12)
+    time = np.arange(1500) / 100
+    voltage = 40 + 40 * np.cos(2 * np.pi * 0.5 * time) * np.exp(-0.05 * time)
+    # The actuator was at rest at 0 V, and waits at the first voltage for a second.
+    driven = np.concatenate([np.zeros(100), np.full(100, voltage[0]), voltage])
+    moved = 0.12 * driven
+    for seconds in (0.1, 1.0, 10.0):
+        kept = np.exp(-0.01 / seconds)
+        moved += 0.02 * 0.12 * lfilter([1 - kept], [1.0, -kept], driven)
+    readings = moved[200:] + 0.01 * rng.normal(size=time.size)
+    write_record(Record(voltage, readings, interval=0.01), tmp_path / "record.h5")
+    text = """
+        [record]
+        file = "record.h5"
+        [model]
+        creep = [0.1, 1.0, 10.0]
+        dynamics = "none"
+        """
+    posterior = problem_of(text, tmp_path).posterior
+    fitted = climb(posterior, pointfit.fit(posterior, rng).optima)
+    assert fitted.rmse == pytest.approx(0.01, rel=0.05)
+    assert fitted.error([slice(0, 500)]) == pytest.approx(0.01, rel=0.1)
 
 
 def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:
