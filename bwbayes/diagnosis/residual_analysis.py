@@ -24,11 +24,11 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study
 from bwbayes.inference.thinning import (
     beginning,
-    readings_at,
     stride_of,
     thin,
     thin_posterior,
     thin_windows,
+    with_residuals_of,
 )
 from bwbayes.model.reversals import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
@@ -183,7 +183,7 @@ class ResidualAnalysis:
         theta = posterior.prior.theta(posterior.prior.constrain(optima[:1])[0])
         unthinned, posterior = posterior, thin_posterior(posterior, theta, READINGS)
         if posterior is not unthinned:
-            posterior = posterior.altered(displacement=readings_at(posterior, unthinned, theta))
+            posterior = with_residuals_of(posterior, unthinned, theta)
         rows = posterior.single_record.readings.rows
         if rows.size > READINGS:
             # Keep evenly spaced readings; the voltage stays as it is.
@@ -342,7 +342,7 @@ class ResidualAnalysis:
         ):
             # The readings of a thinned record depend on the hold.
             theta = rebuilt.prior.theta(self.fit.free[np.newaxis])
-            held = readings_at(posterior, rebuilt, theta)
+            held = with_residuals_of(posterior, rebuilt, theta).single_record.displacement
             readings = np.where(np.isfinite(readings), held, np.nan)
         return posterior.altered(
             displacement=readings, training=self.posterior.single_record.training

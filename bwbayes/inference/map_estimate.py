@@ -19,8 +19,8 @@ import scipy
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
 from bwbayes.inference.least_squares import LeastSquares
-from bwbayes.inference.mode_finding import Mode, Target, refine
-from bwbayes.inference.thinning import beginning, thin_posterior
+from bwbayes.inference.mode_finding import Mode, Target, climb, refine
+from bwbayes.inference.thinning import beginning, thin_posterior, with_residuals_of
 from bwbayes.model.stages.lags import TIME_CONSTANTS
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, parts, unwatched, watched
@@ -75,7 +75,8 @@ def fit(
     """
     # Drawn aside: what a short record is fitted from does not depend on them.
     probes = posterior.prior.theta(posterior.prior.draw(generator.spawn(1)[0], PROBES))
-    short = beginning(thin_posterior(posterior, probes, SAMPLES), SAMPLES)
+    thinned = thin_posterior(posterior, probes, SAMPLES)
+    short = beginning(thinned, SAMPLES)
     modes: list[Mode] = []
     if short is posterior:
         places, noise, spread = _places(posterior, generator, watch=part(watch, 0.0, 0.5))
@@ -87,7 +88,11 @@ def fit(
             _add_mode(posterior, modes, start_point)
     else:
         point = fit(short, generator, part(watch, 0.0, 0.5))
-        return refit(posterior, point, part(watch, 0.5, 1.0))
+        spread, places = point.prior_covariance, [*point.optima]
+        if thinned is not posterior:
+            places = _unthinned(posterior, thinned, point, generator)
+        for start_point in watched(places, part(watch, 0.5, 1.0)):
+            _add_mode(posterior, modes, start_point)
     watch(1.0)
     return _estimate(modes, spread)
 
@@ -196,6 +201,24 @@ def _add_mode(
         start, (covariance, _) = state.coordinates, target.covariance(state)
     modes.append(refine(posterior, start, covariance))
     modes.sort(key=lambda mode: -mode.log_density)
+
+
+def _unthinned(
+    posterior: Posterior, thinned: Posterior, point: MAPEstimate, generator: np.random.Generator
+) -> list[FloatArray]:
+    """Return places (free,) near the modes of a posterior, from a point fit of a thinned one.
+
+    Thinning changes displacement and noise, and moves the modes by far more than a long record
+    leaves open. So places are climbed to from readings that have the residuals of the whole record,
+    and get the noise of its beginning.
+    """
+    prior = posterior.prior
+    theta = prior.theta(prior.constrain(point.mode[np.newaxis])[0])
+    target = Target(with_residuals_of(thinned, posterior, theta))
+    first = beginning(posterior, SAMPLES)
+    noise = prior.unconstrain(prior.draw(generator, DRAWS))[:, target.noise]
+    climbed = (climb(target, optimum[np.newaxis]).coordinates for optimum in point.optima)
+    return [_with_noise(first, position, noise, generator) for position in climbed]
 
 
 def _zero_noise_starts(

@@ -90,17 +90,20 @@ def thin(dataset: Dataset, stride: int) -> Dataset:
     )
 
 
-def readings_at(short: Posterior, whole: Posterior, theta: FloatArray) -> FloatArray:
-    """Return readings (samples,), um, that leave a thinned record the residuals of the whole one.
+def with_residuals_of(short: Posterior, whole: Posterior, theta: FloatArray) -> Posterior:
+    """Return a thinned posterior whose readings leave the residuals of the whole one.
 
     Those of one model θ (1, parameters): to the readings is added what thinning changes of the
     displacement, so that no other model gains from mending that.
     """
-    stride = stride_of(short, whole)
-    before = displacement(whole, whole.single_record, theta)[0, ::stride]
-    after = displacement(short, short.single_record, theta)[0]
-    readings: FloatArray = whole.single_record.displacement[::stride] + after - before
-    return readings
+    readings = {}
+    for thinned, dataset in zip(short.datasets, whole.datasets, strict=True):
+        model = whole.table.of(theta, dataset.name)
+        stride = round(thinned.inputs.interval / dataset.inputs.interval)
+        before = displacement(whole, dataset, model)[0, ::stride]
+        after = displacement(short, thinned, model)[0]
+        readings[dataset.name] = dataset.displacement[::stride] + after - before
+    return short.with_readings(readings)
 
 
 def stride_of(short: Posterior, whole: Posterior) -> int:

@@ -14,10 +14,10 @@ from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.thinning import (
     beginning,
     displacement,
-    readings_at,
     thin,
     thin_posterior,
     thin_windows,
+    with_residuals_of,
 )
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Inputs
@@ -115,7 +115,7 @@ def test_a_thinned_record_is_left_the_residuals_of_the_whole() -> None:
     theta = truth(whole)
     short = thin_posterior(whole, theta, 250)
     assert 250 == short.single_record.voltage.size
-    corrected = short.altered(displacement=readings_at(short, whole, theta))
+    corrected = with_residuals_of(short, whole, theta)
     residuals = [
         posterior.single_record.displacement
         - displacement(posterior, posterior.single_record, theta)[0]
