@@ -86,6 +86,8 @@ class Recursion:
 
         There is a sample at least.
         """
+        if self.numerator.shape[1] == 1:
+            return drive  # with a static gain of one, nothing is left to filter
         for row, values in enumerate(drive):
             values[:], state[row] = scipy.signal.lfilter(
                 self.numerator[row], self.denominator[row], values, zi=state[row]
