@@ -33,7 +33,7 @@ assert np.isfinite(block.log_density).all()
         ("numba", 1_000_000),
         pytest.param("numpy", 1_000_000, marks=pytest.mark.slow),
         # The quick twin: NumPy's batches of models have the same size, of fewer samples each.
-        ("numpy", 150_000),
+        ("numpy", 1 << 17),
     ],
 )
 def test_million_samples_take_less_than_a_gibibyte(engine: Engine, samples: int) -> None:

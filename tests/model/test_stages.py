@@ -460,7 +460,7 @@ def test_a_stage_sees_time_or_command(kind: type[Stage]) -> None:
     np.testing.assert_allclose(pieces, expected, rtol=0, atol=1e-10)
     if kind is Leaking:  # one that grows from pass to pass
         with pytest.raises(InputError, match="what leaking makes of the command cannot be undone"):
-            inverse(made, models, expected)
+            inverse(made, models[:1], expected[:1, :30])
         return
     command = inverse(made, models, expected)
     for row, own, wanted in zip(models, command, expected, strict=True):
