@@ -30,7 +30,10 @@ COLUMNS = ["corrected_lower_95_um", "corrected_upper_95_um"]
 def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run that fails on its held-out readings."""
     folder = small.begun(tmp_path_factory.mktemp("failed") / "run", NARROW)
-    resume(folder, small.quiet(), workers=1)
+    with pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
+        small.without_pictures(patch)
+        resume(folder, small.quiet(), workers=1)
     return folder.path
 
 

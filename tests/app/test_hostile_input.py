@@ -5,7 +5,7 @@ and make a run's folder that reads back the same, with nothing written beside it
 prior draws stands in for the point fit, no misfit is explained and no page is drawn, which take
 longer than all the rest, but for a few cases.
 
-The default run takes the first 150, ten of each kind, which find what befalls one case in 50 with a
+The default run takes the first 75, five of each kind, which find what befalls one case in 25 with a
 probability of 0.95, and one noise; ``-m slow`` takes all, and chooses theirs. A case is made again
 from its number: ``tests.app.mutations.case(SEED, number)``.
 """
@@ -43,7 +43,7 @@ from tests.app.mutations import KINDS, QUICK, Case, case, made
 from tests.measured import keep
 
 SEED = 1
-FEW, ALL = 150, 10_000
+FEW, ALL = 75, 10_000
 SECONDS = 10  # of processor time, for a case that takes some hundredths
 LONGEST_LINE = 700
 

@@ -19,7 +19,7 @@ from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.prediction.bands import KINDS
 from bwbayes.prediction.budget import TYPES
 from bwbayes.record import write_record
-from tests.app import specimens
+from tests.app import small, specimens
 from tests.app.conftest import Type
 from tests.programs import needs
 
@@ -43,8 +43,11 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[bw.Run, bw.Run]:
     folder = tmp_path_factory.mktemp("both")
     write_record(specimens.record(0), folder / "record.csv")
     instruments: dict[str, Any] = {"units": UNITS, "linearity": "0.1 %"}
-    exact = bw.fit(folder / "record.csv", folder=folder / "exact", **KEYS)
-    unsure = bw.fit(folder / "record.csv", folder=folder / "unsure", **instruments, **KEYS)
+    with pytest.MonkeyPatch.context() as patch:
+        small.without_explanations(patch)
+        small.without_pictures(patch)
+        exact = bw.fit(folder / "record.csv", folder=folder / "exact", **KEYS)
+        unsure = bw.fit(folder / "record.csv", folder=folder / "unsure", **instruments, **KEYS)
     return exact, unsure
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -231,29 +233,35 @@ def thinned(record: Record) -> Record:
     return Record(record.voltage[::25], record.displacement[::25], interval=25 * record.interval)
 
 
+@cache
+def plays() -> Record:
+    """Return a record of plays, whose discrepancy is smooth."""
+    return thinned(records(2)[0])
+
+
 def plain(sensor: float, rough: float) -> Record:
     """Return a record of a gain of 0.5 um/V, with a rough discrepancy or none."""
     rng = np.random.default_rng(3)
-    record = thinned(records(2)[0])
+    record = plays()
     slow = autoregressive(0.98, record.samples, (), rng)
     noise = rough * slow + sensor * rng.standard_normal(record.samples)
     return replace(record, displacement=0.5 * record.voltage + noise)
 
 
 @pytest.mark.parametrize(
-    ("record", "expected"),
+    ("made", "expected"),
     [
-        (thinned(records(2)[0]), {"smooth"}),
-        (plain(0.05, 1.0), {"discrepancy"}),
+        (plays, {"smooth"}),
+        (partial(plain, 0.05, 1.0), {"discrepancy"}),
         # White noise alone is a limit of the others, which lose next to nothing by it.
-        (plain(0.3, 0.0), {"discrepancy", "white"}),
+        (partial(plain, 0.3, 0.0), {"discrepancy", "white"}),
     ],
     ids=["plays", "rough", "white"],
 )
 def test_the_noise_is_chosen_by_evidence(
-    record: Record, expected: set[str], tmp_path: Path
+    made: Callable[[], Record], expected: set[str], tmp_path: Path
 ) -> None:
-    write_record(record, tmp_path / "record.h5")
+    write_record(made(), tmp_path / "record.h5")
     problem = resolve_config(parse(CONFIG, "config"), tmp_path)
     point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
     noise, why = chosen_noise(problem, point)
@@ -319,16 +327,18 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
     assert "offset[b]" not in chosen.names
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
-    write_record(thinned(records(2)[0]), tmp_path / "record.h5")
+    write_record(plays(), tmp_path / "record.h5")
     report = check(parse(NOT_SEARCHED, "config"), tmp_path, tmp_path / "out")
     assert "noise: smooth (" in report.about
     page = (tmp_path / "out" / "check.html").read_text(encoding="utf-8")
     assert "discrepancy_quality" in page
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
-    write_record(thinned(records(2)[0]), tmp_path / "record.h5")
+    write_record(plays(), tmp_path / "record.h5")
     config = parse(f'{NOT_SEARCHED}noise = "auto"\n[sampling]\nsteps = 50\n', "config")
     folder = RunFolder.create(tmp_path / "run", resolve_config(config, tmp_path))
     console = Console(file=io.StringIO(), width=200)
