@@ -23,7 +23,8 @@ from bwbayes.errors import InputError, InputWarning
 from tests.app import small
 from tests.app.test_front_door import SEPARATORS, UNITS, drive, moved, written
 from tests.measured import keep
-from tests.record.instruments import INSTRUMENTS, Written
+from tests.record.instruments import Written
+from tests.record.makers import INSTRUMENTS
 
 RECORDS = 200
 

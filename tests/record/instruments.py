@@ -1,7 +1,8 @@
-"""Files as programs and instruments write them: one record, in every form that a bench has.
+"""Texts as programs and instruments write them: one record, in every form that a bench has.
 
-:data:`INSTRUMENTS` writes the same record in each of them; beside the file stands what a user has
-to say of its columns, where they can mean several things. Nothing here uses bwbayes to write.
+:data:`INSTRUMENTS` writes the same record in each of them, :mod:`tests.record.makers` adds the
+files that are no texts; beside a file stands what a user has to say of its columns, where they can
+mean several things. Nothing here uses bwbayes to write.
 """
 
 from __future__ import annotations
@@ -10,16 +11,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import h5py
 import numpy as np
 import pandas as pd
-import scipy.io
 
 from tests.stand import play
 
 SAMPLES, INTERVAL = 600, 0.005
-
-Array = Any
 
 
 class Written(NamedTuple):
@@ -34,59 +31,75 @@ class Written(NamedTuple):
 Writer = Callable[[Path], Written]
 INSTRUMENTS: dict[str, Writer] = {}
 
-
-def _instrument(name: str) -> Callable[[Writer], Writer]:
-    def register(write: Writer) -> Writer:
-        INSTRUMENTS[name] = write
-        return write
-
-    return register
-
-
 TIME = INTERVAL * np.arange(SAMPLES)  # s
 VOLTAGE = np.round(60 * np.exp(-0.5 * TIME) * np.sin(2 * np.pi * TIME / 0.5), 4)
 _NOISE = np.random.default_rng(1).normal(scale=0.02, size=SAMPLES)
 DISPLACEMENT = np.round(0.3 * VOLTAGE + 0.2 * play(VOLTAGE, 6.0) + _NOISE, 5)  # um
 COLUMNS = [TIME, VOLTAGE, DISPLACEMENT]
 UNITS = {"time": "s", "voltage": "V", "displacement": "um"}
-_MICRONS = {"displacement": "um"}
+BOTH = {"voltage": "V", "displacement": "um"}
+MICRONS = {"displacement": "um"}
 
 
-def _named(*names: str) -> dict[str, str]:
-    return dict(zip(UNITS, names, strict=True))
+def named(*names: str) -> dict[str, str]:
+    """Return the names of all three columns, or of voltage and displacement."""
+    return dict(zip([*UNITS][-len(names) :], names, strict=True))
 
 
-def _rows(columns: list[Array], separator: str, form: str = ".6f", end: str = "") -> list[str]:
+def _rows(columns: list[Any], separator: str, form: str = ".6f", end: str = "") -> list[str]:
     return [
         separator.join(f"{value:{form}}" for value in row) + end
         for row in zip(*columns, strict=True)
     ]
 
 
+def _beside(cells: list[str], columns: Any = COLUMNS) -> list[str]:
+    """Return rows behind cells of another column."""
+    return [f"{cell},{row}" for cell, row in zip(cells, _rows(columns, ","), strict=True)]
+
+
 def _commas(rows: list[str]) -> list[str]:
     return [row.replace(".", ",") for row in rows]
 
 
-def _text(path: Path, lines: list[str], encoding: str = "utf-8", **said: Any) -> Written:
-    path.write_bytes(("\r\n".join(lines) + "\r\n").encode(encoding))
-    return Written(path, **said)
+def _text(
+    name: str,
+    head: list[str],
+    rows: list[str],
+    said: tuple[Any, ...] = (),
+    *,
+    encoding: str = "utf-8",
+    file: str = "a.csv",
+) -> None:
+    """Have an instrument write lines, of whose columns, units and rate a user says this."""
+
+    def write(folder: Path) -> Written:
+        (folder / file).write_bytes(("\r\n".join([*head, *rows]) + "\r\n").encode(encoding))
+        return Written(folder / file, *said)
+
+    INSTRUMENTS[name] = write
 
 
-@_instrument("Excel, German, cp1252, preamble")
-def _(folder: Path) -> Written:
-    head = ["Prüfstand 3", "Bediener;Müller", "Datum;3. März 2026", ""]
-    names = "Zeit [s];Spannung [V];Weg [µm];Bemerkung"
-    rows = _commas(_rows(COLUMNS, ";", end=";in Ordnung"))
-    return _text(folder / "messung.csv", [*head, names, *rows], "cp1252")
+# Programs
+
+_text(
+    "Excel, German, cp1252, preamble",
+    [
+        *("Prüfstand 3", "Bediener;Müller", "Datum;3. März 2026", ""),
+        "Zeit [s];Spannung [V];Weg [µm];Bemerkung",
+    ],
+    _commas(_rows(COLUMNS, ";", end=";in Ordnung")),
+    encoding="cp1252",
+)
+_text(
+    "Excel, Unicode text",
+    ["Time (s)\tDrive (V)\tStroke (µm)"],
+    _commas(_rows(COLUMNS, "\t")),
+    encoding="utf-16",
+)
 
 
-@_instrument("Excel, Unicode text")
-def _(folder: Path) -> Written:
-    rows = _commas(_rows(COLUMNS, "\t"))
-    return _text(folder / "a.txt", ["Time (s)\tDrive (V)\tStroke (µm)", *rows], "utf-16")
-
-
-def _lvm(folder: Path, segments: list[list[str]], names: str, x_columns: str = "One") -> Written:
+def _lvm(name: str, segments: list[list[str]], names: str, x_columns: str = "One") -> None:
     """Write LabVIEW's text with its header, and one for each segment."""
     lines = [
         *("LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"),
@@ -103,395 +116,292 @@ def _lvm(folder: Path, segments: list[list[str]], names: str, x_columns: str = "
             f"Delta_X\t{INTERVAL:.6f}\t{INTERVAL:.6f}\t",
             *("***End_of_Header***\t\t\t", f"{names}\tComment", *rows, ""),
         ]
-    return _text(folder / "a.lvm", lines[:-1])
-
-
-@_instrument("LabVIEW lvm")
-def _(folder: Path) -> Written:
-    first, *rows = _rows(COLUMNS, "\t")
-    return _lvm(folder, [[f"{first}\t", *rows]], "X_Value\tVoltage\tPosition")
-
-
-@_instrument("LabVIEW lvm, three segments")
-def _(folder: Path) -> Written:
-    rows = _rows(COLUMNS, "\t")
-    return _lvm(folder, [rows[:200], rows[200:400], rows[400:]], "X_Value\tVoltage\tPosition")
-
-
-@_instrument("LabVIEW lvm without times")
-def _(folder: Path) -> Written:
-    rows = [f"\t{row}" for row in _rows([VOLTAGE, DISPLACEMENT], "\t")]
-    return _lvm(folder, [rows], "X_Value\tVoltage\tPosition", "No")
-
-
-@_instrument("LabVIEW lvm, times of each channel")
-def _(folder: Path) -> Written:
-    rows = _rows([TIME, VOLTAGE, TIME, DISPLACEMENT], "\t")
-    return _lvm(folder, [rows], "X_Value\tVoltage\tX_Value\tPosition", "Multi")
-
-
-def _tdms(folder: Path, channels: Mapping[str, Array], **properties: dict[str, Any]) -> Path:
-    from nptdms import ChannelObject, TdmsWriter  # noqa: PLC0415  # an extra
-
-    with TdmsWriter(folder / "a.tdms") as writer:
-        writer.write_segment(
-            [ChannelObject("Log", n, data, properties.get(n, {})) for n, data in channels.items()]
-        )
-    return folder / "a.tdms"
-
-
-@_instrument("TDMS waveforms")
-def _(folder: Path) -> Written:
-    wave = {"wf_increment": INTERVAL, "wf_start_offset": 0.0, "wf_samples": SAMPLES}
-    units = {"Voltage": wave | {"unit_string": "V"}, "Position": wave | {"unit_string": "um"}}
-    return Written(_tdms(folder, {"Voltage": VOLTAGE, "Position": DISPLACEMENT}, **units))
-
-
-@_instrument("TDMS with times")
-def _(folder: Path) -> Written:
-    path = _tdms(folder, {"Time (s)": TIME, "U_V": VOLTAGE, "laser": DISPLACEMENT})
-    return Written(path, {"displacement": "laser"}, {"displacement": "um"})
-
-
-@_instrument("Excel workbook, units in a second row")
-def _(folder: Path) -> Written:
-    from openpyxl import Workbook  # noqa: PLC0415  # an extra
-
-    book = Workbook()
-    book.active.title = "Notes"
-    book.active.append(["Bench 3", "piezo"])
-    sheet = book.create_sheet("Run 1")
-    sheet.append(["Measurement 7, loops"])
-    sheet.merge_cells("A1:C1")
-    sheet.append(["Time", "Voltage", "Displacement", "Remark"])
-    sheet.append(["s", "V", "um"])
-    for row in zip(*COLUMNS, strict=True):
-        sheet.append([float(value) for value in row])
-    book.save(folder / "a.xlsx")
-    return Written(folder / "a.xlsx")
-
-
-@_instrument("pandas to Excel, with dates")
-def _(folder: Path) -> Written:
-    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(TIME, unit="s")
-    frame = pd.DataFrame({"Time": moments, "U [V]": VOLTAGE, "x [um]": DISPLACEMENT})
-    frame.to_excel(folder / "a.xlsx", index=False)
-    return Written(folder / "a.xlsx")
-
-
-def _mat(folder: Path, variables: dict[str, Any], *names: str) -> Written:
-    scipy.io.savemat(folder / "a.mat", variables)
-    return Written(folder / "a.mat", _named(*names), UNITS)
-
-
-@_instrument("MATLAB struct of two axes")
-def _(folder: Path) -> Written:
-    axes = {"Ux": VOLTAGE, "Uy": 0 * VOLTAGE, "x": DISPLACEMENT, "y": 0.1 * VOLTAGE}
-    written = _mat(folder, {"log": {"time": TIME} | axes, "operator": "bench"}, *"tux")
-    return written._replace(columns={"voltage": "log.Ux", "displacement": "log.x"})
-
-
-@_instrument("MATLAB struct array")
-def _(folder: Path) -> Written:
-    channels = np.zeros(2, dtype=[("Name", object), ("Data", object)])
-    channels["Name"] = ["Model Root/u", "Model Root/y"]
-    channels["Data"] = [VOLTAGE, DISPLACEMENT]
-    variables = {"rec": {"X": {"Data": TIME}, "Y": channels}}
-    return _mat(folder, variables, "rec.X.Data", "rec.Y(1).Data", "rec.Y(2).Data")
-
-
-@_instrument("MATLAB matrix")
-def _(folder: Path) -> Written:
-    variables = {"data": np.stack(COLUMNS, axis=1), "fs": 200.0}
-    return _mat(folder, variables, "data[1]", "data[2]", "data[3]")
-
-
-@_instrument("MATLAB 7.3 struct")
-def _(folder: Path) -> Written:
-    with h5py.File(folder / "a.mat", "w", userblock_size=512) as file:
-        for name, values in zip(("t", "U_V", "pos_um"), COLUMNS, strict=True):
-            file[f"log/{name}"] = values[np.newaxis, :]
-            file[f"log/{name}"].attrs["MATLAB_class"] = np.bytes_("double")
-        file["log/operator"] = np.frombuffer("bench".encode("utf-16-le"), "<u2")[:, np.newaxis]
-        file["log/operator"].attrs["MATLAB_class"] = np.bytes_("char")
-        file["#refs#/a"] = np.arange(9.0)
-    with (folder / "a.mat").open("r+b") as stream:
-        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\0\2IM")
-    return Written(folder / "a.mat", {}, {"time": "s"})
-
-
-@_instrument("HDF5 groups with units")
-def _(folder: Path) -> Written:
-    with h5py.File(folder / "a.h5", "w") as file:
-        for run in ("run_001", "run_003"):
-            group = file.create_group(f"measurement/{run}")
-            group["t"], group["hv_out"] = 1e3 * TIME, VOLTAGE
-            group["axis_x"], group["axis_y"] = 1e3 * DISPLACEMENT, 0 * DISPLACEMENT
-            for name, unit in (("t", "ms"), ("hv_out", "V"), ("axis_x", "nm"), ("axis_y", "nm")):
-                group[name].attrs["unit"] = unit
-    run = "measurement/run_003"
-    columns = {"voltage": f"{run}/hv_out", "displacement": f"{run}/axis_x"}
-    return Written(folder / "a.h5", columns)
-
-
-@_instrument("HDF5 table")
-def _(folder: Path) -> Written:
-    rows = np.zeros(SAMPLES, dtype=[("t_s", "f8"), ("u_V", "f4"), ("pos_um", "f8")])
-    rows["t_s"], rows["u_V"], rows["pos_um"] = COLUMNS
-    with h5py.File(folder / "a.hdf5", "w") as file:
-        file["log"] = rows
-    return Written(folder / "a.hdf5")
-
-
-@_instrument("numpy.savetxt")
-def _(folder: Path) -> Written:
-    np.savetxt(folder / "a.dat", np.stack(COLUMNS, axis=1), header="t_s u_V x_um")
-    return Written(folder / "a.dat")
-
-
-@_instrument("no header, blanks")
-def _(folder: Path) -> Written:
-    rows = _rows([TIME, DISPLACEMENT, VOLTAGE], "  ")
-    return _text(folder / "a.asc", rows, columns=_named("1", "3", "2"), units=UNITS)
-
-
-@_instrument("oscilloscope, units in brackets")
-def _(folder: Path) -> Written:
-    """With an empty line; the sensor's is a voltage."""
-    rows = _rows([1e3 * TIME, VOLTAGE, 1e3 * DISPLACEMENT], ",")
-    lines = ["Time,Channel A,Channel B", "(ms),(V),(mV)", "", *rows]
-    columns = {"voltage": "Channel A", "displacement": "Channel B"}
-    return _text(folder / "a.csv", lines, columns=columns, units={"displacement": "nm"})
-
-
-@_instrument("oscilloscope, units in words")
-def _(folder: Path) -> Written:
-    lines = ["x-axis,1,2", "second,Volt,Volt", *_rows(COLUMNS, ",")]
-    columns = {"voltage": "2", "displacement": "3"}
-    return _text(folder / "a.csv", lines, columns=columns, units={"displacement": "um"})
-
-
-def _stamped(folder: Path, names: str, stamps: Any) -> Written:
-    rows = [f"{t},{v},{d}" for t, v, d in zip(stamps, VOLTAGE, DISPLACEMENT, strict=True)]
-    return _text(folder / "a.csv", [names, *rows])
-
-
-@_instrument("logger with dates")
-def _(folder: Path) -> Written:
-    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(TIME, unit="s")
-    stamps = [t.isoformat(timespec="milliseconds") for t in moments]
-    return _stamped(folder, "Timestamp,Command [V],Position [um]", stamps)
-
-
-@_instrument("Unix time in ms")
-def _(folder: Path) -> Written:
-    stamps = np.rint(1_772_539_199_000 + 1e3 * TIME).astype(np.int64)
-    return _stamped(folder, "t_ms,u_V,x_um", stamps)
-
-
-@_instrument("times of day")
-def _(folder: Path) -> Written:
-    return _stamped(folder, "Time,Command [V],Position [um]", [f"00:00:{t:06.3f}" for t in TIME])
-
-
-@_instrument("pandas with its index")
-def _(folder: Path) -> Written:
-    columns = dict(zip(("time_s", "voltage_V", "displacement_um"), COLUMNS, strict=True))
-    pd.DataFrame(columns).to_csv(folder / "a.csv")
-    return Written(folder / "a.csv")
-
-
-@_instrument("Japanese, cp932")
-def _(folder: Path) -> Written:
-    lines = ["圧電アクチュエータ", "時間(s),電圧(V),変位(um)", *_rows(COLUMNS, ",")]
-    return _text(folder / "a.csv", lines, "cp932")
-
-
-@_instrument("separators at the ends")
-def _(folder: Path) -> Written:
-    return _text(folder / "a.txt", ['"t_s"\t"u_V"\t"x_um"\t', *_rows(COLUMNS, "\t", end="\t")])
-
-
-@_instrument("no times at all")
-def _(folder: Path) -> Written:
-    rows = _rows([VOLTAGE, DISPLACEMENT], ",")
-    return _text(folder / "a.csv", ["u_V,x_um", *rows], fs=1 / INTERVAL)
-
-
-@_instrument("no names and no times")
-def _(folder: Path) -> Written:
-    columns = {"voltage": "1", "displacement": "2"}
-    units = {"voltage": "V", "displacement": "um"}
-    rows = _rows([VOLTAGE, DISPLACEMENT], "\t")
-    return _text(folder / "a.txt", rows, columns=columns, units=units, fs=1 / INTERVAL)
-
-
-@_instrument("marks between thousands")
-def _(folder: Path) -> Written:
-    rows = _rows([1e3 * column for column in COLUMNS], ";", ",.2f")
-    rows = [row.translate(str.maketrans(",.", ".,")) for row in rows]
-    return _text(folder / "a.csv", ["Zeit [ms];Spannung [mV];Weg [nm]", *rows])
-
-
-@_instrument("exponents of Fortran")
-def _(folder: Path) -> Written:
-    rows = [row.replace("E", "D") for row in _rows(COLUMNS, "  ", ".9E")]
-    return _text(folder / "a.dat", ["% t/s u/V x/um", *rows])
-
-
-@_instrument("settings beside the numbers")
-def _(folder: Path) -> Written:
-    """Of an oscilloscope."""
-    rows = _rows(COLUMNS, ",")
-    head = ['"Record Length",600', '"Source","CH1"', '"Vertical Units","V"']
-    head += [","] * (len(rows) - len(head))
-    lines = [f"{a},{b}" for a, b in zip(head, rows, strict=True)]
-    return _text(folder / "a.csv", lines, columns=_named("3", "4", "5"), units=UNITS)
-
-
-@_instrument("oscilloscope, settings in as many fields")
-def _(folder: Path) -> Written:
-    head = ["Model,MSO44", "", "Sample Interval,0.005", "Vertical Units,V,V", "Vertical Offset,0,0"]
-    head += ["Vertical Scale,2,1", "Position,0,0", ",", "Label,Monitor,Sensor", "TIME,CH1,CH2"]
-    rows = _rows([TIME, VOLTAGE / 20, DISPLACEMENT / 0.35], ",", ".9f")
-    columns = _named("TIME", "CH1", "CH2")
-    units = {"time": "s", "voltage": "20 V", "displacement": "0.35 um"}
-    return _text(folder / "a.csv", [*head, *rows], columns=columns, units=units)
-
-
-@_instrument("Origin, comments below the units")
-def _(folder: Path) -> Written:
-    head = ["Time\tVoltage\tDisplacement", "s\tV\tum", "\tamplifier\tcapacitive"]
-    return _text(folder / "a.txt", [*head, *_rows(COLUMNS, "\t")])
-
-
-@_instrument("dSPACE, with a column of words")
-def _(folder: Path) -> Written:
-    head = ["values;;;", 'path;;"Model Root/DAC";"Model Root/ADC"', "name;time;U_cmd;pos_um"]
-    rows = _commas([f";{row}" for row in _rows(COLUMNS, ";")])
-    return _text(folder / "a.csv", [*head, "unit;s;V;um", *rows])
-
-
-@_instrument("MATLAB timetable")
-def _(folder: Path) -> Written:
-    rows = [f"{t:g} sec,{v:.6f},{d:.6f}" for t, v, d in zip(*COLUMNS, strict=True)]
-    return _text(folder / "a.csv", ["Time,Voltage_V_,Position_um_", *rows])
-
-
-@_instrument("data recorder of PI")
-def _(folder: Path) -> Written:
-    head = ["REM E-709", "", "VERSION = 1", "SEPARATOR = 32", "DIM = 2", "SAMPLE_TIME = 0.005000"]
-    head += ["NDATA = 600", "", "NAME0 = Actual Position of axis 1"]
-    head += ["NAME1 = Control Voltage of output chan 1", "", "END_HEADER"]
-    rows = _rows([DISPLACEMENT, VOLTAGE], " ")
-    columns = {"voltage": "Control Voltage of output chan 1", "displacement": "1"}
-    units = {"voltage": "V", "displacement": "um"}
-    return _text(
-        folder / "a.dat",
-        [*(f"# {line}" for line in head), *rows],
-        columns=columns,
-        units=units,
-        fs=200,
-    )
-
-
-@_instrument("commas in quotes")
-def _(folder: Path) -> Written:
-    rows = [f'"{row}"' for row in _commas(_rows(COLUMNS, '"|"'))]
-    rows = [row.replace("|", ",") for row in rows]
-    return _text(folder / "a.csv", ['"Time (s)","Voltage (V)","Displacement (um)"', *rows])
-
-
-@_instrument("numbered samples")
-def _(folder: Path) -> Written:
-    head = ["Interferometer", "Sample Rate (Hz): 200", "", "Sample;Voltage(V);Position(nm)"]
-    rows = _rows([np.arange(SAMPLES), VOLTAGE, 1e3 * DISPLACEMENT], ";")
-    return _text(folder / "a.txt", [*head, *rows], fs=200)
-
-
-@_instrument("Rigol, settings in the header")
-def _(folder: Path) -> Written:
-    """Count samples; start and increment stand above empty columns."""
-    rows = _rows([VOLTAGE, DISPLACEMENT], ",", end=",,")
-    lines = ["X,CH1,CH2,Start,Increment", f"Sequence,Volt,Volt,0.000000e+00,{INTERVAL:e}"]
-    lines += [f"{i},{row}" for i, row in enumerate(rows)]
-    return _text(
-        folder / "a.csv", lines, columns={"voltage": "CH1", "displacement": "CH2"}, units=_MICRONS
-    )
-
-
-@_instrument("Rigol, increment behind the names")
-def _(folder: Path) -> Written:
-    rows = _rows([VOLTAGE, DISPLACEMENT], ",", end=",,")
-    header = f"CH1(V),CH2(V),t0 = 0.000000e+00s, tInc = {INTERVAL:e}s,"
-    columns = {"voltage": "CH1(V)", "displacement": "CH2(V)"}
-    return _text(folder / "a.csv", [header, *rows], columns=columns, units=_MICRONS)
-
-
-@_instrument("Siglent")
-def _(folder: Path) -> Written:
-    head = ["Record Length,Analog:600", f"Sample Interval,Analog:{INTERVAL:.9f}"]
-    head += ["Vertical Units,CH1:V,CH2:V", "Vertical Scale,CH1:20.00,CH2:5.00"]
-    head += ["Horizontal Units,s", "Source,CH1,CH2"]
-    lines = [*head, "Second,Volt,Volt", *_rows(COLUMNS, ",", ".7E")]
-    columns = {"voltage": "CH1", "displacement": "CH2"}
-    return _text(folder / "a.csv", lines, columns=columns, units={"voltage": "V"} | _MICRONS)
-
-
-@_instrument("PicoScope, times in ms")
-def _(folder: Path) -> Written:
-    rows = _rows([1e3 * TIME, VOLTAGE, DISPLACEMENT], ",", ".8f")
-    lines = ["Time,Channel A,Channel B", "(ms),(V),(V)", "", *rows]
-    columns = {"voltage": "Channel A", "displacement": "Channel B"}
-    return _text(folder / "a.csv", lines, columns=columns, units=_MICRONS)
-
-
-@_instrument("Polytec")
-def _(folder: Path) -> Written:
-    head = ["Source File Name:\tbench.pvd", "Signal:\tTime Vib Displacement", "Frame Data"]
-    lines = [*head, "", "Time\tVib Displacement\tRef1 Voltage", "[ s ]\t[ m ]\t[ V ]"]
-    rows = _rows([TIME, 1e-6 * DISPLACEMENT, VOLTAGE], "\t", ".14e")
-    return _text(folder / "a.txt", [*lines, *rows])
-
-
-@_instrument("Keyence, quoted thousands")
-def _(folder: Path) -> Written:
-    rows = _rows([TIME, 1e3 * VOLTAGE, 1e3 * DISPLACEMENT], '","', ",.3f")
-    lines = ['"Time [s]","Monitor [mV]","OUT1 displacement [nm]"', *(f'"{row}"' for row in rows)]
-    return _text(folder / "a.csv", lines)
-
-
-@_instrument("Attocube, picometers counted")
-def _(folder: Path) -> Written:
-    lines = ["# time (ms) drive voltage (V) displacement axis (pm)"]
-    lines += _rows([1e3 * TIME, VOLTAGE, 1e6 * DISPLACEMENT], " ", ".6f")
-    return _text(folder / "a.dat", lines)
-
-
-@_instrument("wave table of PI, target and actual")
-def _(folder: Path) -> Written:
-    lines = ["Time [s];Target Position [µm];Actual Position [µm];Control Voltage [V]"]
-    rows = _rows([TIME, np.round(DISPLACEMENT), DISPLACEMENT, VOLTAGE], ";")
-    columns = {"displacement": "Actual Position [µm]"}
-    return _text(folder / "a.csv", [*lines, *_commas(rows)], "cp1252", columns=columns)
-
-
-@_instrument("pandas without names")
-def _(folder: Path) -> Written:
-    pd.DataFrame(np.transpose(COLUMNS)).to_csv(folder / "a.csv", index=False)
-    return Written(folder / "a.csv", _named("1", "2", "3"), UNITS)
-
-
-@_instrument("writematrix of MATLAB")
-def _(folder: Path) -> Written:
-    """Shortest digits, no names."""
-    rows = [f"{t:.15g},{v:.15g},{d:.15g}" for t, v, d in zip(*COLUMNS, strict=True)]
-    return _text(folder / "a.txt", rows, columns=_named("1", "2", "3"), units=UNITS)
-
-
-@_instrument("thermologger, minutes and a temperature")
-def _(folder: Path) -> Written:
-    lines = ["No.,Time,U,Pos,Temp", "-,min,V,um,°C"]
-    rows = _rows([TIME / 60, VOLTAGE, DISPLACEMENT, 21.5 + 0 * TIME], ",", ".9g", end=",,")
-    lines += [f"{i},{row}" for i, row in enumerate(rows, start=1)]
-    return _text(folder / "a.csv", [*lines, ",,,,,,", ",,,,,,"])
+    _text(name, lines[:-1], [], file="a.lvm")
+
+
+_TIMED = _rows(COLUMNS, "\t")
+_NAMES = "X_Value\tVoltage\tPosition"
+_lvm("LabVIEW lvm", [[f"{_TIMED[0]}\t", *_TIMED[1:]]], _NAMES)
+_lvm("LabVIEW lvm, three segments", [_TIMED[:200], _TIMED[200:400], _TIMED[400:]], _NAMES)
+_UNTIMED = [f"\t{row}" for row in _rows(COLUMNS[1:], "\t")]
+_lvm("LabVIEW lvm without times", [_UNTIMED], _NAMES, "No")
+_EACH = _rows([TIME, VOLTAGE, TIME, DISPLACEMENT], "\t")
+_lvm("LabVIEW lvm, times of each channel", [_EACH], "X_Value\tVoltage\tX_Value\tPosition", "Multi")
+_text("numpy.savetxt", ["# t_s u_V x_um"], _rows(COLUMNS, " ", ".18e"), file="a.dat")
+_text(
+    "no header, blanks",
+    [],
+    _rows([TIME, DISPLACEMENT, VOLTAGE], "  "),
+    (named("1", "3", "2"), UNITS),
+    file="a.asc",
+)
+_FRAME = pd.DataFrame(dict(zip(("time_s", "voltage_V", "displacement_um"), COLUMNS, strict=True)))
+_text("pandas with its index", [], _FRAME.to_csv().splitlines())
+_text(
+    "pandas without names",
+    [],
+    pd.DataFrame(np.transpose(COLUMNS)).to_csv(index=False).splitlines(),
+    (named("1", "2", "3"), UNITS),
+)
+_text(
+    "Japanese, cp932",
+    ["圧電アクチュエータ", "時間(s),電圧(V),変位(um)"],
+    _rows(COLUMNS, ","),
+    encoding="cp932",
+)
+_text("no times at all", ["u_V,x_um"], _rows(COLUMNS[1:], ","), ({}, {}, 1 / INTERVAL))
+_text("no names and no times", [], _rows(COLUMNS[1:], "\t"), (named("1", "2"), BOTH, 1 / INTERVAL))
+_text(
+    "spreadsheet, French, blanks between thousands and typeset minus signs",
+    ["temps [s];tension [mV];position [nm]"],
+    [
+        row.translate({ord(a): b for a, b in {",": " ", ".": ",", "-": "\u2212"}.items()})
+        for row in _rows([TIME, 1e3 * VOLTAGE, 1e3 * DISPLACEMENT], ";", ",.3f")
+    ],
+)
+_text(
+    "exponents of Fortran",
+    ["% t/s u/V x/um"],
+    [row.replace("E", "D") for row in _rows(COLUMNS, "  ", ".9E")],
+    file="a.dat",
+)
+_text(
+    "Origin, comments below the units",
+    ["Time\tVoltage\tDisplacement", "s\tV\tum", "\tamplifier\tcapacitive"],
+    _rows(COLUMNS, "\t"),
+)
+_text(
+    "dSPACE, with a column of words",
+    [
+        *("values;;;", 'path;;"Model Root/DAC";"Model Root/ADC"', "name;time;U_cmd;pos_um"),
+        "unit;s;V;um",
+    ],
+    [f";{row}" for row in _commas(_rows(COLUMNS, ";"))],
+)
+_text(
+    "MATLAB timetable",
+    ["Time,Voltage_V_,Position_um_"],
+    [f"{t:g} sec,{v:.6f},{d:.6f}" for t, v, d in zip(*COLUMNS, strict=True)],
+)
+# Shortest digits, no names.
+_text("writematrix of MATLAB", [], _rows(COLUMNS, ",", ".15g"), (named("1", "2", "3"), UNITS))
+_text(
+    "commas in quotes",
+    ['"Time (s)","Voltage (V)","Displacement (um)"'],
+    [f'"{row}"'.replace("|", ",") for row in _commas(_rows(COLUMNS, '"|"'))],
+)
+_text(
+    "a table drawn with bars and dashes",
+    ["| t (s) | U (V) | x (um) |", "|-------|------:|:------:|"],
+    [f"| {row} |" for row in _rows(COLUMNS, " | ")],
+    file="a.md",
+)
+_text(
+    "Igor, waves as text",
+    ["IGOR", "WAVES/D t_s, voltage_V, pos_nm", "BEGIN"],
+    [f"\t{row}" for row in _rows([TIME, VOLTAGE, 1e3 * DISPLACEMENT], "\t")]
+    + ["END", 'X SetScale/P x 0,0.005,"s", voltage_V'],
+    file="a.itx",
+)
+
+# Oscilloscopes and recorders
+
+# With an empty line; the sensor's is a voltage.
+_text(
+    "oscilloscope, units in brackets",
+    ["Time,Channel A,Channel B", "(ms),(V),(mV)", ""],
+    _rows([1e3 * TIME, VOLTAGE, 1e3 * DISPLACEMENT], ","),
+    (named("Channel A", "Channel B"), {"displacement": "nm"}),
+)
+_text(
+    "oscilloscope, units in words",
+    ["x-axis,1,2", "second,Volt,Volt"],
+    _rows(COLUMNS, ","),
+    (named("2", "3"), MICRONS),
+)
+_text(
+    "oscilloscope, units behind a preposition",
+    ['"in s","CH1 in V","CH2 in V"'],
+    _rows(COLUMNS, ","),
+    (named("CH1 in V", "CH2 in V"), {"displacement": "1 um"}),
+)
+_text(
+    "oscilloscope, settings beside the numbers",
+    [],
+    _beside(['"Record Length",600', '"Source","CH1"', '"Vertical Units","V"', *[","] * 597]),
+    (named("3", "4", "5"), UNITS),
+)
+_text(
+    "oscilloscope, settings in columns of their own",
+    [],
+    _beside(
+        ["Record Length,600,", "Sample Interval,0.005,", "Trigger Point,1,", "Source,CH1,"]
+        + [",,"] * 596
+    ),
+    (named("4", "5", "6"), UNITS),
+)
+_text(
+    "oscilloscope, settings in as many fields",
+    [
+        *("Model,MSO44", "", "Sample Interval,0.005", "Vertical Units,V,V", "Vertical Offset,0,0"),
+        *("Vertical Scale,2,1", "Position,0,0", ",", "Label,Monitor,Sensor", "TIME,CH1,CH2"),
+    ],
+    _rows([TIME, VOLTAGE / 20, DISPLACEMENT / 0.35], ",", ".9f"),
+    (named("TIME", "CH1", "CH2"), {"time": "s", "voltage": "20 V", "displacement": "0.35 um"}),
+)
+_TEKTRONIX = [
+    *("Model,MSO44", "Firmware Version,1.2.3", "Horizontal Units,s", "Horizontal Scale,0.4"),
+    *(f"Sample Interval,{INTERVAL}", f"Record Length,{SAMPLES}", "Gating,0.0% to 100.0%"),
+    *("Probe Attenuation,10,1", "Vertical Units,V,um", "Vertical Offset,0,0", ","),
+    "Label,Monitor,Sensor",
+]
+_text(
+    "oscilloscope, units and rate above the header",
+    [*_TEKTRONIX, "TIME,CH1,CH2"],
+    _rows(COLUMNS, ","),
+    (named("CH1", "CH2"),),
+)
+_text(
+    "oscilloscope, rate above the header in place of times",
+    [*_TEKTRONIX, "CH1,CH2"],
+    _rows(COLUMNS[1:], ","),
+    (named("CH1", "CH2"),),
+)
+# Count samples; start and increment stand above empty columns.
+_text(
+    "Rigol, settings in the header",
+    ["X,CH1,CH2,Start,Increment", f"Sequence,Volt,Volt,0.000000e+00,{INTERVAL:e}"],
+    [f"{i},{row}" for i, row in enumerate(_rows(COLUMNS[1:], ",", end=",,"))],
+    (named("CH1", "CH2"), MICRONS),
+)
+_text(
+    "Rigol, increment behind the names",
+    [f"CH1(V),CH2(V),t0 = 0.000000e+00s, tInc = {INTERVAL:e}s,"],
+    _rows(COLUMNS[1:], ",", end=",,"),
+    (named("CH1(V)", "CH2(V)"), MICRONS),
+)
+_text(
+    "Siglent",
+    [
+        *("Record Length,Analog:600", f"Sample Interval,Analog:{INTERVAL:.9f}"),
+        *("Vertical Units,CH1:V,CH2:V", "Vertical Scale,CH1:20.00,CH2:5.00", "Horizontal Units,s"),
+        *("Source,CH1,CH2", "Second,Volt,Volt"),
+    ],
+    _rows(COLUMNS, ",", ".7E"),
+    (named("CH1", "CH2"), BOTH),
+)
+_text(
+    "recorder, settings above fields that begin with a separator",
+    [
+        *('"Model","DL850"', '"TraceName","CH1","CH2"', '"BlockSize",600,600'),
+        *('"SampleRate",200,200', '"HResolution",5.0e-03,5.0e-03', '"HOffset",0.0,0.0', ""),
+    ],
+    [f",{row}," for row in _rows(COLUMNS[1:], ",")],
+    (named("2", "3"), BOTH, 200.0),
+)
+
+# Loggers
+
+_MOMENTS = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(np.rint(1e3 * TIME), unit="ms")
+_text(
+    "logger with dates",
+    ["Timestamp,Command [V],Position [um]"],
+    _beside([t.isoformat(timespec="milliseconds") for t in _MOMENTS], COLUMNS[1:]),
+)
+_text(
+    "Unix time in ms",
+    ["t_ms,u_V,x_um"],
+    _beside([f"{1_772_539_199_000 + 1e3 * t:.0f}" for t in TIME], COLUMNS[1:]),
+)
+_text(
+    "Keysight BenchLink, milliseconds behind a colon",
+    ["Scan,Time,101 <HV> (VDC),Alarm 101,102 <Gauge> (VDC),Alarm 102"],
+    [
+        f"{i},{t:%m/%d/%Y %H:%M:%S}:{t.microsecond // 1000:03d},{v:+.8E},0,{d:+.8E},0"
+        for i, (t, v, d) in enumerate(zip(_MOMENTS, VOLTAGE, DISPLACEMENT, strict=True), start=1)
+    ],
+    (named("101 <HV> (VDC)", "102 <Gauge> (VDC)"), {"voltage": "V", "displacement": "1 um"}),
+)
+_text(
+    "thermologger, minutes and a temperature",
+    ["No.,Time,U,Pos,Temp", "-,min,V,um,°C"],
+    _rows([np.arange(1, 601), TIME / 60, *COLUMNS[1:], 21.5 + 0 * TIME], ",", ".9g", end=",,")
+    + 2 * [",,,,,,"],
+)
+_text(
+    "catman, channels and devices below the names",
+    [
+        *("HBM_CATMAN_DATAFILE", "Version:\t5.2", "", '"Zeit 1 [s]"\t"U_Piezo [V]"\t"Weg 1 [µm]"'),
+        *('"CH=1"\t"CH=2"\t"CH=3"', '"Auto"\t"MX"\t"MX"'),
+    ],
+    _rows(COLUMNS, "\t"),
+)
+
+# Controllers and sensors
+
+_text(
+    "data recorder of PI",
+    [
+        *("# REM E-709", "# ", "# VERSION = 1", "# SEPARATOR = 32", "# DIM = 2"),
+        *("# SAMPLE_TIME = 0.005000", "# NDATA = 600", "# ", "# NAME0 = Actual Position of axis 1"),
+        *("# NAME1 = Control Voltage of output chan 1", "# ", "# END_HEADER"),
+    ],
+    _rows([DISPLACEMENT, VOLTAGE], " "),
+    (named("Control Voltage of output chan 1", "1"), BOTH, 200),
+    file="a.dat",
+)
+_text(
+    "wave table of PI, target and actual",
+    ["Time [s];Target Position [µm];Actual Position [µm];Control Voltage [V]"],
+    _commas(_rows([TIME, np.round(DISPLACEMENT), DISPLACEMENT, VOLTAGE], ";")),
+    ({"displacement": "Actual Position [µm]"},),
+    encoding="cp1252",
+)
+_text(
+    "controller's scope, a clock beside each channel and settings above",
+    ["Name\tU\tName\tPos", "SampleTime[ms]\t5\tSampleTime[ms]\t5", "Unit\tV\tUnit\tum", ""],
+    _rows([1e3 * TIME, VOLTAGE, 1e3 * TIME, DISPLACEMENT], "\t"),
+    (named("1", "2", "4"), {"time": "ms", "voltage": "V", "displacement": "um"}),
+)
+_text(
+    "numbered samples",
+    ["Interferometer", "Sample Rate (Hz): 200", "", "Sample;Voltage(V);Position(nm)"],
+    _rows([np.arange(SAMPLES), VOLTAGE, 1e3 * DISPLACEMENT], ";"),
+    ({}, {}, 200),
+)
+_text(
+    "Polytec",
+    [
+        *("Source File Name:\tbench.pvd", "Signal:\tTime Vib Displacement", "Frame Data", ""),
+        *("Time\tVib Displacement\tRef1 Voltage", "[ s ]\t[ m ]\t[ V ]"),
+    ],
+    _rows([TIME, 1e-6 * DISPLACEMENT, VOLTAGE], "\t", ".14e"),
+)
+_text(
+    "Keyence, quoted thousands",
+    ['"Time [s]","Monitor [mV]","OUT1 displacement [nm]"'],
+    [f'"{row}"' for row in _rows([TIME, 1e3 * VOLTAGE, 1e3 * DISPLACEMENT], '","', ",.3f")],
+)
+_text(
+    "Attocube, picometers counted",
+    ["# time (ms) drive voltage (V) displacement axis (pm)"],
+    _rows([1e3 * TIME, VOLTAGE, 1e6 * DISPLACEMENT], " "),
+    file="a.dat",
+)
+_text(
+    "ferroelectric tester, electrodes of either polarity",
+    [
+        *("Result", "Hysteresis Amplitude [V]: 60", "Table 1"),
+        "Time [s]\tV+ [V]\tV- [V]\tI1 [A]\tD1 [nm]",
+    ],
+    _rows([TIME, VOLTAGE, -VOLTAGE, np.cos(TIME), 1e3 * DISPLACEMENT], "\t"),
+    ({"voltage": "V+ [V]"},),
+    file="a.dat",
+)
+_text(
+    "potentiostat, voltages against a reference",
+    ["EXPLAIN", "CURVE\tTABLE\t600", "Pt\tT\tVf\tIm\tPos", "#\ts\tV vs. Ref.\tA\tum"],
+    _rows([np.arange(SAMPLES), *COLUMNS[:2], TIME**2, DISPLACEMENT], "\t"),
+    ({"voltage": "Vf"},),
+    file="a.dta",
+)

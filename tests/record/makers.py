@@ -1,39 +1,264 @@
-"""More files of other makers, as :mod:`tests.record.instruments` has them, after their formats."""
+"""Files of other formats than text, as :mod:`tests.record.instruments` has these, added to them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
 import h5py
 import numpy as np
+import pandas as pd
 import scipy.io
+from nptdms import ChannelObject, GroupObject, RootObject, TdmsWriter
+from openpyxl import Workbook
 
 from tests.record.instruments import (
+    BOTH,
     COLUMNS,
     DISPLACEMENT,
+    INSTRUMENTS,
     INTERVAL,
+    MICRONS,
     SAMPLES,
     TIME,
     UNITS,
     VOLTAGE,
     Writer,
     Written,
+    named,
 )
 
-MAKERS: dict[str, Writer] = {}
-MICRONS = {"displacement": "1 um"}
 COUNTS = np.rint(DISPLACEMENT / 1e-5).astype(np.int32)  # exact, as it has five decimals
+NAMES = ("time_s", "voltage_V", "displacement_um")
+PAIR = np.stack(COLUMNS[1:], axis=1)
 
 
 def _maker(name: str) -> Callable[[Writer], Writer]:
     def register(write: Writer) -> Writer:
-        MAKERS[name] = write
+        INSTRUMENTS[name] = write
         return write
 
     return register
+
+
+def _table(*fields: tuple[Any, ...]) -> Any:
+    """Return a structured array of fields: name, type, values and shape of each, if it has one."""
+    rows = np.zeros(SAMPLES, dtype=[(name, kind, *shape) for name, kind, _, *shape in fields])
+    for name, _, values, *_ in fields:
+        rows[name] = values
+    return rows
+
+
+def _tdms(folder: Path, channels: Mapping[str, Any], **properties: dict[str, Any]) -> Path:
+    with TdmsWriter(folder / "a.tdms") as writer:
+        writer.write_segment(
+            [ChannelObject("Log", n, data, properties.get(n, {})) for n, data in channels.items()]
+        )
+    return folder / "a.tdms"
+
+
+@_maker("TDMS waveforms")
+def _(folder: Path) -> Written:
+    wave = {"wf_increment": INTERVAL, "wf_start_offset": 0.0, "wf_samples": SAMPLES}
+    units = {"Voltage": wave | {"unit_string": "V"}, "Position": wave | {"unit_string": "um"}}
+    return Written(_tdms(folder, {"Voltage": VOLTAGE, "Position": DISPLACEMENT}, **units))
+
+
+@_maker("TDMS with times")
+def _(folder: Path) -> Written:
+    path = _tdms(folder, {"Time (s)": TIME, "U_V": VOLTAGE, "laser": DISPLACEMENT})
+    return Written(path, {"displacement": "laser"}, MICRONS)
+
+
+@_maker("FlexLogger, TDMS groups")
+def _(folder: Path) -> Written:
+    start = np.datetime64("2026-03-03T12:00:00.123456", "us")
+    wave = {"wf_increment": INTERVAL, "wf_start_offset": 0.0, "wf_start_time": start}
+    group = "cDAQ1Mod1"
+    monitor, position = wave | {"unit_string": "V"}, wave | {"unit_string": "um"}
+    with TdmsWriter(folder / "a.tdms") as writer:
+        for rows in (slice(0, 400), slice(400, SAMPLES)):
+            writer.write_segment(
+                [
+                    RootObject({"Name": "Test 12", "Operator": "bench"}),
+                    GroupObject(group, {"Rate": 200.0}),
+                    ChannelObject(group, "Amplifier Monitor", VOLTAGE[rows], monitor),
+                    ChannelObject(group, "Stage Position", DISPLACEMENT[rows], position),
+                ]
+            )
+    return Written(folder / "a.tdms", named("Amplifier Monitor", "Stage Position"))
+
+
+@_maker("Excel workbook, units in a second row")
+def _(folder: Path) -> Written:
+    book = Workbook()
+    book.active.title = "Notes"
+    book.active.append(["Bench 3", "piezo"])
+    sheet = book.create_sheet("Run 1")
+    sheet.append(["Measurement 7, loops"])
+    sheet.merge_cells("A1:C1")
+    sheet.append(["Time", "Voltage", "Displacement", "Remark"])
+    for row in (["s", "V", "um"], *np.stack(COLUMNS, axis=1).tolist()):
+        sheet.append(row)
+    book.save(folder / "a.xlsx")
+    return Written(folder / "a.xlsx")
+
+
+@_maker("pandas to Excel, with dates")
+def _(folder: Path) -> Written:
+    moments = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(TIME, unit="s")
+    frame = pd.DataFrame({"Time": moments, "U [V]": VOLTAGE, "x [um]": DISPLACEMENT})
+    frame.to_excel(folder / "a.xlsx", index=False)
+    return Written(folder / "a.xlsx")
+
+
+@_maker("LibreOffice workbook")
+def _(folder: Path) -> Written:
+    """With shared words, durations by their style, formulas' values, and styled empty rows."""
+    book = Workbook()
+    book.active.append(["Time", "Voltage [V]", "Position [um]"])
+    for row in np.stack([TIME / 86400, *COLUMNS[1:]], axis=1).tolist():
+        book.active.append(row)
+    for number in range(2, SAMPLES + 40):
+        book.active.cell(number, 1).number_format = "[HH]:MM:SS.00"
+    book.save(folder / "written.xlsx")
+    formula = rb'<c r="B\1"\2><f aca="false">B\1*1</f><v>'
+    with ZipFile(folder / "written.xlsx") as plain, ZipFile(folder / "a.xlsx", "w") as archive:
+        for name in plain.namelist():
+            content = plain.read(name)
+            if name == "xl/worksheets/sheet1.xml":
+                content = re.sub(rb'<c r="B(\d*[13579])"([^>]*)><v>', formula, content)
+                assert content.count(b"<f ") == SAMPLES // 2
+            archive.writestr(name, content)
+    return Written(folder / "a.xlsx")
+
+
+def _mat(folder: Path, variables: dict[str, Any], *names: str, **units: str) -> Written:
+    scipy.io.savemat(folder / "a.mat", variables)
+    return Written(folder / "a.mat", named(*names), units)
+
+
+@_maker("MATLAB struct of two axes")
+def _(folder: Path) -> Written:
+    axes = {"Ux": VOLTAGE, "Uy": 0 * VOLTAGE, "x": DISPLACEMENT, "y": 0.1 * VOLTAGE}
+    variables = {"log": {"time": TIME} | axes, "operator": "bench"}
+    return _mat(folder, variables, "log.Ux", "log.x", **UNITS)
+
+
+@_maker("MATLAB struct array")
+def _(folder: Path) -> Written:
+    channels = np.zeros(2, dtype=[("Name", object), ("Data", object)])
+    channels["Name"] = ["Model Root/u", "Model Root/y"]
+    channels["Data"] = [VOLTAGE, DISPLACEMENT]
+    variables = {"rec": {"X": {"Data": TIME}, "Y": channels}}
+    return _mat(folder, variables, "rec.X.Data", "rec.Y(1).Data", "rec.Y(2).Data", **UNITS)
+
+
+@_maker("MATLAB matrix")
+def _(folder: Path) -> Written:
+    variables = {"data": np.stack(COLUMNS, axis=1), "fs": 200.0}
+    return _mat(folder, variables, "data[1]", "data[2]", "data[3]", **UNITS)
+
+
+@_maker("MATLAB, structs of time series")
+def _(folder: Path) -> Written:
+    """As ``struct(ts)`` saves them, each with the same times."""
+    variables: dict[str, Any] = {
+        name: {
+            **{"Name": name, "Time": TIME[:, None], "Data": values[:, None]},
+            **{"DataInfo": {"Units": unit}, "TimeInfo": {"Units": "seconds"}},
+        }
+        for name, unit, values in (("drive", "V", VOLTAGE), ("stage", "um", DISPLACEMENT))
+    }
+    return _mat(folder, variables, "drive.Data", "stage.Data")
+
+
+@_maker("Simulink, structure with time")
+def _(folder: Path) -> Written:
+    signals = {"values": PAIR, "dimensions": 2.0, "label": "u, y"}
+    variables: dict[str, Any] = {"out": {"time": TIME[:, None], "signals": signals}}
+    return _mat(folder, variables, "out.signals.values[1]", "out.signals.values[2]", **UNITS)
+
+
+@_maker("MATLAB 7.3 struct")
+def _(folder: Path) -> Written:
+    with h5py.File(folder / "a.mat", "w", userblock_size=512) as file:
+        for name, values in zip(("t", "U_V", "pos_um"), COLUMNS, strict=True):
+            file[f"log/{name}"] = values[np.newaxis, :]
+            file[f"log/{name}"].attrs["MATLAB_class"] = np.bytes_("double")
+        file["log/operator"] = np.frombuffer("bench".encode("utf-16-le"), "<u2")[:, np.newaxis]
+        file["log/operator"].attrs["MATLAB_class"] = np.bytes_("char")
+        file["#refs#/a"] = np.arange(9.0)
+    with (folder / "a.mat").open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\0\2IM")
+    return Written(folder / "a.mat", {}, {"time": "s"})
+
+
+def _hdf5(path: Path, content: Mapping[str, Any], **attributes: Mapping[str, Any]) -> Path:
+    """Write datasets, and the attributes of all that have the same last name."""
+    with h5py.File(path, "w") as file:
+        file.update(content)
+        for name in content:
+            file[name].attrs.update(attributes.get(name.rpartition("/")[2], {}))
+    return path
+
+
+@_maker("HDF5 groups with units")
+def _(folder: Path) -> Written:
+    axes = {"hv_out": (VOLTAGE, "V"), "axis_x": (1e3 * DISPLACEMENT, "nm")}
+    axes |= {"t": (1e3 * TIME, "ms"), "axis_y": (0 * DISPLACEMENT, "nm")}
+    content = {
+        f"measurement/run_00{i}/{n}": values for i in (1, 3) for n, (values, _) in axes.items()
+    }
+    path = _hdf5(folder / "a.h5", content, **{n: {"unit": unit} for n, (_, unit) in axes.items()})
+    return Written(path, named("measurement/run_003/hv_out", "measurement/run_003/axis_x"))
+
+
+@_maker("HDF5 table")
+def _(folder: Path) -> Written:
+    rows = _table(("t_s", "f8", TIME), ("u_V", "f4", VOLTAGE), ("pos_um", "f8", DISPLACEMENT))
+    return Written(_hdf5(folder / "a.hdf5", {"log": rows}))
+
+
+@_maker("HDF5 table with an array in each row")
+def _(folder: Path) -> Written:
+    rows = _table(("t_s", "f8", TIME), ("adc", "f8", PAIR, (2,)))
+    path = _hdf5(folder / "a.h5", {"log": rows})
+    return Written(path, named("log.adc[1]", "log.adc[2]"), BOTH)
+
+
+@_maker("vibrometer, HDF5 with channels in an attribute")
+def _(folder: Path) -> Written:
+    channels, units = ["Time", "Ref1 Voltage", "Vib Displacement"], ["s", "V", "um"]
+    data = {"scan/data": np.stack(COLUMNS, axis=1)}
+    path = _hdf5(folder / "a.h5", data, data={"channels": channels, "units": units})
+    return Written(path, named("Ref1 Voltage", "Vib Displacement"))
+
+
+@_maker("pandas to HDF5, fixed")
+def _(folder: Path) -> Written:
+    words = np.array(NAMES, "S15")
+    content = {"axis0": words, "axis1": np.arange(SAMPLES), "block0_items": words}
+    content["block0_values"] = np.stack(COLUMNS, axis=1)
+    path = _hdf5(folder / "a.h5", {f"record/{name}": values for name, values in content.items()})
+    with h5py.File(path, "r+") as file:
+        file["record"].attrs["pandas_type"] = np.bytes_("frame")
+    return Written(path)
+
+
+@_maker("pandas to HDF5, table")
+def _(folder: Path) -> Written:
+    values = np.stack(COLUMNS, axis=1)
+    rows = _table(("index", "i8", np.arange(SAMPLES)), ("values_block_0", "f8", values, (3,)))
+    listed = "(lp0\n" + "".join(f"{'a' * (i > 0)}V{n}\np{i + 1}\n" for i, n in enumerate(NAMES))
+    kind = {"values_block_0_kind": np.bytes_(f"{listed}a.")}
+    path = _hdf5(folder / "a.h5", {"record/table": rows}, table=kind)
+    with h5py.File(path, "r+") as file:
+        file["record"].attrs["pandas_type"] = np.bytes_("frame_table")
+    return Written(path)
 
 
 @_maker("xarray, netCDF-4")
@@ -57,246 +282,33 @@ def _(folder: Path) -> Written:
 def _(folder: Path) -> Written:
     with scipy.io.netcdf_file(folder / "a.nc", "w") as file:
         file.createDimension("time", SAMPLES)
-        columns = zip(UNITS.items(), (*COLUMNS[:2], COUNTS), strict=True)
-        for (name, unit), values in columns:
+        for (name, unit), values in zip(UNITS.items(), (*COLUMNS[:2], COUNTS), strict=True):
             data = file.createVariable(name, values.dtype.newbyteorder("="), ("time",))
-            data[:] = values
-            data.units = unit
+            data[:], data.units = values, unit
         data.scale_factor = np.float64(1e-5)
     return Written(folder / "a.nc")
 
 
 @_maker("netCDF, channels along a dimension with names")
 def _(folder: Path) -> Written:
+    words = np.array(["voltage_V".ljust(16), "displacement_um".ljust(16)], "S16").view("S1")
     with scipy.io.netcdf_file(folder / "a.nc", "w", version=2) as file:
         for name, size in (("time", SAMPLES), ("channel", 2), ("letters", 16)):
             file.createDimension(name, size)
-        words = np.array(["voltage_V".ljust(16), "displacement_um".ljust(16)], "S16")
-        file.createVariable("channel", "c", ("channel", "letters"))[:] = words.view("S1").reshape(
-            2, 16
-        )
-        file.createVariable("data", "f8", ("time", "channel"))[:] = np.stack(COLUMNS[1:], axis=1)
+        file.createVariable("channel", "c", ("channel", "letters"))[:] = words.reshape(2, 16)
+        file.createVariable("data", "f8", ("time", "channel"))[:] = PAIR
         time = file.createVariable("time", "f8", ("time",))
         time[:], time.units = TIME, "s"
     return Written(folder / "a.nc")
 
 
-@_maker("vibrometer, HDF5 with channels in an attribute")
-def _(folder: Path) -> Written:
-    with h5py.File(folder / "a.h5", "w") as file:
-        data = file.create_dataset("scan/data", data=np.stack(COLUMNS, axis=1).astype("f8"))
-        data.attrs["channels"] = ["Time", "Ref1 Voltage", "Vib Displacement"]
-        data.attrs["units"] = ["s", "V", "um"]
-    columns = {"voltage": "Ref1 Voltage", "displacement": "Vib Displacement"}
-    return Written(folder / "a.h5", columns)
-
-
-@_maker("HDF5 table with an array in each row")
-def _(folder: Path) -> Written:
-    rows = np.zeros(SAMPLES, dtype=[("t_s", "f8"), ("adc", "f8", (2,))])
-    rows["t_s"], rows["adc"] = TIME, np.stack(COLUMNS[1:], axis=1)
-    with h5py.File(folder / "a.h5", "w") as file:
-        file["log"] = rows
-    columns = {"voltage": "log.adc[1]", "displacement": "log.adc[2]"}
-    return Written(folder / "a.h5", columns, {"voltage": "V", "displacement": "um"})
-
-
-def _pandas(folder: Path, kind: str) -> tuple[h5py.File, h5py.Group]:
-    file = h5py.File(folder / "a.h5", "w")
-    frame = file.create_group("record")
-    frame.attrs["pandas_type"] = np.bytes_(kind)
-    return file, frame
-
-
-NAMES = ("time_s", "voltage_V", "displacement_um")
-
-
-def _tektronix(folder: Path, columns: list[Any], names: str, units: str) -> Path:
-    head = [
-        *("Model,MSO44", "Firmware Version,1.2.3", "Horizontal Units,s", "Horizontal Scale,0.4"),
-        *(f"Sample Interval,{INTERVAL}", f"Record Length,{SAMPLES}", "Gating,0.0% to 100.0%"),
-        *("Probe Attenuation,10,1", f"Vertical Units,{units}", "Vertical Offset,0,0", ","),
-        *("Label,Monitor,Sensor", names),
-    ]
-    rows = [",".join(f"{value:.6f}" for value in row) for row in zip(*columns, strict=True)]
-    (folder / "a.csv").write_text("\n".join([*head, *rows, ""]))
-    return folder / "a.csv"
-
-
-@_maker("oscilloscope, units and rate above the header")
-def _(folder: Path) -> Written:
-    path = _tektronix(folder, COLUMNS, "TIME,CH1,CH2", "V,um")
-    return Written(path, {"voltage": "CH1", "displacement": "CH2"})
-
-
-@_maker("oscilloscope, rate above the header in place of times")
-def _(folder: Path) -> Written:
-    path = _tektronix(folder, COLUMNS[1:], "CH1,CH2", "V,um")
-    return Written(path, {"voltage": "CH1", "displacement": "CH2"})
-
-
-@_maker("pandas to HDF5, fixed")
-def _(folder: Path) -> Written:
-    file, frame = _pandas(folder, "frame")
-    with file:
-        words = np.array(NAMES, "S15")
-        frame["axis0"], frame["axis1"], frame["block0_items"] = words, np.arange(SAMPLES), words
-        frame["block0_values"] = np.stack(COLUMNS, axis=1)
-    return Written(folder / "a.h5")
-
-
-@_maker("pandas to HDF5, table")
-def _(folder: Path) -> Written:
-    file, frame = _pandas(folder, "frame_table")
-    rows = np.zeros(SAMPLES, dtype=[("index", "i8"), ("values_block_0", "f8", (3,))])
-    rows["index"], rows["values_block_0"] = np.arange(SAMPLES), np.stack(COLUMNS, axis=1)
-    with file:
-        frame["table"] = rows
-        listed = "(lp0\n" + "".join(f"{'a' * (i > 0)}V{n}\np{i + 1}\n" for i, n in enumerate(NAMES))
-        frame["table"].attrs["values_block_0_kind"] = np.bytes_(f"{listed}a.")
-    return Written(folder / "a.h5")
-
-
-@_maker("MATLAB, structs of time series")
-def _(folder: Path) -> Written:
-    """As ``struct(ts)`` saves them, each with the same times."""
-    variables: dict[str, Any] = {
-        name: {
-            **{"Name": name, "Time": TIME[:, None], "Data": values[:, None]},
-            "DataInfo": {"Units": unit},
-            "TimeInfo": {"Units": "seconds"},
-        }
-        for name, unit, values in (("drive", "V", VOLTAGE), ("stage", "um", DISPLACEMENT))
-    }
-    scipy.io.savemat(folder / "a.mat", variables)
-    columns = {"voltage": "drive.Data", "displacement": "stage.Data"}
-    return Written(folder / "a.mat", columns)
-
-
-@_maker("Simulink, structure with time")
-def _(folder: Path) -> Written:
-    signals = {"values": np.stack(COLUMNS[1:], axis=1), "dimensions": 2.0, "label": "u, y"}
-    variables: dict[str, Any] = {"out": {"time": TIME[:, None], "signals": signals}}
-    scipy.io.savemat(folder / "a.mat", variables)
-    columns = {"voltage": "out.signals.values[1]", "displacement": "out.signals.values[2]"}
-    return Written(folder / "a.mat", columns, UNITS)
-
-
-@_maker("FlexLogger, TDMS groups")
-def _(folder: Path) -> Written:
-    from nptdms import ChannelObject, GroupObject, RootObject, TdmsWriter  # noqa: PLC0415
-
-    start = np.datetime64("2026-03-03T12:00:00.123456", "us")
-    wave = {"wf_increment": INTERVAL, "wf_start_offset": 0.0, "wf_start_time": start}
-    group = "cDAQ1Mod1"
-    with TdmsWriter(folder / "a.tdms") as writer:
-        for rows in (slice(0, 400), slice(400, SAMPLES)):
-            channels = [
-                ChannelObject(group, name, values[rows], wave | {"unit_string": unit})
-                for name, unit, values in (
-                    ("Amplifier Monitor", "V", VOLTAGE),
-                    ("Stage Position", "um", DISPLACEMENT),
-                )
-            ]
-            root = RootObject({"Name": "Test 12", "Operator": "bench"})
-            writer.write_segment([root, GroupObject(group, {"Rate": 200.0}), *channels])
-    columns = {"voltage": "Amplifier Monitor", "displacement": "Stage Position"}
-    return Written(folder / "a.tdms", columns)
-
-
 @_maker("npz with a table")
 def _(folder: Path) -> Written:
-    rows = np.zeros(SAMPLES, dtype=[("t_ms", "f8"), ("u_V", "f8"), ("x_nm", "f8")])
-    rows["t_ms"], rows["u_V"], rows["x_nm"] = 1e3 * TIME, VOLTAGE, 1e3 * DISPLACEMENT
+    rows = _table(
+        ("t_ms", "f8", 1e3 * TIME), ("u_V", "f8", VOLTAGE), ("x_nm", "f8", 1e3 * COLUMNS[2])
+    )
     np.savez_compressed(folder / "a.npz", log=rows, gains=np.eye(3), note=np.array("bench"))
     return Written(folder / "a.npz")
-
-
-@_maker("LibreOffice workbook")
-def _(folder: Path) -> Written:
-    """With shared words, durations by their style, formulas' values, and styled empty rows."""
-    words = ["Time", "Voltage [V]", "Position [um]"]
-    strings = "".join(f'<si><t xml:space="preserve">{word}</t></si>' for word in words)
-    rows = [
-        '<row r="1">'
-        + "".join(f'<c r="{c}1" s="0" t="s"><v>{i}</v></c>' for i, c in enumerate("ABC"))
-        + "</row>"
-    ]
-    for i, (t, v, d) in enumerate(zip(*COLUMNS, strict=True), start=2):
-        formula = f'<f aca="false">B{i}*1</f>' if i % 2 else ""
-        rows.append(
-            f'<row r="{i}"><c r="A{i}" s="1"><v>{t / 86400:.15g}</v></c>'
-            f'<c r="B{i}" s="0" t="n">{formula}<v>{v}</v></c><c r="C{i}" s="0"><v>{d}</v></c>'
-            "</row>"
-        )
-    rows += [f'<row r="{i}"><c r="A{i}" s="1"/></row>' for i in range(SAMPLES + 2, SAMPLES + 40)]
-    main = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
-    office = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
-    package = "http://schemas.openxmlformats.org/package/2006"
-    kind = "application/vnd.openxmlformats-officedocument.spreadsheetml"
-    parts = {
-        "[Content_Types].xml": f'<Types xmlns="{package}/content-types">'
-        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.'
-        'relationships+xml"/><Default Extension="xml" ContentType="application/xml"/>'
-        f'<Override PartName="/xl/workbook.xml" ContentType="{kind}.sheet.main+xml"/>'
-        f'<Override PartName="/xl/worksheets/sheet1.xml" ContentType="{kind}.worksheet+xml"/>'
-        f'<Override PartName="/xl/sharedStrings.xml" ContentType="{kind}.sharedStrings+xml"/>'
-        f'<Override PartName="/xl/styles.xml" ContentType="{kind}.styles+xml"/></Types>',
-        "_rels/.rels": f'<Relationships xmlns="{package}/relationships"><Relationship Id="rId1" '
-        f'Type="{office}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
-        "xl/_rels/workbook.xml.rels": f'<Relationships xmlns="{package}/relationships">'
-        f'<Relationship Id="rId1" Type="{office}/styles" Target="styles.xml"/>'
-        f'<Relationship Id="rId2" Type="{office}/worksheet" Target="worksheets/sheet1.xml"/>'
-        f'<Relationship Id="rId3" Type="{office}/sharedStrings" Target="sharedStrings.xml"/>'
-        "</Relationships>",
-        "xl/workbook.xml": f'<workbook {main} xmlns:r="{office}"><sheets>'
-        '<sheet name="Messung" sheetId="1" state="visible" r:id="rId2"/></sheets></workbook>',
-        "xl/sharedStrings.xml": f"<sst {main}>{strings}</sst>",
-        "xl/styles.xml": f'<styleSheet {main}><numFmts count="1"><numFmt numFmtId="165" '
-        'formatCode="[HH]:MM:SS.00"/></numFmts><cellXfs count="2"><xf numFmtId="0"/>'
-        '<xf numFmtId="165"/></cellXfs></styleSheet>',
-        "xl/worksheets/sheet1.xml": f"<worksheet {main}><sheetData>{''.join(rows)}</sheetData>"
-        "</worksheet>",
-    }
-    with ZipFile(folder / "a.xlsx", "w") as archive:
-        for name, text in parts.items():
-            archive.writestr(name, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}')
-    return Written(folder / "a.xlsx")
-
-
-def _lines(path: Path, head: list[str], rows: Any) -> Path:
-    path.write_text("\n".join([*head, *rows, ""]), encoding="utf-8")
-    return path
-
-
-@_maker("Keysight BenchLink, milliseconds behind a colon")
-def _(folder: Path) -> Written:
-    stamps = np.datetime64("2026-12-03T14:05:58", "us") + np.rint(1e6 * TIME).astype("m8[us]")
-    texts = [f"{t:%m/%d/%Y %H:%M:%S}:{t.microsecond // 1000:03d}" for t in stamps.tolist()]
-    rows = enumerate(zip(texts, VOLTAGE, DISPLACEMENT, strict=True), start=1)
-    cells = [f"{i},{t},{v:+.8E},0,{d:+.8E},0" for i, (t, v, d) in rows]
-    head = ["Scan,Time,101 <HV> (VDC),Alarm 101,102 <Gauge> (VDC),Alarm 102"]
-    columns = {"voltage": "101 <HV> (VDC)", "displacement": "102 <Gauge> (VDC)"}
-    return Written(_lines(folder / "a.csv", head, cells), columns, {"voltage": "V"} | MICRONS)
-
-
-@_maker("a table drawn with bars and dashes")
-def _(folder: Path) -> Written:
-    rows = [f"| {t:.3f} | {v:.4f} | {d:.5f} |" for t, v, d in zip(*COLUMNS, strict=True)]
-    head = ["| t (s) | U (V) | x (um) |", "|-------|------:|:------:|"]
-    return Written(_lines(folder / "a.md", head, rows))
-
-
-@_maker("spreadsheet, French, blanks between thousands and typeset minus signs")
-def _(folder: Path) -> Written:
-    def number(value: float) -> str:
-        return f"{value:,.2f}".replace(",", " ").replace(".", ",").replace("-", "\u2212")
-
-    rows = [
-        f"{t:.3f};{number(1e3 * v)};{number(1e3 * d)}".replace(".", ",")
-        for t, v, d in zip(*COLUMNS, strict=True)
-    ]
-    return Written(_lines(folder / "a.csv", ["temps [s];tension [mV];position [nm]"], rows))
 
 
 @_maker("NumPy, dates")
@@ -304,78 +316,3 @@ def _(folder: Path) -> Written:
     stamps = np.datetime64("2026-03-03", "us") + np.rint(1e6 * TIME).astype("m8[us]")
     np.savez(folder / "a.npz", time=stamps, voltage_V=VOLTAGE, displacement_um=DISPLACEMENT)
     return Written(folder / "a.npz")
-
-
-def _table(path: Path, head: str, *columns: Any, separator: str = "\t", end: str = "") -> Path:
-    rows = (separator.join(f"{value:.6f}" for value in row) for row in zip(*columns, strict=True))
-    path.write_text("\n".join([head, *rows, end]), encoding="utf-8")
-    return path
-
-
-@_maker("ferroelectric tester, electrodes of either polarity")
-def _(folder: Path) -> Written:
-    head = (
-        "Result\nHysteresis Amplitude [V]: 60\nTable 1\nTime [s]\tV+ [V]\tV- [V]\tI1 [A]\tD1 [nm]"
-    )
-    columns = TIME, VOLTAGE, -VOLTAGE, np.cos(TIME), 1e3 * DISPLACEMENT
-    return Written(_table(folder / "a.dat", head, *columns), {"voltage": "V+ [V]"})
-
-
-@_maker("catman, channels and devices below the names")
-def _(folder: Path) -> Written:
-    head = (
-        "HBM_CATMAN_DATAFILE\nVersion:\t5.2\n\n"
-        '"Zeit 1 [s]"\t"U_Piezo [V]"\t"Weg 1 [µm]"\n"CH=1"\t"CH=2"\t"CH=3"\n"Auto"\t"MX"\t"MX"'
-    )
-    return Written(_table(folder / "a.txt", head, *COLUMNS))
-
-
-@_maker("Igor, waves as text")
-def _(folder: Path) -> Written:
-    head = "IGOR\nWAVES/D t_s, voltage_V, pos_nm\nBEGIN"
-    columns = np.full(SAMPLES, ""), TIME, VOLTAGE, 1e3 * DISPLACEMENT
-    rows = ("\t".join(map(str, row)) for row in zip(*columns, strict=True))
-    end = 'END\nX SetScale/P x 0,0.005,"s", voltage_V\n'
-    (folder / "a.itx").write_text("\n".join([head, *rows, end]))
-    return Written(folder / "a.itx")
-
-
-@_maker("potentiostat, voltages against a reference")
-def _(folder: Path) -> Written:
-    head = "EXPLAIN\nCURVE\tTABLE\t600\nPt\tT\tVf\tIm\tPos\n#\ts\tV vs. Ref.\tA\tum"
-    path = _table(folder / "a.dta", head, np.arange(SAMPLES), *COLUMNS[:2], TIME**2, DISPLACEMENT)
-    return Written(path, {"voltage": "Vf"})
-
-
-@_maker("controller's scope, a clock beside each channel and settings above")
-def _(folder: Path) -> Written:
-    head = "Name\tU\tName\tPos\nSampleTime[ms]\t5\tSampleTime[ms]\t5\nUnit\tV\tUnit\tum\n"
-    path = _table(folder / "a.csv", head, 1e3 * TIME, VOLTAGE, 1e3 * TIME, DISPLACEMENT)
-    columns = {"time": "1", "voltage": "2", "displacement": "4"}
-    return Written(path, columns, {"time": "ms", "voltage": "V", "displacement": "um"})
-
-
-@_maker("oscilloscope, units behind a preposition")
-def _(folder: Path) -> Written:
-    path = _table(folder / "a.csv", '"in s","CH1 in V","CH2 in V"', *COLUMNS, separator=",")
-    return Written(path, {"voltage": "CH1 in V", "displacement": "CH2 in V"}, MICRONS)
-
-
-@_maker("oscilloscope, settings in columns of their own")
-def _(folder: Path) -> Written:
-    rows = [f",,,{t:.6f},{v:.6f},{x:.6f}" for t, v, x in zip(*COLUMNS, strict=True)]
-    settings = {"Record Length": 600, "Sample Interval": 0.005, "Trigger Point": 1, "Source": "CH1"}
-    for row, (name, value) in enumerate(settings.items()):
-        rows[row] = f"{name},{value}{rows[row][1:]}"
-    (folder / "a.csv").write_text("\n".join([*rows, ""]))
-    return Written(folder / "a.csv", dict(zip(UNITS, "456", strict=True)), UNITS)
-
-
-@_maker("recorder, settings above fields that begin with a separator")
-def _(folder: Path) -> Written:
-    head = '"Model","DL850"\n"TraceName","CH1","CH2"\n"BlockSize",600,600\n"SampleRate",200,200\n'
-    rows = [f",{v:.5f},{x:.5f}," for v, x in zip(*COLUMNS[1:], strict=True)]
-    text = "\n".join([f'{head}"HResolution",5.0e-03,5.0e-03\n"HOffset",0.0,0.0\n', *rows, ""])
-    (folder / "a.csv").write_text(text)
-    columns = {"voltage": "2", "displacement": "3"}
-    return Written(folder / "a.csv", columns, {"voltage": "V", "displacement": "um"}, 200.0)

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io import matlab
-from tests.record.makers import MAKERS
+from tests.record.makers import INSTRUMENTS
 
 SAMPLES = 24
 TIME = 0.5 + 1e-3 * np.arange(SAMPLES)
@@ -432,7 +432,7 @@ def test_a_damaged_netcdf_file_is_read_or_refused_in_a_line(
     tmp_path_factory: pytest.TempPathFactory, at: int, damage: list[int], is_cut: bool
 ) -> None:
     folder = tmp_path_factory.getbasetemp()
-    content = bytearray(MAKERS["netCDF-3 of SciPy, packed"](folder).path.read_bytes())
+    content = bytearray(INSTRUMENTS["netCDF-3 of SciPy, packed"](folder).path.read_bytes())
     content[at : at + len(damage)] = bytes(damage)
     (folder / "b.nc").write_bytes(content[:at] if is_cut else content)
     with warnings.catch_warnings():

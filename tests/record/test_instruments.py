@@ -15,17 +15,8 @@ from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
-from tests.record.instruments import (
-    DISPLACEMENT,
-    INSTRUMENTS,
-    INTERVAL,
-    TIME,
-    VOLTAGE,
-    Written,
-)
-from tests.record.makers import MAKERS
-
-ALL = INSTRUMENTS | MAKERS
+from tests.record.instruments import DISPLACEMENT, INTERVAL, TIME, VOLTAGE, Written
+from tests.record.makers import INSTRUMENTS
 
 
 def read(written: Written) -> Record:
@@ -35,9 +26,9 @@ def read(written: Written) -> Record:
         return read_record(path, columns=columns, units=units, fs=fs)
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", INSTRUMENTS)
 def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
-    record = read(ALL[name](tmp_path))
+    record = read(INSTRUMENTS[name](tmp_path))
     assert record.interval == pytest.approx(INTERVAL, rel=1e-9)
     assert 0.0 == record.start
     np.testing.assert_allclose(record.voltage, VOLTAGE, rtol=1e-6, atol=1e-6)
@@ -45,13 +36,13 @@ def test_every_form_is_the_same_record(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(record.displacement, DISPLACEMENT, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", INSTRUMENTS)
 def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
     """Without a word from the user a file is read, or one message has a guess that reads it.
 
     What nobody can guess, a sensitivity or a rate, is left open, and refused as it is.
     """
-    written = ALL[name](tmp_path)
+    written = INSTRUMENTS[name](tmp_path)
     alone, error = written._replace(columns={}, units={}, fs=None), None
     try:
         read(alone)
@@ -70,7 +61,7 @@ def test_what_is_left_open_is_asked_for_once(tmp_path: Path, name: str) -> None:
             # Of columns without names, which of two is meant nobody can guess.
             assert np.corrcoef(np.asarray(values), right)[0, 1] > 0.99
         timeless = {"no times at all", "no names and no times", "numbered samples"}
-        timeless |= {name for name in ALL if name.startswith("recorder, settings above")}
+        timeless |= {name for name in INSTRUMENTS if name.startswith("recorder, settings above")}
         assert (error.fs is not None) == (name in timeless | {"data recorder of PI"})
     else:
         assert error is None
@@ -170,8 +161,8 @@ def test_a_rate_in_a_line_above_the_header_is_the_one_to_copy(tmp_path: Path) ->
 def test_lines_above_the_header_are_skipped_with_a_remark(tmp_path: Path) -> None:
     path = INSTRUMENTS["Excel, German, cp1252, preamble"](tmp_path).path
     with (
-        pytest.warns(InputWarning, match=r"messung.csv:1: 3 lines above the header skipped"),
-        pytest.warns(InputWarning, match=r"messung.csv:5: ignored columns: Bemerkung"),
+        pytest.warns(InputWarning, match=r"a.csv:1: 3 lines above the header skipped"),
+        pytest.warns(InputWarning, match=r"a.csv:5: ignored columns: Bemerkung"),
     ):
         read_record(path)
 
@@ -187,7 +178,7 @@ def test_a_rate_above_the_header_is_asked_for_unless_the_length_beside_it_is_rig
     tmp_path: Path,
 ) -> None:
     """Else the preamble may be that of another record; the units stand in any case."""
-    written = MAKERS["oscilloscope, rate above the header in place of times"](tmp_path)
+    written = INSTRUMENTS["oscilloscope, rate above the header in place of times"](tmp_path)
     text = written.path.read_text()
     for length in ("Record Length,599", "Points,600"):
         written.path.write_text(text.replace("Record Length,600", length))

@@ -14,7 +14,8 @@ from openpyxl import Workbook
 
 from bwbayes.errors import InputError
 from bwbayes.record import read_record
-from tests.record.instruments import DISPLACEMENT, INSTRUMENTS, VOLTAGE
+from tests.record.instruments import DISPLACEMENT, VOLTAGE
+from tests.record.makers import INSTRUMENTS
 
 EPOCH = datetime(1899, 12, 30)  # cells have no zone
 FORMATS = {
