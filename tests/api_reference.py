@@ -3,8 +3,6 @@
 Needs the extra ``docs``.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from importlib import import_module

@@ -7,8 +7,6 @@ Rooms whose files take a second or two come last, so that all workers end at abo
 Commands of other processes take this checkout too, and what is compiled of it, not an installation.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 from pathlib import Path

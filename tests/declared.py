@@ -1,7 +1,5 @@
 """What the parts of the model declare, by parameter name, for tests that put models together."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from bwbayes.inference.parameters import JointPrior, Parameter

@@ -5,8 +5,6 @@ are made under these names, small enough for seconds, by what the names look lik
 is run by itself, unless its files are of a new kind.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import json
 import re

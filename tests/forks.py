@@ -3,8 +3,6 @@
 There is one such server for all tests of a process, so what it imports is decided here.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 
 FORKS = multiprocessing.get_context("forkserver")

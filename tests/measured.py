@@ -5,8 +5,6 @@ them, so that none is quoted from memory. An expression names some of them: how 
 what they are multiplied by, and their paths, ``"extent 100 study/cover*|other study/cover"``.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping

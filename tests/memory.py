@@ -1,7 +1,5 @@
 """The largest memory of a process of its own."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

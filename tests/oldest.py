@@ -13,8 +13,6 @@ A newer Python and the newest versions are tried without the constraints, and wi
 errors.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

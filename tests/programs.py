@@ -7,8 +7,6 @@ none is left out unnoticed.
 ``python3 tests/programs.py`` prints the Debian packages of those that are missing here.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass

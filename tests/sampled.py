@@ -1,7 +1,5 @@
 """A posterior, sampled as a run does it."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

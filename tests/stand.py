@@ -1,7 +1,5 @@
 """The paper's ring bender on a stand: records whose parameters, discrepancy and noise are known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Four methods on one measured record: what ``runs/beside_others.py`` finds, and README quotes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from runpy import run_path
 

@@ -16,8 +16,6 @@ comparisons, which depend on each other, is off by chance in one calibration of 
 white noise model, fitted to records of the same kind, fails by far.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -20,8 +20,6 @@ hysteresis: four
 seconds of a record do not tell an exponent, a loop and its shape of which nothing is known.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path

@@ -6,8 +6,6 @@ the campaign's sampling rate: four milliseconds are as long as the lag that the 
 and the amplifier makes every step within one sample.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 SPECIMENS and KILLS say how many, if not so many.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

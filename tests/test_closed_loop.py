@@ -5,8 +5,6 @@ that the controller has, and its draws are the actuators; then the stand's own a
 no draw is.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

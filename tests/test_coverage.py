@@ -7,8 +7,6 @@ with the nominal level within three standard errors taken from the spread betwee
 shows that bands and intervals of 0.4 times the right width are found.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ Python is in ``test_readme.py``, docstrings are run by ``test_public_names.py``,
 cells by ``test_notebooks.py``. Each command is run once; ``-m slow`` runs every line and config.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A whole fit of a million samples, from its start to its report, fits into 2 GiB."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.measured import keep

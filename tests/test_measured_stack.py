@@ -1,7 +1,5 @@
 """The measured piezo stack: convergence, held-out error, calibrated bands, against white noise."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -8,8 +8,6 @@ After a change, ``jupyter execute --inplace notebooks/NAME.ipynb`` stores the ne
 # mypy: allow-untyped-calls
 # nbformat says that it has types, but its functions have none.
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -5,8 +5,6 @@ rules and so has the memory of Preisach's kin. A step along a straight piece of 
 other way to write one.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import pickle

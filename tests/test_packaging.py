@@ -5,8 +5,6 @@ checkout: with what it brings along (templates), and without numba. Where no pac
 that is skipped.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -5,8 +5,6 @@ precisely as they are printed, and no others. Of limits and records, those that 
 checked too; the rest of them are numbers that the tests themselves hold.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What `import bwbayes` offers, and what people and tools look for: names, docstrings, errors."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib.util

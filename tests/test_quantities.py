@@ -1,7 +1,5 @@
 """Input and output of any kind: words, units and conversions, priors, records without a time."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Those of its first command are held against a run of it; those of the slow ones 
 measured when they last ran in full.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from typing import Any

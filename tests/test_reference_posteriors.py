@@ -11,8 +11,6 @@ a right sampler would fail once in some 200 runs. A wrong one does not pass with
 off, nor with a noise whose correlation is half as long again, as the twins show.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

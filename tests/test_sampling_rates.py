@@ -6,8 +6,6 @@ of it. What the model misses is smooth and the same at all rates, so that fewer 
 tell more: a rough discrepancy, an Ornstein-Uhlenbeck process, is the twin.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The twin leaves them in.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

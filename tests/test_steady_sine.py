@@ -5,8 +5,6 @@ decaying drive: gamma of the other sign with another d is the next best explanat
 worse, and no ensemble should spend its time there.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

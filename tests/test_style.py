@@ -3,8 +3,6 @@
 Types of the package are checked each time, those of the tests, which take as long, by ``-m slow``.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -21,8 +21,6 @@ differences: what a 20th of the readings knows of the sensor's noise has an sd â
 so that one difference in three is beyond one. How many are within is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -5,8 +5,6 @@ predict, whose voltages are read with white noise of 0.003 to 0.3% of their rang
 4 kHz. The twin drives the model by the voltage as measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +40,7 @@ class Answer:
     coverage: float
     width: float
 
-    def right(self, clean: Answer) -> bool:
+    def right(self, clean: "Answer") -> bool:
         """Whether it is what is asked for, beside that of the ``clean`` voltage.
 
         Of d, alpha and beta 2%, of gamma 10%, or three sds; 88 to 99% of the next record covered,

@@ -5,8 +5,6 @@ priors, at 10 Hz (100 readings) and at 1 kHz (10,000). A slow study keeps its fi
 tables quote them.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

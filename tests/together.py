@@ -4,8 +4,6 @@ Ranks of a replicate's whitened coordinates are nearly independent, so that repl
 as many more of a single parameter would. Its errors come from the spread between replicates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the tests of the app share: the small run, and a copy of it to change."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A small finished run to draw and to report, made up without any sampling."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -5,8 +5,6 @@ the record that it names, one of the two spoilt. Texts are spoilt by the byte, t
 line; HDF5 and MATLAB files by the byte, and made again from arrays that belong in no record.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A small run: a few hundred samples of the virtual test stand that converge within seconds."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Specimens of a known population on the virtual stand, as small as a record can be."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a person is told of the steps of a job: their names, and what share of each is done."""
 
-from __future__ import annotations
-
 import pytest
 
 from bwbayes.app.running.progress import StepProgress
@@ -14,7 +12,7 @@ class Steps:
         self.shares: dict[str, list[float]] = {}
 
     @classmethod
-    def of_commands(cls, monkeypatch: pytest.MonkeyPatch) -> Steps:
+    def of_commands(cls, monkeypatch: pytest.MonkeyPatch) -> "Steps":
         """Return what takes note of all that the lines of commands show from now on."""
         steps = cls()
         monkeypatch.setattr(StepProgress, "__call__", lambda _, *told: steps(*told))

@@ -3,8 +3,6 @@
 Chromium opens each page as a reader does, on a telephone and on a screen, light and dark.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path

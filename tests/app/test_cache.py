@@ -1,7 +1,5 @@
 """What a run worked out is read from its folder, and anything else is worked out again."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The calibrate command: what it leaves, how it goes on, and the status it ends with."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A campaign: every record in the table, however it ended; interrupted, continued, added to."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

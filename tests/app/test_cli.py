@@ -1,7 +1,5 @@
 """The command line: what it prints, what it leaves, and the status it ends with."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """A file beside a run is read as the run's record was, if it has the same columns."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 import warnings

@@ -1,7 +1,5 @@
 """``bwbayes compare`` and ``fit.compare``: the same numbers, one page, and refusals in a line."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

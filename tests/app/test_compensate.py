@@ -1,7 +1,5 @@
 """`bwbayes compensate` and `fit.compensate`: a command with its promised error, or one line."""
 
-from __future__ import annotations
-
 import json
 import re
 import warnings

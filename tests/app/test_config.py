@@ -1,7 +1,5 @@
 """Configs say what is wrong in one line, and what they mean without their defaults."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

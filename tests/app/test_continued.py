@@ -4,8 +4,6 @@ Taken for records of their own, which is the twin, they say something else: the 
 an unknown start, and a discrepancy that knows nothing of the first half's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise, permutations

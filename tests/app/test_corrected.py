@@ -3,8 +3,6 @@
 The sensor's noise is said to be a fifth of what it is, so that bands are five times too narrow.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

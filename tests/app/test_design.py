@@ -1,7 +1,5 @@
 """``bwbayes design``: candidates in, a ranking and the best signal's file out."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

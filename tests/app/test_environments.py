@@ -1,7 +1,5 @@
 """What the environment lacks ends in no traceback: encodings, readers, processes, caches."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

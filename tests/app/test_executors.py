@@ -1,7 +1,5 @@
 """Executors, here and on a cluster: the same bits, whoever dies on the way."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal

@@ -1,7 +1,5 @@
 """`bwbayes export` and `fit.export`: the posterior's mean for a controller, or one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from functools import partial

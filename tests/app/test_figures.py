@@ -1,7 +1,5 @@
 """Pictures show what they should, with units, and touch nothing global."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable, Mapping

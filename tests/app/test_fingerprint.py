@@ -1,7 +1,5 @@
 """A chain knows the posterior it belongs to: an edited config is refused, in one line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From arrays to bands in five lines, by the folder and the functions of the command line."""
 
-from __future__ import annotations
-
 import shutil
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A run's folder comes to be whole or not at all, has one writer, and is never lost by mistake."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

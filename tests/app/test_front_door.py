@@ -4,8 +4,6 @@ Records are made by a play model of the tests' own, at any length, rate, start t
 separator; what is checked is all that a run does before it samples.
 """
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@
 with a small budget; none may be refused. Whether such a short sampling converges is not asked here.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter
 from pathlib import Path

@@ -10,8 +10,6 @@ probability of 0.95, and one noise; ``-m slow`` takes all, and chooses theirs. A
 from its number: ``tests.app.mutations.case(SEED, number)``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import io

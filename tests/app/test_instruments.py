@@ -1,7 +1,5 @@
 """What instruments are worth widens what depends on them, and stands in budget and certificate."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Several records in one config: what is read, refused, run, continued and predicted."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -5,8 +5,6 @@ what a person's do, but for pictures and explanations, which are spared. The slo
 kills makes 200 of them, or as many as the environment variable KILLS says.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The parts that a record was made with are found by themselves, and no others."""
 
-from __future__ import annotations
-
 import io
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Readings without noise, as a first try has them: a fit converges, and says what they lack."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A config becomes explicit numbers, once: the same ones from the same config."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from functools import partial

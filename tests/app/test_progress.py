@@ -1,7 +1,5 @@
 """The line that a person watches: its ETA counts down, and it is there whatever takes its time."""
 
-from __future__ import annotations
-
 import re
 import time
 from importlib import import_module

@@ -1,7 +1,5 @@
 """From a CSV at once: a record without a config gets one, or one clear line."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable

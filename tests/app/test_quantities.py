@@ -1,7 +1,5 @@
 """Loops of other quantities: each run by one line, in its own words and units, and back again."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

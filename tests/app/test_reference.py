@@ -4,8 +4,6 @@ The reference is made from the config's models and from the parts, so what is te
 is missing from them, and that every example is a config.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 

@@ -1,7 +1,5 @@
 """The report says what the summary says, needs nothing but itself, and keeps quiet if it must."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from base64 import b64encode

@@ -1,7 +1,5 @@
 """A run leaves what it should, says nothing it cannot know, and does not depend on its pieces."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Objects show little at a prompt, ``dir`` public names alone, and docstrings no inner modules."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Any

@@ -7,8 +7,6 @@ spike of ten is missed, or a good reading set aside, less than once in 10,000. T
 off by two ranges or more, and the second one is good: less is what an actuator in motion may do.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 The plant is simulated without the stage: the displacement of an actuator, multiplied.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`bwbayes track` and `fit.track`: numbers, a table and a picture that agree, or one line."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

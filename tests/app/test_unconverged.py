@@ -1,7 +1,5 @@
 """A run that has not converged keeps its draws, and speaks of no interval."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files from strangers run no code, leave no folder, and put nothing of theirs into the page."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

@@ -3,8 +3,6 @@
 That nothing is said of a run that passed, each command's own tests say.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Noise on a record's voltage: the model is driven without it, the record stays as measured."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Measure everything and print tables: ``python -m tests.benchmarks``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 
 import click

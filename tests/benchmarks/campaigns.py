@@ -6,8 +6,6 @@
 cores.
 """
 
-from __future__ import annotations
-
 import tempfile
 from functools import partial
 from pathlib import Path

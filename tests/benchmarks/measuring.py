@@ -1,7 +1,5 @@
 """Calls timed in turns, and what was measured as rows of a table."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence

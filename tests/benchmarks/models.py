@@ -1,7 +1,5 @@
 """What a sample of a model costs: by engine, in two threads, forward and backward."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial

@@ -14,8 +14,6 @@ it takes a long chain to be known, and without it there are more.
 # mypy: allow-untyped-calls
 # arviz_stats says that it has types, but its functions have none.
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

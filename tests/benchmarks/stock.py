@@ -5,8 +5,6 @@ It is a generous stock: the loop takes all walkers at once, though emcee's defau
 each, and dynamics and noise go through ``scipy.signal.lfilter`` as on the NumPy engine.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

@@ -4,8 +4,6 @@ It is right but for the step within which h passes zero. Such a step is v = 2 V 
 and another rate for all of it would move h by γ α v² < 0.03 um, and the log density by less than 1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from click.testing import CliRunner

@@ -6,8 +6,6 @@ CPU seconds of all its processes and their ratio: the machine may be busy with o
 one step leaves (a run's folder) is what the next ones open.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

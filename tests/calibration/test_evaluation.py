@@ -5,8 +5,6 @@ that one comparison is wrong by chance once in 16,000 times. Defects are planted
 normal posterior in the twins.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import ndtr

@@ -1,7 +1,5 @@
 """Replicates: records come from the model that is fitted, and statistics are what they say."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ offset of its own, and fitted together with the first: what is left of the sd is
 truths, what was promised.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Held against the closed form where the model is linear and Gaussian, against dyn
 sampling of the plain posterior (``tests/reference``), and against integrals over a grid.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Later readings are scored by their joint density, given the earlier ones alone."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 

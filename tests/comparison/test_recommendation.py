@@ -1,7 +1,5 @@
 """What is recommended follows from the numbers, and what cannot be told is called so."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

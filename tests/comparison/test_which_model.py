@@ -10,8 +10,6 @@ The recommended model then predicts a fresh record of the plant, another drive f
 error is compared with that of the best candidate.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

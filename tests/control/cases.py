@@ -1,7 +1,5 @@
 """Actuators with every part that has a step, their parameters, and voltages to drive them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bwbayes.arrays import FloatArray

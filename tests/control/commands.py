@@ -1,7 +1,5 @@
 """Fitted problems to compensate with, and what becomes of commands that are played."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace

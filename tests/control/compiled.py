@@ -1,7 +1,5 @@
 """The exported C file, compiled with warnings as errors, as functions of arrays."""
 
-from __future__ import annotations
-
 import ctypes
 import subprocess
 from pathlib import Path

@@ -6,8 +6,6 @@ lines that a DAC holds, comes half a sample late and is found. ``-m slow`` fits 
 whose voltage is measured, compensates, and plays the commands by a DAC.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

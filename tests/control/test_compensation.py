@@ -8,8 +8,6 @@ twin is in ``test_command_hold.py``.
 ``-m slow`` fits 40 seeds of the stand, compensates, and runs the stand.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a control engineer gets: coefficients, a discrete system of scipy, and C that agrees."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Margins are those of textbooks and of closed-loop poles; a design keeps them with every draw."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The closed loop: a slow one that begins anew at every sample, and the stand's own amplifier."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

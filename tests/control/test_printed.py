@@ -1,7 +1,5 @@
 """C from Python: what is printed does what the function does; what cannot be printed is refused."""
 
-from __future__ import annotations
-
 import ctypes
 import subprocess
 from collections.abc import Callable

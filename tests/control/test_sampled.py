@@ -1,7 +1,5 @@
 """A model a sample at a time: the simulation's displacement, and a voltage that leads back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What tracking promises: with feed-forward, PID control follows better than with either alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

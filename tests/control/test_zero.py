@@ -1,7 +1,5 @@
 """0 um is where the actuator stands at zero volts: for commands, which begin there, loops and C."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

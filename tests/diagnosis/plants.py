@@ -4,8 +4,6 @@ The good plant is Bouc-Wen hysteresis behind a lag, read with an Ornstein-Uhlenb
 noise. Each defect is large enough that a fit of the good model cannot be trusted.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

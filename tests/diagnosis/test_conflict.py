@@ -3,8 +3,6 @@
 Each kind of planted mistake is said, by name.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether records agree is told by a chi-square that keeps its false-alarm rate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -6,8 +6,6 @@ back to where it was; of a multisine, which hardly does in 12 s, of those twice 
 states alone, and of those half as large as white noise by its other parts.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

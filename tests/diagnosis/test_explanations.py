@@ -1,7 +1,5 @@
 """Explanations are weighed by their exact evidence where it is known; plants get their cause."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace

@@ -3,8 +3,6 @@
 False alarms: none in 100 drives of the fitted kind, with noise and other sampling rates.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -6,8 +6,6 @@ are set, channels are shifted, or the plant is measured again without the cause,
 Then the next record of the plant, another drive that is cut from a running one, is predicted.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

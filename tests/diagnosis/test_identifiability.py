@@ -4,8 +4,6 @@ At the test stand's 1000 Hz, with the damping free. What is left depends on the 
 alone, so the mode is put at the truth.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

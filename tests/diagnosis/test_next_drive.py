@@ -4,8 +4,6 @@ The plants of :mod:`tests.diagnosis.plants` are fitted with the good model, and 
 Their next record is another drive, no faster and no further than the first.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

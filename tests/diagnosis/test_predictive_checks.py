@@ -4,8 +4,6 @@ A p-value below 0.005 or above 0.995 is odd: one in a hundred for a record of th
 less here, since the posterior has seen the record.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

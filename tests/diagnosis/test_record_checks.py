@@ -1,7 +1,5 @@
 """What is wrong with a record is named, and nothing is said about a good one."""
 
-from __future__ import annotations
-
 import re
 from ast import literal_eval
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Where what a model misses follows the drive, rivals widen the bands of unlike drives alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Verdicts on records whose error is known: hardly a false alarm, no miss, and the right cause."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -6,8 +6,6 @@ Limits: at most 1% of good runs' verdicts say no, and no spoilt record holds; th
 spoilt records, from the same generator.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path

@@ -7,8 +7,6 @@ model's columns from the plain model in ``tests.reference`` and the noise's dens
 are about as wide as the likelihood, so that both count, and their means are an sd off the truth.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """Small posteriors to test with: short records of the ring bender."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np

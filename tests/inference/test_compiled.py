@@ -4,8 +4,6 @@ Both engines sum over the samples in another order, so they may differ by roundi
 samples + |log density|.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

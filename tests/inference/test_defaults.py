@@ -1,7 +1,5 @@
 """Default priors: scales of the drive in its units, not of its sampling, and wide enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ of second order by the Yule-Walker equations, a Matérn process of order 5/2 (th
 Ornstein-Uhlenbeck processes (two, three or four states).
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from collections.abc import Callable

@@ -6,8 +6,6 @@ place of the states' own after each reading), so what is promised is the posteri
 integration puts it, and calibrated.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from dataclasses import replace

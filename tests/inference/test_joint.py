@@ -4,8 +4,6 @@ It is held against the posteriors of the records alone, and against the whole re
 records are its halves.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import get_args
 

@@ -4,8 +4,6 @@ Everything is compared with a dense Gaussian: the covariance of the discrepancy 
 the readings' times, with that of the unknown start added, all inverted at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Derivatives in a posterior's coordinates are those of closed forms, within the errors stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

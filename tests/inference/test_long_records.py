@@ -1,7 +1,5 @@
 """A million samples with 64 walkers fit into a laptop's memory, on either engine."""
 
-from __future__ import annotations
-
 import pytest
 
 from bwbayes.inference.engine import Engine

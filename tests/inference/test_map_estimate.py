@@ -1,7 +1,5 @@
 """The point fit stands on the mode, knows the curvature there, and sees all modes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Modes are those of closed forms, and what is simulated once is what is simulated each time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 

@@ -4,8 +4,6 @@ The oracle is a dense Gaussian, with the covariance of a driven oscillator from 
 of its equation of motion.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Gain and creep in the likelihood: a dense Gaussian, both engines, slow starts, old equations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

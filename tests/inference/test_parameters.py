@@ -1,7 +1,5 @@
 """The joint prior: one density in two sets of coordinates, draws that follow it, constraints."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

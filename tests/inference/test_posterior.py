@@ -1,7 +1,5 @@
 """The posterior of a batch of models; :mod:`tests.test_reference_posteriors` has its numbers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The plants creep with the logarithm of the time, made by a convolution with logâ
 knows no lags; 0 to 3% of the displacement a decade, fitted 16 s at 1 to 5 Hz.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -8,8 +8,6 @@ are known to about 1.3%, so one sd that is 5% wrong is found six times in seven,
 7% wrong 998 times in a thousand.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A thinned record: its path, its readings, and that what is searched in it is found in all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """What an estimated voltage leaves unsure of the parameters, against fits along other estimates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole actuator against a slow simulation, and what its parts promise together."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Distributions mean what their names say, and normal scores keep their precision."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

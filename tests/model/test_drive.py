@@ -1,7 +1,5 @@
 """Turning points, times and speeds are the drive's own: noise and sampling rate do not show."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

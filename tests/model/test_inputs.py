@@ -1,7 +1,5 @@
 """What drives an actuator, cut and put together on one clock."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

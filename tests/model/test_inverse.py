@@ -1,7 +1,5 @@
 """The voltage for a displacement, whatever the actuator is made of, gives that displacement."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from itertools import pairwise
 

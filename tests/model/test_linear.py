@@ -1,7 +1,5 @@
 """The recursions against scipy, closed forms and limits, for every kind of pole."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

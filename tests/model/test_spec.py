@@ -1,7 +1,5 @@
 """A model's spec: a chain of stages to be changed, compared, and written as a config has it."""
 
-from __future__ import annotations
-
 import json
 
 from hypothesis import given

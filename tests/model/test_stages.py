@@ -4,8 +4,6 @@ The oracles are plain loops over samples and scipy; the compiled passes, pieces 
 inverse, a model at a controller's pace and its C file have to agree with the whole record in NumPy.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Populations from draws: calibrated, as the closed form where that is right, and said when not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

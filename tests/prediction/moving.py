@@ -6,8 +6,6 @@ so all that bands can get wrong is the start of the record. Any operator may be 
 values that the virtual stand has for it.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 

@@ -5,8 +5,6 @@ drawn once a record), an Ornstein-Uhlenbeck discrepancy and white sensor noise, 
 that the bands say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

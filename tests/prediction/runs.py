@@ -5,8 +5,6 @@ Pareto-smoothed importance sampling (Vehtari et al., "Pareto smoothed importance
 and chosen again by their weights: a run in two seconds. All else is the run's own code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Coverages are of 1,000 truths: a right one is off by more than 2 % once in 250 times.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

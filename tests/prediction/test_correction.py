@@ -5,8 +5,6 @@ plant is fitted to a decaying sine by the good model, its posterior is the point
 and bands fail on a drive of another kind, from which they are corrected.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Forecasts: the discrepancy goes on from where readings leave it; the bands keep their word."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple

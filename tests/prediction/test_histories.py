@@ -4,8 +4,6 @@ A record that was driven by so much before it begins tells how far that was once
 further; the evidence is the mean of the likelihood over states, on a fine grid.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measured loops are those of slow loops, of the whole range and of half of it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

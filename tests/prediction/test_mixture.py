@@ -1,7 +1,5 @@
 """Values of the mixture against double sums and the exact mixture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import logsumexp, ndtr

@@ -17,8 +17,6 @@ quite Student's. It also makes 200 records for every operator, whose 95% band mu
 97%.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from unittest.mock import patch

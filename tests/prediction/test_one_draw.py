@@ -5,8 +5,6 @@ closed forms and dense matrices, with sds that differ much, at the training reco
 interval and at others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -7,8 +7,6 @@ has fewer; where 80% do, one of 13 has as many. The twin is another actuator, wi
 gain: of 40 one may pass, as one does whose discrepancy hides it, at the limit of what may be luck.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path

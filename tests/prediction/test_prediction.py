@@ -1,7 +1,5 @@
 """What predictions promise: nested bands, one simulation a record, honest unknown starts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

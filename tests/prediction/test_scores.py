@@ -1,7 +1,5 @@
 """Scores by hand on small bands, and the bootstrap against the spread over replicates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

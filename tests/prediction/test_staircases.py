@@ -7,8 +7,6 @@ prior of each strength, draws taken as they are have the wrong creep, and each o
 that suits it: their band misses the rest of the record.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from unittest.mock import patch
 

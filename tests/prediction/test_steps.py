@@ -1,7 +1,5 @@
 """Step responses are those of closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

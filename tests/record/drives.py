@@ -1,7 +1,5 @@
 """Drives of every kind at any rate, from 0 to 1, as benches play them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

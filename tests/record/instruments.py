@@ -5,8 +5,6 @@ files that are no texts; beside a file stands what a user has to say of its colu
 mean several things. Nothing here uses bwbayes to write.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Files of other formats than text, as :mod:`tests.record.instruments` has these, added to them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

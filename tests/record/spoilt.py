@@ -1,7 +1,5 @@
 """Good records of all kinds of drives on the virtual test stand, and what may be wrong with one."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace

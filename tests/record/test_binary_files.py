@@ -1,7 +1,5 @@
 """Records in HDF5, MATLAB and NumPy files: what is accepted, one line for what is not."""
 
-from __future__ import annotations
-
 import os
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """Channels with clocks of their own are put together by their times."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Columns and units of any file, table or array: recognized, said by the user, or asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

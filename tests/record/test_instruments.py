@@ -1,7 +1,5 @@
 """Every form in which a bench writes a record is read, with as little said as possible."""
 
-from __future__ import annotations
-
 import warnings
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Series with times of their own beside them are put together by these, and units beside count."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from io import BytesIO

@@ -1,7 +1,5 @@
 """Voltage and displacement in files of their own are one record."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A record keeps its data, addresses it by time, and is checked before it is used."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """What is written is what is read: through every format, in every unit, to the last bit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Uncertain units are read, kept, and say how each parameter of a model scales."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 from pathlib import Path
 

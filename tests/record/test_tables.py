@@ -1,7 +1,5 @@
 """Of several tables in one file one is read, the one that is chosen, and as if it stood alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ Tests of random quantities allow four standard errors (false alarms: 6 in 100,00
 otherwise; their seeds are fixed.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

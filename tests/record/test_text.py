@@ -1,7 +1,5 @@
 """Text records: what is accepted, and one line for everything that is not."""
 
-from __future__ import annotations
-
 import gzip
 import warnings
 from pathlib import Path

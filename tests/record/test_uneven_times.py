@@ -1,7 +1,5 @@
 """Times that are not uniform: samples move to the nearest ones of a grid, along their slopes."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Units as names of columns, users and data sheets write them."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

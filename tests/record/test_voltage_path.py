@@ -1,7 +1,5 @@
 """A clean voltage comes back bit for bit, and of a noisy one the reversals that are real."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The signals do what the paper's text means, and the parts keep their shapes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

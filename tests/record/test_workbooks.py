@@ -1,7 +1,5 @@
 """What a cell of a workbook shows and what it holds are two things: what it holds is read."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime, timedelta
 from pathlib import Path

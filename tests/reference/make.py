@@ -6,8 +6,6 @@ Independent runs of dynamic nested sampling, aimed at the posterior, are pooled.
 ten minutes on one core.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

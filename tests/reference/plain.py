@@ -7,8 +7,6 @@ densities. It reads the same configs as the package does, as far as the cases he
 prior given, a record in a CSV file, exponent one, discrepancy noise.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The numbers of a summary are those of the draws."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

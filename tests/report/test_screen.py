@@ -1,7 +1,5 @@
 """A table fits the screen, or the log, that it is shown on: nothing of it is cut off."""
 
-from __future__ import annotations
-
 import hypothesis.strategies as st
 from hypothesis import given
 

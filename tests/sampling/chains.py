@@ -1,7 +1,5 @@
 """Chain files to test with: what is written is made up, and always the same."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ All are made from autoregressive walkers whose draws are good: standard normal, 
 autocorrelation time of three steps. So what a test finds missing is what was broken.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bwbayes.arrays import FloatArray, IntArray

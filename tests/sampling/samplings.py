@@ -1,7 +1,5 @@
 """A sampling of a small Gaussian to its end, to be interrupted, watched and compared."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any

@@ -9,8 +9,6 @@ variance, so a variance that is wrong by 6 or 30% is found nearly always; the ba
 known only 14% well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import cast

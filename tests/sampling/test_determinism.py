@@ -4,8 +4,6 @@ So it does however many ensembles are moved together. The pieces end in the midd
 in another phase or place, and each goes on from the file alone, as a run does that was interrupted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import suppress

@@ -3,8 +3,6 @@
 # mypy: allow-untyped-calls
 # arviz_stats says that it has types, but its functions have none.
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An ensemble moves as emcee moves it; starts are tight, far, and apart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import emcee

@@ -6,8 +6,6 @@ The planted proposal is a normal distribution of a third of the posterior's widt
 have a tail of shape 0.91: far above the limit of 0.7, that of a fitted one far below.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 

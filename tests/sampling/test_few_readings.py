@@ -5,8 +5,6 @@ the sensor's noise. The share of each is worked out twice: by the chain, and by 
 around the modes, which knows nothing of chains.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -11,8 +11,6 @@ so the rate of false alarms is below 3% (at 95 % confidence). One in ten is in t
 all with ``-m slow``.
 """
 
-from __future__ import annotations
-
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A chain of the default budget is judged, stored and read within a laptop's memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ four repetitions with other seeds the right moves scored at most 3.3 here and th
 at least 17, with the alarm at 7.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

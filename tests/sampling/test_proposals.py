@@ -3,8 +3,6 @@
 That they leave a distribution as it is, :mod:`tests.sampling.test_moves` shows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

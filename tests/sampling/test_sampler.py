@@ -1,7 +1,5 @@
 """A sampling ends for a reason that it tells, with the same bits wherever and however it ran."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 from dataclasses import replace

@@ -4,8 +4,6 @@ Readings of an actuator with next to no hysteresis leave open whether α is none
 small that α does not show. Without the map walkers take one in a thousand of a mixture's places.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

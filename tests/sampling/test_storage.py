@@ -1,7 +1,5 @@
 """The chain's files keep what was written, whenever its writer dies and whatever a disk loses."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 import time

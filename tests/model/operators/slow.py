@@ -1,7 +1,5 @@
 """Slow and obvious operators: integrators, plays one by one, extrema looked for anew each time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Operators given by a differential equation: as published, and the laws they keep or do not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is promised of every operator in the registry, and of one from outside the package."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

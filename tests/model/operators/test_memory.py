@@ -1,7 +1,5 @@
 """Operators that remember extrema: against slow plain ones, and the laws they keep or do not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Jiles-Atherton and domain walls: against an integrator of the equation as it is published."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
