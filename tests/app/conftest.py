@@ -22,26 +22,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def fit(run: Path) -> bw.Run:
-    """Return the small run in Python."""
     return bw.open_run(run)
 
 
 @pytest.fixture
 def copy(run: Path, tmp_path: Path) -> RunFolder:
-    """Return a copy of the finished run, to be changed."""
     shutil.copytree(run, tmp_path / "copy")
     return RunFolder.open(tmp_path / "copy")
 
 
 @pytest.fixture
 def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the time that pictures take."""
     small.without_pictures(monkeypatch)
 
 
 @pytest.fixture
 def _without_explanations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the time that fits of every defect take."""
     small.without_explanations(monkeypatch)
 
 

@@ -59,7 +59,6 @@ def bands(
 
 
 def scores(truth: bool = True) -> Scores:
-    """Make up scores, no two alike."""
     return Scores(
         nrmse=0.0123,
         max_error_um=5.52,
@@ -135,11 +134,9 @@ def page(
     numbers: Mapping[str, Any] | None = None,
     pictures: Mapping[str, bytes] | None = None,
 ) -> str:
-    """Return the page of a run, by default with its own numbers, and of those pictures."""
     report = run_report(run, summary(run) if numbers is None else numbers)
     return render(report, pictures or {}, plots_of(run))
 
 
 def figures(run: Result) -> dict[str, Figure]:
-    """Draw all figures of a run, by name."""
     return {name: draw_styled(picture.draw) for name, picture in pictures(run).items()}

@@ -149,7 +149,6 @@ KINDS = (
 
 
 def chosen(rng: Generator, among: Any) -> Any:
-    """Choose one of a sequence."""
     return among[int(rng.integers(len(among)))]
 
 

@@ -67,12 +67,10 @@ def config(*changes: tuple[str, str], text: str = TEXT) -> Config:
 
 
 def begun(path: Path, *changes: tuple[str, str]) -> RunFolder:
-    """Return the folder of a run before its first step."""
     return RunFolder.create(path, resolve_config(config(*changes), path.parent))
 
 
 def typed(command: click.Command, *words: object) -> int:
-    """Return the exit status of a command with these words behind its name."""
     status: int = command.main([str(word) for word in words], standalone_mode=False)
     return status
 
@@ -88,7 +86,6 @@ def without_explanations(patch: pytest.MonkeyPatch) -> None:
 
 
 def quiet() -> Console:
-    """Return a console that prints nothing."""
     return Console(quiet=True)
 
 
@@ -124,14 +121,12 @@ def finished(factory: pytest.TempPathFactory) -> Path:
 
 
 def numbers(folder: Path) -> dict[str, Any]:
-    """Return the summary without what differs between two runs of the same."""
     result: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     del result["wall_s"]
     return result
 
 
 def lowest_ess(folder: Path) -> float:
-    """Return the effective draws of the worst parameter."""
     parameters = numbers(folder)["parameters"].values()
     return float(min(min(one["ess_bulk"], one["ess_tail"]) for one in parameters))
 

@@ -60,7 +60,6 @@ alpha = {alpha!r}
 
 
 def truths(number: int) -> dict[str, float]:
-    """Draw the true parameters of a specimen."""
     generator = np.random.default_rng([7, number])
     return {
         name: float(median * np.exp(spread * generator.standard_normal()))
@@ -69,13 +68,11 @@ def truths(number: int) -> dict[str, float]:
 
 
 def record(number: int) -> bw.Record:
-    """Return the record of a specimen."""
     config = parse(STAND.format(seed=number + 1, **truths(number)), "stand")
     return resolve_config(config, Path()).record
 
 
 def specimens(folder: Path, count: int) -> None:
-    """Write the records of so many specimens into a new folder."""
     folder.mkdir(parents=True)
     for number in range(count):
         bw.write_record(record(number), folder / f"s{number:03d}.csv")

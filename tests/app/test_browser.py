@@ -66,7 +66,6 @@ CONTRAST = """() => {
 
 
 def png() -> bytes:
-    """Draw a picture of the size that the report's have."""
     figure = Figure(figsize=(11, 5))
     figure.subplots().plot([0, 1])
     buffer = BytesIO()
@@ -76,7 +75,6 @@ def png() -> bytes:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Write the pages that are looked at."""
     folder = tmp_path_factory.mktemp("pages")
     picture = png()
     paths = {name: folder / f"{name}.html" for name in PAGES}
@@ -199,7 +197,6 @@ def test_intervals_are_seen_on_a_telephone(chromium: Any, pages: dict[str, Path]
 
 
 def middle_of(page: Any, name: str) -> tuple[float, float, float]:
-    """Return the middle of a plot's displacement panel, and its width."""
     plot = page.locator(f"#{name} .plot")
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()

@@ -86,7 +86,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def cut(whole: Path, path: Path, size: int) -> CalibrationFolder:
-    """Return a copy of a calibration that ended after so many bytes of replicates."""
     shutil.copytree(whole, path)
     shutil.rmtree(path / "figures")
     for name in ("calibration.json", "calibration.html"):
@@ -235,8 +234,6 @@ def test_run_is_calibrated_in_its_folder_and_its_report_says_so(
 def test_run_that_fails_its_calibration_says_so_and_ends_with_status_four(
     bwbayes: Type, copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where no replicate converges."""
-
     def short(posterior: Posterior, plan: SamplingPlan, **rest: Any) -> CalibrationSetup:
         return CalibrationSetup(posterior, replace(plan, max_steps=25), **rest)
 
@@ -310,7 +307,6 @@ def test_replicates_of_nothing_or_of_another_config_are_refused(
 
 
 def test_what_no_replicate_can_use_leaves_no_folder(tmp_path: Path) -> None:
-    """Said at once, not by the first replicate."""
     old, new = "mean = 0.3, sd = 0.05", "mean = 3.0, sd = 0.01"
     assert old in TEXT
     with pytest.raises(InputError, match="hardly any draw has"):

@@ -55,7 +55,6 @@ def test_help_explains_every_option() -> None:
 
 
 def test_python_runs_the_package_as_the_command() -> None:
-    """Of the Python that is typed, whatever is first in the path."""
     typed = [sys.executable, "-m", "bwbayes", "--version"]
     done = subprocess.run(typed, capture_output=True, text=True, check=True)
     assert re.fullmatch(r"bwbayes, version \d+\.\d+\.\d+\n", done.stdout)
@@ -134,7 +133,6 @@ def test_a_text_that_is_neither_config_nor_record_is_called_so(
 def test_check_shows_record_priors_and_point_fit_and_writes_its_page_alone(
     bwbayes: Type, tmp_path: Path
 ) -> None:
-    """Of the config's record, then of another one."""
     (tmp_path / "small.toml").write_text(small.TEXT)
     said = bwbayes("check", "small.toml")
     assert (0, "") == (said.status, small.without_progress(said.err))
@@ -219,7 +217,6 @@ def test_predict_takes_a_voltage_alone(
 def test_no_file_is_replaced_unless_that_is_asked_for(
     bwbayes: Type, run: Path, tmp_path: Path
 ) -> None:
-    """A measured record above all."""
     (tmp_path / "new.csv").write_text(lines(HEADER, *ROWS))
     before = (tmp_path / "new.csv").read_bytes()
     for command in (
@@ -297,7 +294,6 @@ def test_record_that_goes_the_other_way_ends_with_status_3(
 def test_a_files_own_columns_are_recognized(
     bwbayes: Type, run: Path, record: Record, tmp_path: Path
 ) -> None:
-    """As by `bwbayes run`: a user's next file has the columns of the first."""
     assert record.displacement is not None
     rows = zip(1e3 * record.time, record.voltage, record.displacement, strict=True)
     lines = ["# voltage: command", "t [ms],drive (V),pos_um"]
@@ -311,7 +307,6 @@ def test_a_files_own_columns_are_recognized(
 
 
 def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_path: Path) -> None:
-    """All but those of the columns, which it settles; the rate too."""
     path = tmp_path / "bench 3.csv"
     path.write_text(lines("amp,laser", *(row.partition(",")[2] for row in ROWS)))
     given = ("--fs", "200", "--out", "my results", "--seed", "3", "--search", "9s")
@@ -323,7 +318,6 @@ def test_the_command_to_copy_has_the_options_that_were_given(bwbayes: Type, tmp_
 
 
 def test_a_predicted_files_name_need_not_be_utf_8(bwbayes: Type, run: Path, tmp_path: Path) -> None:
-    """Its bands, scores and figure are called as it can be written."""
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/messung_\xe4.csv"))
     write_record(read_record(run / "records/sine.h5"), path)
     out = tmp_path / "bands.csv"

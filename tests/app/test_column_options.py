@@ -111,7 +111,6 @@ def test_a_file_of_other_columns_is_read_by_itself(
 
 
 def test_a_run_keeps_how_its_record_was_read(tmp_path: Path) -> None:
-    """Through its folder, where the record has the package's own columns."""
     written(tmp_path / "first.csv", ["a", "b", "c"], [*QUANTITIES], 1.0)
     text = """\
 [record]
@@ -158,7 +157,6 @@ def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
 
 @pytest.fixture
 def renamed(copy: RunFolder, tmp_path: Path) -> Path:
-    """Return a file of the columns of a run's record, which a run can be told of alone."""
     config = load(copy.config)
     noted = {
         "columns": {"time": "a", "voltage": "b", "displacement": "c"},
@@ -181,7 +179,6 @@ def renamed(copy: RunFolder, tmp_path: Path) -> Path:
 def test_predict_validates_on_a_second_file_of_the_same_kind(
     bwbayes: Type, copy: RunFolder, renamed: Path
 ) -> None:
-    """To the numbers of the file that says its units itself."""
     for name in ("next", "same"):
         said = bwbayes("predict", copy.path, "--record", renamed.with_name(f"{name}.csv"))
         assert (0, "") == (said.status, said.err)
@@ -225,7 +222,6 @@ def test_predict_says_that_a_record_without_a_displacement_validates_nothing(
 def test_compensate_and_design_read_a_file_alike(
     bwbayes: Type, copy: RunFolder, renamed: Path
 ) -> None:
-    """A reference without a voltage, and a drive."""
     times = np.arange(50) / 50
     rows = np.stack([times, 20_000 * np.sin(np.pi * times) ** 2], axis=1)
     reference = renamed.with_name("path.csv")
@@ -254,7 +250,6 @@ def test_compensate_and_design_read_a_file_alike(
 def test_a_reference_or_drive_is_told_its_columns_and_units_as_a_record_is(
     bwbayes: Type, tmp_path: Path, command: str, flag: str, other: tuple[str, ...]
 ) -> None:
-    """Below another table, with names and units that say nothing; what is open is asked for."""
     time = np.arange(200) / 50
     columns = np.stack([time, 30 * np.sin(4 * time), 15 * np.sin(4 * time)], axis=1)
     above = ["p,q,r", "1,1,1", "2,1,1", "3,1,1", "4,1,1", ""]

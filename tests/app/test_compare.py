@@ -75,7 +75,6 @@ def fits() -> tuple[Run, Run]:
 
 
 def test_fits_are_compared_and_saved(fits: tuple[Run, Run], tmp_path: Path) -> None:
-    """By a method, and at the top; fits of one name by number."""
     bouc_wen, linear = fits
     comparison = linear.compare(bouc_wen, future=False, workers=1)
     assert comparison.recommended == "bouc-wen"
@@ -143,7 +142,6 @@ def test_what_cannot_be_compared_is_one_line(fits: tuple[Run, Run]) -> None:
 def test_other_readings_are_refused(
     fits: tuple[Run, Run], record: Record, keys: dict[str, Any], line: str
 ) -> None:
-    """Before anything is worked out, so that it does not matter what the draws are of."""
     config, records = config_of(record, KEYS | keys)
     other = fits[1].with_cache(problem=resolve_config(config, Path(), records))
     with pytest.raises(InputError, match=line):

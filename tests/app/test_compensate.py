@@ -19,7 +19,6 @@ from tests.app.conftest import Type
     "ignore:the reference is smoothed", "ignore:between samples", "ignore:voltage and last reversal"
 )
 def test_files_say_the_same_and_the_command_is_a_record(fit: bw.Run, tmp_path: Path) -> None:
-    """What is written: a record that the package reads again, numbers, a table, a page."""
     made = fit.compensate(build_reference("sine", 0.02, 30.0, 0.5), from_rest=True, limit=5.0)
     files = made.save(tmp_path / "new")
     names = ["command.csv", *(f"compensation.{kind}" for kind in ("json", "csv", "html"))]
@@ -63,7 +62,6 @@ def test_a_file_and_an_array_give_one_command(fit: bw.Run, tmp_path: Path) -> No
 def test_a_shape_is_that_of_the_command_line(
     bwbayes: Type, run: Path, fit: bw.Run, tmp_path: Path
 ) -> None:
-    """By its name, with the same numbers; with options left out, the same defaults."""
     shape = "triangle", "--amplitude", 30, "--frequency", 1, "--periods", 2
     said = bwbayes("compensate", run, *shape, "--from-rest", "--limit", 5, "--out", "out")
     assert 0 == said.status
@@ -85,7 +83,6 @@ def test_a_shape_is_that_of_the_command_line(
 def test_a_limit_that_is_not_kept_is_no_success(
     bwbayes: Type, run: Path, fit: bw.Run, limit: float, status: int, kept: bool
 ) -> None:
-    """The run's validation passed: it ends as a failure alone for the limit, and says why."""
     shape = "triangle", "--amplitude", 30, "--frequency", 1, "--from-rest"
     said = bwbayes("compensate", run, *shape, "--limit", limit, "--out", f"out{limit}")
     assert said.status == status
@@ -136,7 +133,6 @@ def test_what_is_no_reference_is_one_line(
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_a_command_after_any_drive_says_what_a_demagnetized_start_would_change(fit: bw.Run) -> None:
-    """Where that at least halves the largest error; and nothing of one that is declared so."""
     values = 20 * np.sin(np.linspace(0, 6, 200)) ** 2
     waited, rested = (fit.compensate(values, from_rest=declared) for declared in (False, True))
     errors = [float(np.mean(made.compensated.largest)) for made in (waited, rested)]

@@ -19,7 +19,6 @@ RECORD = '[record]\nfile = "record.csv"\n'
 
 
 def refused(text: str) -> str:
-    """Return what is said against a config."""
     with pytest.raises(InputError) as error:
         parse(text, "my.toml")
     said = str(error.value)
@@ -93,7 +92,6 @@ def test_an_earlier_key_is_told_the_new_one(table: str, earlier: str, now: str) 
 
 
 def test_no_error_shows_the_name_of_a_class() -> None:
-    """Nor a word of the checker's own, for wrong values at every place of a config."""
     for key in ("record", "stand", "model", "sampling", "parameters", "validation", "truth"):
         for value in ("3", "'a'", "[]", "[1]", "true", "{ a = [] }", "{ a = { b = [] } }"):
             said = refused(f"{key} = {value}\n" + ("" if key == "record" else RECORD))
@@ -109,7 +107,6 @@ def test_no_error_shows_the_name_of_a_class() -> None:
     ],
 )
 def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
-    """In a config and as a keyword."""
     head = RECORD if table == "record" else f"{RECORD}[{table}]\n"
     alone, listed = (parse(f"{head}{key} = {v}\n", "") for v in (f'"{text}"', f'["{text}"]'))
     assert alone == listed

@@ -35,7 +35,6 @@ def whole(seed: int = 1) -> Record:
 
 
 def parts(record: Record, *cuts: int, own_clock: bool = False) -> list[Record]:
-    """Cut a record at samples, each part with the whole's clock, or with one from zero."""
     edges = [0, *cuts, record.samples]
     made = [record.window(INTERVAL * first, INTERVAL * last) for first, last in pairwise(edges)]
     return [replace(one, start=0.0) if own_clock else one for one in made]
@@ -52,7 +51,6 @@ def densities(made: Problem) -> np.ndarray[Any, Any]:
 
 
 def chained(named: Mapping[str, Record], **first: Any) -> dict[str, dict[str, Any]]:
-    """Return tables of records of which each continues the one before."""
     names = list(named)
     tables: dict[str, dict[str, Any]] = {names[0]: {"record": named[names[0]], **first}}
     for before, name in pairwise(names):
@@ -106,7 +104,6 @@ def test_windows_and_what_is_held_out_are_those_of_the_whole(order: tuple[int, .
 
 
 def test_a_continued_record_beside_another(tmp_path: Path) -> None:
-    """From files; the other keeps its own offset and start, and the config says the whole."""
     record, other = whole(), whole(2)
     named = dict(zip(("a", "b"), parts(record, 120), strict=True)) | {"other": other}
     for name, one in named.items():

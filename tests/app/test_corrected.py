@@ -26,7 +26,6 @@ COLUMNS = ["corrected_lower_95_um", "corrected_upper_95_um"]
 
 @pytest.fixture(scope="module")
 def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run that fails on its held-out readings."""
     folder = small.begun(tmp_path_factory.mktemp("failed") / "run", NARROW)
     with pytest.MonkeyPatch.context() as patch:
         small.without_explanations(patch)
@@ -65,7 +64,6 @@ def test_corrected_band_stands_beside_the_failed_one(failed: Path) -> None:
 def test_predictions_of_drives_alike_have_it_and_others_do_not(
     failed: Path, bwbayes: Type, tmp_path: Path
 ) -> None:
-    """The held-out readings say nothing of a drive that goes further than the record's."""
     record = bw.open_run(failed).problem.record
     for name, times in (("alike", 1.0), ("further", 1.3)):
         pd.DataFrame({"time_s": record.time, "voltage_V": times * record.voltage}).to_csv(

@@ -82,7 +82,6 @@ def test_what_cannot_be_ranked_is_one_line(
 def test_validate_finds_a_record_to_validate_on_and_one_to_train_on(
     bwbayes: Type, run: Path, tmp_path: Path
 ) -> None:
-    """Both within the voltages and speeds of training."""
     said = bwbayes("design", run, "--validate", "--out", "out")
     assert said.status == 0
     numbers = json.loads((tmp_path / "out/design.json").read_text())

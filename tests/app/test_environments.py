@@ -144,7 +144,6 @@ multiprocessing.synchronize.SemLock.__init__ = refuse
 
 @pytest.mark.parametrize("broken", ["", NO_SEMAPHORES])
 def test_where_no_process_starts_this_one_computes(tmp_path: Path, broken: str) -> None:
-    """A script without a main guard, and a system without semaphores."""
     script = tmp_path / "script.py"
     script.write_text(WORK.format(broken=broken))
     ended = python(str(script))
@@ -166,7 +165,6 @@ def test_where_no_process_starts_this_one_computes(tmp_path: Path, broken: str) 
 def test_a_run_of_which_a_file_is_cut_off_is_resumed_to_its_end(
     copy: RunFolder, file: str, share: float
 ) -> None:
-    """At once, or after a line that says what to do."""
     whole = (copy.path / file).read_bytes()
     (copy.path / file).write_bytes(whole[: int(share * len(whole))])
     with warnings.catch_warnings():

@@ -53,14 +53,12 @@ def posterior() -> Any:
 
 
 def chain() -> Chain:
-    """Return a chain before its first step."""
     one = posterior()
     point = pointfit.fit(one, np.random.default_rng(1))
     return init_chain(one, point, PLAN, np.random.default_rng(2))
 
 
 def sampled(pool: Executor, watcher: Callable[..., None] = lambda *_: None) -> Any:
-    """Return all draws of the small sampling."""
     one, begun = posterior(), chain()
     sample(one, PLAN, begun, pool, watcher)
     return draws(one, begun)
@@ -68,7 +66,6 @@ def sampled(pool: Executor, watcher: Callable[..., None] = lambda *_: None) -> A
 
 @pytest.fixture(scope="module")
 def here() -> Any:
-    """Return the draws as one thread of this process makes them."""
     with open_executor(1) as pool:
         return sampled(pool)
 
@@ -182,7 +179,6 @@ def test_a_missing_scheduler_and_an_unknown_word_are_one_line(
 def test_a_run_refuses_an_executor_before_its_map_estimate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor does it take a new target, which the next one would have."""
     folder = small.begun(tmp_path / "run")
     before = folder.config.read_bytes()
     monkeypatch.setattr("bwbayes.app.running.run.choose_model", None)
@@ -203,7 +199,6 @@ def test_a_run_refuses_an_executor_before_its_map_estimate(
 def test_every_command_refuses_an_executor_first_of_all(
     bwbayes: Type, monkeypatch: pytest.MonkeyPatch, command: str, executor: str, said: str
 ) -> None:
-    """Before it looks at what it is given, which is not there."""
     monkeypatch.setattr(workers_module, "PATIENCE", 0.2)
     if executor == "dask":
         monkeypatch.setitem(sys.modules, "distributed", None)
@@ -235,13 +230,11 @@ def die() -> None:
 
 
 def test_a_process_that_dies_ends_the_work_at_once() -> None:
-    """What is on disk can be resumed; the command line says so (`cli.main`)."""
     with open_executor(1, executor="processes") as pool, pytest.raises(BrokenProcessPool):
         pool.submit(die).result(PATIENCE)
 
 
 def linear_algebra_threads() -> set[int]:
-    """Return how many threads the linear algebra libraries of this process use."""
     np.linalg.solve(np.eye(2), np.eye(2))
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 

@@ -69,7 +69,6 @@ def test_options_that_make_no_sense_are_one_line(
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 @pytest.mark.parametrize("verb", ["compensate", "export", "track"])
 def test_voltages_beyond_those_fitted_have_to_be_allowed(verb: str, fit: bw.Run) -> None:
-    """The record went from -100 to 100 V."""
     shape = ["sine"] if verb == "compensate" else []
     options: dict[str, Any] = {"amplitude": 5.0, "frequency": 1.0} if shape else {}
     options |= {"frequencies": (1.0,), "draws": 2} if verb == "track" else {}

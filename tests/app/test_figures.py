@@ -59,7 +59,6 @@ def places(panel: Axes) -> tuple[int, int]:
 
 
 def names(panel: Axes) -> list[str]:
-    """Return the names of the cells of a panel, if it has any."""
     return [text.get_text() for text in panel.texts]
 
 
@@ -150,7 +149,6 @@ def test_zoom_is_at_the_largest_judged_error_and_makes_the_bands_tall() -> None:
 
 
 def test_no_line_or_band_goes_from_one_window_to_the_next() -> None:
-    """Between 1 and 2 s nothing is drawn; nor is there a path of the loop."""
     bands = example.bands(lead_in=0).within([slice(0, 1000), slice(2000, 3000)])
     along_time = draw_bands(bands)
     for panel in along_time.axes[::2]:
@@ -203,7 +201,6 @@ def test_thinned_series_keep_their_extremes(values: list[float], most: int) -> N
 
 
 def test_plots_keep_the_extremes_and_few_samples() -> None:
-    """Of voltage, mean and residual, wherever they are; and the ends."""
     bands = example.bands(samples=60_000)
     assert bands.measured is not None
     bands.measured[12_345] += 30.0
@@ -242,7 +239,6 @@ class Broken(Executor):
 
 
 def short() -> Result:
-    """Return a run of few samples and one parameter."""
     training = example.bands("training", 300, 0, training=True)
     every = training, example.bands(samples=300, lead_in=30)
     return example.run(True, example.draws()[..., :1], example.PARAMETERS[:1], every)
@@ -266,7 +262,6 @@ def test_another_process_draws_the_same_pictures_in_the_same_order(tmp_path: Pat
 
 
 def test_without_convergence_there_are_the_chains(tmp_path: Path) -> None:
-    """Also where the process that was to draw them has died."""
     figure_worker, run = FigureWorker(Broken()), example.run(converged=False)
     figure_worker.draw(run)
     drawn, plots = figure_worker.collect(run, tmp_path)

@@ -42,7 +42,6 @@ def opened(folder: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def keys(folder: Path, opened: Run) -> dict[str, Any]:
-    """Return tests/app/small.py's config as keyword arguments."""
     return {
         "name": "small",
         "seed": 3,
@@ -63,7 +62,6 @@ def keys(folder: Path, opened: Run) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def fit(record: Record, keys: dict[str, Any]) -> Run:
-    """Return a fit of the small run's arrays."""
     arrays = record.voltage, record.displacement
     made = bw.Record.from_arrays(*arrays, interval=record.interval, voltage_is="command")
     with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
@@ -73,7 +71,6 @@ def fit(record: Record, keys: dict[str, Any]) -> Run:
 
 
 def stopped(folder: Path, steps: int = 25) -> Run:
-    """Return the run of a folder as its first steps leave it."""
     made = bw.open_run(folder)
     outcome = replace(made.outcome, converged=False, stop_reason=f"step limit {steps} reached")
     return made.with_cache(outcome=outcome, kept={})
@@ -372,8 +369,6 @@ def test_what_is_no_record_is_one_line(record: Record) -> None:
 def test_rivals_are_fitted_once_and_kept_with_the_run(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None are fitted unless the model's error follows the drive."""
-
     def rivals(p_value: float) -> tuple[Rival, ...] | None:
         lock = DriveLock(0.5, p_value)
         return (

@@ -80,7 +80,6 @@ def test_second_writer_is_refused_while_the_first_one_lives(
 
 @contextmanager
 def powerless() -> Iterator[None]:
-    """Give up root's right to write anywhere."""
     if os.geteuid() != 0:
         yield
         return
@@ -93,7 +92,6 @@ def powerless() -> Iterator[None]:
 
 @pytest.fixture
 def read_only() -> Iterator[Path]:
-    """Return a folder that may only be read."""
     # Not below pytest's own folder, which others may not even enter.
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
@@ -139,7 +137,6 @@ def test_full_disk_leaves_no_folder(tmp_path: Path, size: int) -> None:
 
 
 def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -> None:
-    """And nothing of an interrupted start."""
     partial = tmp_path / "results/.a.partial/records/old.h5"
     partial.parent.mkdir(parents=True)
     partial.write_bytes(b"half a record")
@@ -166,7 +163,6 @@ def test_what_is_no_runs_is_never_replaced(tmp_path: Path, problem: Problem, nam
 
 
 def test_what_is_no_run_cannot_be_opened(tmp_path: Path) -> None:
-    """A folder with a config alone is somebody's project, and a file is no folder."""
     config = tmp_path / "config.toml"
     for path in (tmp_path, tmp_path / "none"):
         with pytest.raises(InputError, match=f"{path}: no run here; start one with"):

@@ -66,7 +66,6 @@ def written(
     separator: str = ",",
     header: bool = True,
 ) -> Path:
-    """Write a record as an instrument would, every number with the digits that it needs."""
     scales = [UNITS[q][unit] for q, unit in zip(UNITS, units, strict=True)]
     decimals = max(decimals_of(1 / rate) + 3 + round(np.log10(scales[0])), 0)
     times = [f"{(start + i / rate) / scales[0]:.{decimals}f}" for i in range(voltage.size)]

@@ -28,7 +28,6 @@ RECORDS = 200
 
 
 def ordinary(folder: Path, number: int) -> Path:
-    """Write a record as somebody may have it."""
     generator = np.random.default_rng([20261123, number])
     samples = int(np.exp(generator.uniform(np.log(200), np.log(8000))))
     kind = str(generator.choice(["sine", "decaying", "growing", "unipolar", "chirp", "triangle"]))
@@ -45,7 +44,6 @@ def ordinary(folder: Path, number: int) -> Path:
 
 
 def ended(path: Path, folder: Path) -> str:
-    """Run a file to its report; return how it ended."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         config = draft_config(path, path.parent).config
@@ -70,7 +68,6 @@ def test_no_ordinary_record_is_refused(tmp_path: Path) -> None:
 
 
 def arguments(written: Written) -> list[str]:
-    """Return what is typed after `bwbayes run`."""
     path, columns, units, fs = written
     said = [f"--column={name}={value}" for name, value in columns.items()]
     said += [f"--unit={name}={value}" for name, value in units.items()]

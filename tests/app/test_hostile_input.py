@@ -62,7 +62,6 @@ class Said:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the folder that the commands run in."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["bwbayes", "check", "my.toml"])
     monkeypatch.setenv("COLUMNS", "200")

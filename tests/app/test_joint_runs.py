@@ -65,7 +65,6 @@ def problem(*changes: tuple[str, str]) -> Problem:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """Return the folder of the run, made once; it is for reading."""
     path = tmp_path_factory.mktemp("joint") / "run"
     folder = RunFolder.create(path, resolve_config(parse(TEXT, "joint.toml"), path.parent))
     with pytest.MonkeyPatch.context() as patch:
@@ -133,7 +132,6 @@ def test_a_chain_of_several_records_goes_on_and_knows_its_own(
 
 
 def test_replicates_make_all_records_anew() -> None:
-    """Each with its own readings."""
     common = experiment(problem(("ess = 150", "ess = 100")))
     assert ["loops"] == [*common.held_out]
     entry = replicate(common, 1, 0).entry
@@ -143,7 +141,6 @@ def test_replicates_make_all_records_anew() -> None:
 
 
 def measured(seed: int, gain: float = 0.6) -> Record:
-    """Return a short measured record."""
     time = np.arange(100) / 50
     voltage = 80 * np.sin(2 * np.pi * time)
     noise = np.random.default_rng(seed).standard_normal(100)
@@ -223,7 +220,6 @@ def test_what_several_records_cannot_be_is_refused(change: tuple[str, str], mess
 
 
 def test_readings_do_not_count_twice(tmp_path: Path) -> None:
-    """One measurement under two names is refused, unless each has windows of its own."""
     write_record(measured(1), tmp_path / "a.h5")
     text = '[record.a]\nfile = "a.h5"\n[record.b]\nfile = "a.h5"\n'
     with pytest.raises(InputError, match=r"^record\.b: the same measurement as record\.a, whose"):

@@ -80,14 +80,12 @@ def started(where: Path, *arguments: str, last_step: str = "") -> Iterator[ForkS
 
 
 def finished(where: Path, *arguments: str) -> tuple[int | None, str, str]:
-    """Return exit status, output and errors of a command."""
     with started(where, *arguments) as process:
         process.join(PATIENCE)
         return process.exitcode, (where / "out").read_text(), (where / "err").read_text()
 
 
 def session(leader: int) -> list[str]:
-    """Return the processes of a session that live: command lines."""
     result = subprocess.run(
         ["ps", "-o", "stat=,args=", "--sid", str(leader)],
         capture_output=True,
@@ -98,7 +96,6 @@ def session(leader: int) -> list[str]:
 
 
 def assert_alone(leader: int) -> None:
-    """See that all processes of an ended session end too."""
     end = time.monotonic() + PATIENCE
     while session(leader) and time.monotonic() < end:
         time.sleep(0.05)
@@ -106,7 +103,6 @@ def assert_alone(leader: int) -> None:
 
 
 def wait(process: ForkServerProcess, moment: Moment, folder: Path) -> None:
-    """Wait for a moment of a run, or for its end."""
     end = time.monotonic() + PATIENCE
     while process.is_alive() and not moment(folder):
         assert time.monotonic() < end
@@ -223,7 +219,6 @@ def test_no_request_to_stop_is_lost(where: str, name: str, tmp_path: Path) -> No
 def test_request_to_stop_ends_in_order(
     tmp_path: Path, asked: signal.Signals, everyone: bool, moment: Moment
 ) -> None:
-    """Ctrl-C reaches all processes of a terminal, the workers too."""
     # Long enough that it has not ended by itself before it is asked to.
     (tmp_path / "small.toml").write_text(small.TEXT.replace("ess = 200", "ess = 20000"))
     folder = tmp_path / "a"
@@ -280,14 +275,12 @@ def test_kills_at_random_end_in_the_same_bits(run: Path, tmp_path: Path) -> None
 
 
 def go_on(where: Path) -> tuple[str, ...]:
-    """Return the command that goes on with a run, or starts it."""
     if (where / "a").exists():
         return ("resume", "a", "--quiet")
     return ("run", "small.toml", "--out", "a", "--quiet")
 
 
 def counted(path: Path) -> list[int]:
-    """Return how many blocks of each phase a file has, if it is there."""
     if not path.exists():
         return [0] * len(PHASES)
     chain = ChainFile.read(path)

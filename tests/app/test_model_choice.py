@@ -167,7 +167,6 @@ def test_noise_that_grows_with_the_speed_is_as_wide_where_the_next_drive_is_fast
     "keys", [{"stages": []}, {"stages": ["backlash"]}, {"search": "none"}, {"search": "0s"}]
 )
 def test_stages_that_are_named_are_not_searched(keys: dict[str, Any], tmp_path: Path) -> None:
-    """Nor is anything else added to them: a list, or no time, is the user's word."""
     config = config_of("quadratic", tmp_path)
     model = config.model.model_copy(update=keys)
     problem = resolve_config(config.model_copy(update={"model": model}), tmp_path)
@@ -177,7 +176,6 @@ def test_stages_that_are_named_are_not_searched(keys: dict[str, Any], tmp_path: 
 
 
 def test_a_search_ends_when_its_time_is_over(tmp_path: Path) -> None:
-    """It says so, what it found by then counts, and a run looks at the rest once more."""
     config = config_of("quadratic", tmp_path)
     model = config.model.model_copy(update={"search": "0.001s"})
     chosen = search_stages(resolve_config(config.model_copy(update={"model": model}), tmp_path))
@@ -188,8 +186,6 @@ def test_a_search_ends_when_its_time_is_over(tmp_path: Path) -> None:
 def test_a_stage_that_errs_more_on_held_out_readings_is_not_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever its evidence; the search says what it has refused."""
-
     def misled(*arguments: Any) -> tuple[Explanation, ...]:
         return tuple(replace(found, held_out=(0.1, 0.12)) for found in explain(*arguments))
 
@@ -306,7 +302,6 @@ def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> Non
 
 
 def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
-    """As of one, from what each has alone; a parameter of one record's own stays its own."""
     for name, record in zip("ab", records(2), strict=True):
         write_record(thinned(record), tmp_path / f"{name}.h5")
     text = "".join(f'[record.{n}]\nfile = "{n}.h5"\nfrom_rest = true\n' for n in "ab")

@@ -36,14 +36,12 @@ def refused(text: str, folder: Path) -> str:
 
 
 def record() -> Record:
-    """Make up a record."""
     voltage, displacement = np.random.default_rng(1).uniform(-1, 1, size=(2, 400))
     return Record(80 * voltage, 50 * displacement + 7, interval=0.01, voltage_is="command")
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder with a record in it."""
     write_record(record(), tmp_path / "record.csv")
     return tmp_path
 
@@ -171,7 +169,6 @@ def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None
 
 
 def test_nothing_is_said_of_a_record_in_memory_that_stays_as_it_is(tmp_path: Path) -> None:
-    """Numbers that a file has for missing readings may be readings here."""
     marked = np.tile(np.append(-9999.0, np.arange(49.0)), 8)
     in_memory = {"record": replace(record(), displacement=marked)}
     problem = resolve_config(parse(RECORD, "my.toml"), tmp_path, in_memory)
@@ -225,14 +222,12 @@ def test_what_cannot_be_run_is_said_with_its_place(folder: Path, text: str, said
 def test_made_record_that_no_file_could_hold_is_refused_before_the_run(
     tmp_path: Path, signal: str, said: str
 ) -> None:
-    """The run's folder keeps it as a file, and reads it back."""
     assert said in refused(f"[record]\nsignal = {{ {signal} }}", tmp_path)
     held_out = f"[validation.a]\nsignal = {{ {signal} }}\nlead_in = 0.001"
     assert said in refused(f'[record]\nsignal = "identification"\n{held_out}', tmp_path)
 
 
 def test_what_was_said_of_a_record_stays_with_its_run(folder: Path) -> None:
-    """Its own copy, in the package's columns, would not say it again."""
     text = (folder / "record.csv").read_text().splitlines()
     rows = [f"{line},21.5" for line in text if not line.startswith("#")]
     (folder / "record.csv").write_text("\n".join([rows[0].replace("21.5", "temp_C"), *rows[1:]]))
@@ -243,7 +238,6 @@ def test_what_was_said_of_a_record_stays_with_its_run(folder: Path) -> None:
 
 
 def test_a_model_without_hysteresis_needs_no_loops(tmp_path: Path) -> None:
-    """So the fix of this finding removes it."""
     voltage = 50 * np.sin(np.arange(4000) / 50)
     error = np.random.default_rng(1).normal(0, 0.005, voltage.size)
     write_record(Record(voltage, 0.1 * voltage + error, interval=1e-3), tmp_path / "record.h5")

@@ -157,7 +157,6 @@ def test_what_others_print_goes_where_it_belongs(
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_of_many_calls_it_says_how_many_before_the_first_is_done(terminal: bool) -> None:
-    """A log, too."""
     screen = StringIO()
     console = Console(force_terminal=terminal, width=100, file=screen)
     options: dict[str, Any] = {
@@ -188,7 +187,6 @@ COMMANDS = {
 def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
     bwbayes: Type, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    """Elsewhere, and if it is to be quiet, there is none."""
     (tmp_path / "small.toml").write_text(small.TEXT)
     rows = [f"{i / 100},{5 * (i % 7)},{2 * (i % 7)}" for i in range(60)]
     (tmp_path / "record.csv").write_text("\n".join(["time_s,voltage_V,displacement_um", *rows]))
@@ -204,7 +202,6 @@ def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
 
 
 def again(command: str) -> tuple[str, ...]:
-    """Return what a command needs to write its files again."""
     return () if command in ("init", "check", "report") else ("--overwrite",)
 
 

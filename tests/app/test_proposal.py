@@ -61,7 +61,6 @@ def write(tmp_path: Path, record: Record) -> Write:
 
 
 def command(*arguments: str | Path) -> Result:
-    """Return what a command did."""
     return CliRunner().invoke(cli.cli, [str(one) for one in arguments], standalone_mode=False)
 
 
@@ -118,8 +117,6 @@ def _turned(displacement: FloatArray) -> None:
 def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
     write: Write, rows: np.ndarray
 ) -> None:
-    """A fit sets aside those it is fitted to alone."""
-
     def spoil(displacement: FloatArray) -> None:
         displacement[rows] += 60.0
 
@@ -173,7 +170,6 @@ def test_the_command_that_writes_the_config_has_the_options_that_were_given(writ
 
 @pytest.mark.filterwarnings("ignore:.*1 line above the header:bwbayes.errors.InputWarning")
 def test_the_config_names_the_table_that_was_chosen(bwbayes: Type, write: Write) -> None:
-    """Of several, which ``init`` and ``run`` list with the option that chooses one."""
     path = write()
     alone = read_record(path)
     turned = write(change=_turned).read_text()
@@ -195,7 +191,6 @@ def test_the_config_names_the_table_that_was_chosen(bwbayes: Type, write: Write)
 def test_units_that_are_stated_are_doubted_and_not_refused(
     write: Write, factors: tuple[float, float, float]
 ) -> None:
-    """No magnitude is impossible: what was read is said once, and the user decides."""
     proposal = proposed(write(factors=factors))
     (finding,) = proposal.findings
     assert "unlikely units" == finding.kind
@@ -208,7 +203,6 @@ def test_units_that_are_stated_are_doubted_and_not_refused(
 def test_a_reversed_sign_is_turned_by_its_unit(
     write: Write, record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where `check` shows what a run refuses; what its misfit comes from takes longer than all."""
     small.without_explanations(monkeypatch)
     path = write(change=_turned)
     done = command("check", path, "--out", path.parent / "page")
@@ -245,8 +239,6 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
 
 
 def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write) -> None:
-    """A remedy that is followed leaves a config of one side, and says where the jump is."""
-
     def jump(displacement: FloatArray) -> None:
         displacement[400:] += 10.0
 
@@ -261,8 +253,6 @@ def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write)
 
 
 def test_readings_that_are_clipped_are_missing(write: Write) -> None:
-    """On both sides, however often; also in another record that the run predicts."""
-
     def clip(displacement: FloatArray) -> None:
         low, high = np.min(displacement), np.max(displacement)
         np.clip(displacement, 0.8 * low, 0.8 * high, out=displacement)

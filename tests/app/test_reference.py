@@ -33,7 +33,6 @@ WITH = {
 
 
 def config_with(key: Key) -> str:
-    """Write a config around the example of a key."""
     table = key.path.rpartition(".")[0]
     beside = [line for line in WITH.get(table, "").splitlines() if line.split()[0] != key.name]
     example = f"{key.name} = {key.example}"
@@ -113,7 +112,6 @@ def test_a_key_that_does_not_exist_is_one_line_with_the_nearest(asked: str, hint
 
 @every_part
 def test_a_part_has_a_line_and_a_page_with_its_parameters(name: str) -> None:
-    """The page has the equation too, and where there is something to it its source."""
     (line,) = re.findall(rf"^  {name} +(\S.*)$", parts_reference(None), flags=re.MULTILINE)
     page = parts_reference(name)
     assert line.split(".")[0] in " ".join(page.split())

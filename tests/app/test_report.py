@@ -99,7 +99,6 @@ def test_bands_that_do_not_hold_come_before_the_answer_with_the_fix() -> None:
 
 @pytest.mark.parametrize("held_out", [True, False])
 def test_a_run_that_holds_nothing_out_says_so_on_page_and_screen(held_out: bool) -> None:
-    """With what to write; a run that holds readings out says nothing of it."""
     validation = {"training": BandValidation("training", True, True)}
     if held_out:
         validation["held-out"] = BandValidation("held-out", False, True)
@@ -176,7 +175,6 @@ def test_rounding_costs_at_most_a_twentieth_of_a_standard_deviation(
 
 
 def test_a_stored_summary_and_the_truth_are_shown() -> None:
-    """Estimates are the stored ones, and there is no column of truths where none is known."""
     run = example.run()
     stored: Any = summary(run)
     stored["parameters"]["d"] |= {"mean": 0.12345, "sd": 0.001}

@@ -68,7 +68,6 @@ def test_larger_target_is_reached_with_the_same_draws_first(
 def test_what_is_finished_is_not_worked_out_again(
     copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So it stays finished, whenever it is interrupted; files that are missing are made again."""
     numbers, before = copy.numbers(), copy.summary.stat().st_mtime_ns
     for stage in STAGES.values():
         monkeypatch.setattr(stage, "compute", None)
@@ -84,7 +83,6 @@ def test_what_is_finished_is_not_worked_out_again(
 
 
 def test_pictures_of_an_earlier_end_do_not_stay(copy: RunFolder) -> None:
-    """A target that is missed takes back the intervals that a lower one had given."""
     steps = ChainFile.read(copy.chain).steps("sampling")
     assert not resume(copy, small.quiet(), workers=1, ess=1e6, steps=steps).converged
     assert {"trace.png", "ranks.png"} == {p.name for p in (copy.path / "figures").iterdir()}

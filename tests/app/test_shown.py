@@ -23,7 +23,6 @@ from tests.population.test_population import drawn
 
 @pytest.fixture(scope="module")
 def objects(fit: bw.Run, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Return what public calls return."""
     folder, rng = tmp_path_factory.mktemp("shown"), np.random.default_rng(1)
     time = np.arange(300) / 50
     voltage = 60 * np.sin(2 * np.pi * time) * (1 - time / 20)
@@ -63,7 +62,6 @@ def followed(generator: np.random.Generator) -> Tracking:
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
 def test_every_object_shows_itself_in_a_dozen_lines(objects: list[Any]) -> None:
-    """Those that users make and get."""
     public = {getattr(bw, name) for name in bw.__all__ if isinstance(getattr(bw, name), type)}
     assert not {one.__name__ for one in public - {*map(type, objects)}}
     for thing in objects:

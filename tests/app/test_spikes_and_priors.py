@@ -85,7 +85,6 @@ def set_aside(problem: Problem) -> list[int]:
 
 
 def prior_arguments(problem: Problem) -> FloatArray:
-    """Return all arguments of the priors, means over their sds."""
     values: list[float] = []
     for parameter in problem.parameters:
         arguments = parameter.prior.arguments if parameter.prior else {}
@@ -95,7 +94,6 @@ def prior_arguments(problem: Problem) -> FloatArray:
 
 
 def off(spoiled: Spoiled) -> str:
-    """Return what is wrong with the problem of a spoiled record; nothing if it is right."""
     problem = resolved(spoiled.record, "outliers = true")
     if set_aside(problem) != spoiled.rows.tolist():
         return f"{set_aside(problem)} for {spoiled.rows.tolist()}, {spoiled.sizes} um"

@@ -117,7 +117,6 @@ def test_what_does_not_know_the_temperature_refuses_in_one_line(
 
 @pytest.mark.usefixtures("_without_explanations")
 def test_a_model_that_does_not_see_the_temperature_needs_none() -> None:
-    """Although the record brings it: of a forecast, and of a command."""
     keys = {"stages": [], "noise": "white", "from_rest": True, "ess": 200, "progress": False}
     fit = bw.fit(measured(22.0, 22.01, 4), dynamics="none", **keys)  # type: ignore[arg-type]
     with warnings.catch_warnings():
@@ -144,7 +143,6 @@ def test_both_engines_give_one_log_density() -> None:
     ("said", "shift"), [('["temperature_degC"]', 0.0), ('{ temperature_degC = "T2" }', 1.0)]
 )
 def test_a_config_names_the_column_of_a_covariate(said: str, shift: float, tmp_path: Path) -> None:
-    """As it is called, or otherwise; a problem's own files bring it along."""
     temperature = TRAINED.covariates["temperature_degC"]
     columns = record_arrays(TRAINED) | {"T2": temperature + 1}
     pd.DataFrame(columns).to_csv(tmp_path / "bench.csv", index=False)

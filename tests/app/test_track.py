@@ -18,7 +18,6 @@ from tests.app.conftest import Type
 def test_numbers_table_and_picture_agree(
     bwbayes: Type, run: Path, fit: bw.Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """As the command writes what Python gives; it is worked out once for both."""
     tracking, asked = fit.track(frequencies=(5.0,), draws=5), dict[str, Any]()
 
     def track(_: bw.Run, **options: Any) -> Any:

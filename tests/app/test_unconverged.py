@@ -21,7 +21,6 @@ from tests.app.conftest import Type
 
 @pytest.fixture(scope="module")
 def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]:
-    """Return a run that used up its budget, and the exit status of its command."""
     path = tmp_path_factory.mktemp("short") / "small"
     made = small.begun(path, ("block = 25", "block = 25\nsteps = 25"))
     with pytest.MonkeyPatch.context() as patch:
@@ -49,7 +48,6 @@ def test_run_without_convergence_speaks_of_no_interval(
 def test_one_that_is_interrupted_is_said_to_be_not_finished(
     cut_short: tuple[RunFolder, int], bwbayes: Type, tmp_path: Path
 ) -> None:
-    """And not to have reached a limit of steps, as its chain alone would have it."""
     path = tmp_path / "interrupted"
     shutil.copytree(cut_short[0].path, path)
     (path / "summary.json").unlink()

@@ -58,7 +58,6 @@ def test_the_payload_is_live(payload: bytes, mark: Path) -> None:
 
 
 def as_numpy_file(payload: bytes) -> bytes:
-    """Give the header of an array of objects, with the payload as its pickle."""
     buffer = io.BytesIO()
     header = {"descr": "|O", "fortran_order": False, "shape": (40,)}
     np.lib.format.write_array_header_1_0(buffer, header)
@@ -215,7 +214,6 @@ class Skeleton(HTMLParser):
 
 
 def page(text: str, converged: bool) -> str:
-    """Return the report of a run whose every text from a config or a record is this one."""
     label = "".join(f"\\U{ord(character):08X}" for character in text)
     config = parse(QUICK + f'[parameters.d]\nfixed = 1.0\nlabel = "{label}"\n', "my.toml")
     odd = [
@@ -245,7 +243,6 @@ def test_texts_add_no_tag_to_the_page(text: str, converged: bool) -> None:
 
 @pytest.mark.parametrize("text", PAYLOADS)
 def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
-    """Brackets are no markup there, and do not stop the command."""
     parameters = [dataclasses.replace(p, unit=text) for p in example.PARAMETERS]
     report = Report(title="", blocks=[priors_table(JointPrior(parameters))])
     # A long one may go on in the next line.

@@ -54,7 +54,6 @@ def passed(request: pytest.FixtureRequest) -> bool | None:
 
 @pytest.fixture
 def judged(run: Path, tmp_path: Path, passed: bool | None) -> Path:
-    """Return a copy of a run of which the verdict on one window is as it is asked for."""
     folder = tmp_path / "judged"
     shutil.copytree(run, folder)
     numbers = json.loads((folder / "summary.json").read_text())

@@ -11,18 +11,15 @@ SECONDS = 10.0
 
 
 def sine(time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return a sine of 0.5 to 1.5 Hz, at any phase."""
     wave: FloatArray = np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi))
     return wave
 
 
 def decaying_sine(time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return a sine that decays."""
     return np.exp(-rng.uniform(0.1, 0.25) * time) * sine(time, rng)
 
 
 def triangle(time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return a triangle that may decay."""
     phase = 2 * np.pi * rng.uniform(0.3, 1.0) * time + rng.uniform(0, 2 * np.pi)
     wave: FloatArray = np.exp(-rng.uniform(0, 0.2) * time) * scipy.signal.sawtooth(phase, 0.5)
     return wave
@@ -41,7 +38,6 @@ def staircase(time: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def multisine(time: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return five sines of 0.2 to 2 Hz."""
     waves = [sine(time * rng.uniform(0.4, 1.3), rng) for _ in range(5)]
     return sum(waves, np.zeros(time.size))
 

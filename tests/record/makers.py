@@ -43,7 +43,6 @@ def _maker(name: str) -> Callable[[Writer], Writer]:
 
 
 def _table(*fields: tuple[Any, ...]) -> Any:
-    """Return a structured array of fields: name, type, values and shape of each, if it has one."""
     rows = np.zeros(SAMPLES, dtype=[(name, kind, *shape) for name, kind, _, *shape in fields])
     for name, _, values, *_ in fields:
         rows[name] = values

@@ -33,7 +33,6 @@ KINDS: list[Kind] = ["h5", "mat", "compressed", "7.3", "npz"]
 
 
 def store(folder: Path, kind: Kind, arrays: dict[str, Any]) -> Path:
-    """Store arrays as another program would, without anything of bwbayes."""
     if kind == "npz":
         np.savez(folder / "record.npz", **arrays)
         return folder / "record.npz"
@@ -55,7 +54,6 @@ def fault(path: Path) -> str:
 
 
 def overwrite(path: Path, form: str, offset: int, number: int) -> None:
-    """Put a number into a file."""
     data = bytearray(path.read_bytes())
     struct.pack_into(form, data, offset, number)
     path.write_bytes(data)
@@ -88,7 +86,6 @@ def test_prefixes_integers_and_single_precision_are_converted(tmp_path: Path, ki
 
 @pytest.mark.parametrize("compressed", [True, False])
 def test_a_version_5_file_is_read_as_scipy_wrote_it(tmp_path: Path, compressed: bool) -> None:
-    """Every class of numbers, matrices and texts, nested in structs and cell arrays."""
     kinds = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
     arrays = {kind: np.arange(24).reshape(3, 8).astype(kind) for kind in kinds}
     cells = np.empty(3, dtype=object)

@@ -75,7 +75,6 @@ def lvm(path: Path, delay: float, *, x_columns: str) -> Path:
 
 
 def check(record: Record, delay: float, ratio: float) -> None:
-    """Every value is the one of its time, and no common time is left out."""
     np.testing.assert_allclose(record.voltage, voltage_at(record.time), atol=1e-5)
     assert record.displacement is not None
     readings = record.displacement[record.has_reading]

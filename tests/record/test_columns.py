@@ -27,7 +27,6 @@ VALUES = {"t [ms]": 1e3 * TIME, "U_mV": 1e3 * VOLTAGE, "pos": 1e3 * DISPLACEMENT
 
 
 def write(path: Path, values: dict[str, Any]) -> Path:
-    """Write columns to a file of any kind."""
     if path.suffix == ".csv":
         pd.DataFrame(values).to_csv(path, index=False)
     elif path.suffix == ".h5":
@@ -74,7 +73,6 @@ def test_a_mapping_that_is_wrong_is_one_line(
 
 @pytest.mark.parametrize("suffix", [".csv", ".h5", ".mat"])
 def test_columns_are_recognized_where_none_are_said(tmp_path: Path, suffix: str) -> None:
-    """A unit is all that has to be said, and of a MATLAB file's, which have none, each."""
     units = UNIT | ({"time": "ms"} if suffix == ".mat" else {})
     path = write(tmp_path / f"a{suffix}", VALUES)
     assert_same(read_record(path, units=units))
@@ -133,7 +131,6 @@ def test_all_that_is_missing_is_said_at_once(tmp_path: Path, suffix: str) -> Non
 
 
 def test_a_sampling_rate_takes_the_place_of_a_time_column(tmp_path: Path) -> None:
-    """Asked for where no column rises: a thermometer's is not guessed to be the time."""
     values = {"voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT, "temp_C": np.cos(TIME)}
     path = write(tmp_path / "a.h5", values)
     line = r"what is the sampling rate, Hz \(no column can be .* mean nothing\)\?.*; say fs=HZ"
@@ -175,7 +172,6 @@ def test_the_ends_of_a_time_stamps_range_can_be_told_apart(tmp_path: Path) -> No
 def test_units_of_time_are_asked_for_with_their_rates(
     tmp_path: Path, columns: dict[str, str]
 ) -> None:
-    """As nothing else would show a wrong one."""
     name = "t" if columns else "clock"
     values = {name: 2 * np.arange(200), "voltage_V": VOLTAGE, "displacement_um": DISPLACEMENT}
     line = rf"{name}' is 0.5 Hz for 398 s in s, 500 Hz for 0.398 s in ms, 500000 Hz for"
@@ -202,7 +198,6 @@ def test_a_unit_anywhere_in_a_name_is_the_guess(
 
 
 def test_a_sensors_volts_are_asked_for_with_their_sensitivity(tmp_path: Path) -> None:
-    """As the guess would else be read as if 1 V were 1 um."""
     values = {"time_s": TIME, "amplifier [V]": VOLTAGE, "gauge [mV]": DISPLACEMENT}
     line = r"which the displacement, and how many um is 1 mV of 'gauge \[mV\]'\? .*t': '\? um'}$"
     with pytest.raises(ColumnsError, match=line):
@@ -311,7 +306,6 @@ def test_a_unit_that_is_none_of_the_quantity_is_said(tmp_path: Path) -> None:
 
 @given(st.permutations(["time", "voltage", "displacement"]))
 def test_a_number_is_that_of_a_column_whatever_the_names_are(order: list[str]) -> None:
-    """Also where a column's name is another's number."""
     values = dict(
         zip(["time", "voltage", "displacement"], (TIME, VOLTAGE, DISPLACEMENT), strict=True)
     )
@@ -409,7 +403,6 @@ def test_arrays_that_are_no_record_are_one_line(changes: dict[str, Any], line: s
 
 @given(st.lists(st.sampled_from([(-1,), (-1, 1), (1, -1)]), min_size=3, max_size=3))
 def test_rows_and_columns_are_vectors(shapes: list[tuple[int, ...]]) -> None:
-    """As MATLAB keeps every vector, each array in its own way."""
     arrays = [x.reshape(s) for x, s in zip((TIME, VOLTAGE, DISPLACEMENT), shapes, strict=True)]
     time, voltage, displacement = arrays
     assert_same(Record.from_arrays(voltage, displacement, time=time))
@@ -439,7 +432,6 @@ def test_a_number_far_from_all_readings_that_is_repeated_is_a_missing_one(
 
 
 def test_a_number_that_may_be_a_reading_stays_one() -> None:
-    """One that stands alone or is near others, and where the voltage is one of its own."""
     step = np.where(np.arange(200) < 20, 0.0, 50.0 + 0.1 * np.sin(TIME))
     cases: list[tuple[Any, list[int], float]] = [
         (VOLTAGE, [50], -9999.0),
@@ -455,7 +447,6 @@ def test_a_number_that_may_be_a_reading_stays_one() -> None:
 
 @pytest.mark.parametrize("kind", ["datetime64[ns]", "datetime64[us]", "timedelta64[ns]"])
 def test_a_table_may_have_dates_or_an_index_for_times(kind: str) -> None:
-    """They need no unit."""
     frame = pd.DataFrame(VALUES)
     assert_same(Record.from_pandas(frame.set_index("t [ms]"), units=UNIT))
     dates = (TIME * 1e9).round().astype("timedelta64[ns]")

@@ -122,7 +122,6 @@ def test_dates_go_on_after_midnight_whatever_their_order(
 def test_a_rate_beside_the_numbers_is_the_one_to_copy(
     tmp_path: Path, name: str, value: float | None
 ) -> None:
-    """Of a number that is called otherwise nothing is known."""
     log = {"u_V": VOLTAGE, "x_um": DISPLACEMENT, name: value or 200.0}
     scipy.io.savemat(tmp_path / "a.mat", {"log": log})
     with pytest.raises(ColumnsError) as caught:

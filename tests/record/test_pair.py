@@ -25,7 +25,6 @@ HEADERS = {
 def written(
     path: Path, quantity: str, header: str, separator: str, decimal: str, *, timed: bool
 ) -> Path:
-    """Write a file of a quantity, with times before it or alone."""
     columns = [TIME, VALUES[quantity]] if timed else [VALUES[quantity]]
     rows = [
         separator.join(f"{x:.6f}".replace(".", decimal) for x in row)

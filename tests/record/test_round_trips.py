@@ -38,7 +38,6 @@ records = st.builds(
 
 
 def through(record: Record, folder: Path, suffix: str) -> Record:
-    """Write a record in one format, and read it."""
     path = folder / f"same.{suffix.split(maxsplit=1)[0]}"
     write_record(record, path, mat_version="7.3" if suffix.endswith("7.3") else "5")
     return read_record(path, need_displacement=record.displacement is not None)

@@ -62,7 +62,6 @@ def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
     blocks: list[tuple[str, str, int]],
     data: st.DataObject,
 ) -> None:
-    """Also where the header, title and times of the next one are the same."""
     headers, titles, lengths = ([block[i] for block in blocks] for i in range(3))
     path = tmp_path_factory.getbasetemp() / "tables.csv"
     content = tables(lengths)  # type: ignore[arg-type]
@@ -91,7 +90,6 @@ def test_a_block_below_an_empty_line_in_which_times_begin_again_is_a_table(
     separator: str,
     data: st.DataObject,
 ) -> None:
-    """Below the header of the first one, if that has one."""
     content = tables(lengths)
     blocks = ["\n".join(separator.join(map(repr, row)) for row in rows) for rows in content]
     path = tmp_path_factory.getbasetemp() / "blocks.csv"

@@ -166,7 +166,6 @@ EVERY = {name: f"hysteresis = '{name}'\n" for name in HYSTERESIS} | {
 
 
 def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -> Problem:
-    """Resolve a config with an actuator on the stand and a model of it."""
     text = (
         f"[record]\nsignal = {SIGNAL}\n{record}"
         f"[stand]\ndiscrepancy = 'none'\nsample_rate = {RATE}\n"
@@ -200,7 +199,6 @@ def test_the_model_reproduces_the_stands_record_with_the_stated_truth(
 
 @pytest.mark.parametrize("name", ["duhem", "prandtl-ishlinskii", "jiles-atherton"])
 def test_so_it_does_from_a_state_that_is_stated(name: str, tmp_path: Path) -> None:
-    """And not with another value."""
     parts = f"hysteresis = '{name}'\ndynamics = 'lag'\n"
     problem = of(parts, parts, tmp_path, "[stand.parameters]\ninitial = 0.4\n")
     assert problem.config.truth["initial"] == 0.4

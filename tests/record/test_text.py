@@ -26,7 +26,6 @@ def read(folder: Path, content: str | bytes) -> Record:
 
 
 def fault(folder: Path, content: str | bytes) -> str:
-    """Return the one line that reading `content` ends with, without the folder."""
     with pytest.raises(InputError) as caught:
         read(folder, content)
     text = str(caught.value)
@@ -122,7 +121,6 @@ def test_times_alone_at_the_end_are_skipped_with_a_remark(tmp_path: Path, times:
 
 
 def test_a_row_like_one_above_the_numbers_stays(tmp_path: Path) -> None:
-    """Without times, a row left out would move all that follow."""
     rows = ["0.1,OVLD", *(f"{np.sin(i):.4f},{np.cos(i):.4f}" for i in range(250)), "0.1,OVLD"]
     path = tmp_path / "record.csv"
     path.write_text(lines("voltage_V,displacement_um", *rows, "0.2,0.3"))
@@ -271,7 +269,6 @@ def test_of_equal_columns_of_one_name_one_is_taken_and_of_others_none(tmp_path: 
 
 
 def test_decimals_of_three_digits_are_no_thousands(tmp_path: Path) -> None:
-    """Whatever the mark, and however many whole numbers stand beside them in other columns."""
     for separator, decimal in ((",", "."), (";", "."), (";", ",")):
         rows = [f"{i}|{1 + i / 7:.3f}|{7 + np.sin(i):.3f}" for i in range(500)]
         rows = [row.replace(".", decimal).replace("|", separator) for row in rows]

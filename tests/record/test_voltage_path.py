@@ -20,12 +20,10 @@ SEEDS = st.integers(0, 10_000)
 
 
 def noisy(clean: FloatArray, sd: float, seed: int) -> FloatArray:
-    """Return a voltage with white noise."""
     return clean + sd * np.random.default_rng([1, seed]).standard_normal(clean.size)
 
 
 def length(voltage: FloatArray) -> float:
-    """Return the length of a path, V."""
     return float(np.sum(np.abs(np.diff(voltage))))
 
 
@@ -114,7 +112,6 @@ def test_its_reversals_are_the_true_ones(kind: str, seed: int) -> None:
 
 
 def large_turns(voltage: FloatArray, threshold: float) -> int:
-    """Count the reversals at which a voltage comes back by a threshold, V."""
     count, direction, extreme = 0, 0, voltage[0]
     for value in voltage:
         if direction * (value - extreme) >= 0 and direction:

@@ -24,7 +24,6 @@ from tests.stand import autoregressive
 
 
 def parameters(draws: FloatArray) -> dict[str, dict[str, float]]:
-    """Return the summary's parameters of a run of these draws (steps, ensembles, walkers, 4)."""
     steps, ensembles, walkers, _ = draws.shape
     accepted = np.full((steps // 50, ensembles, walkers), 20)
     run = example.run(values=draws)
