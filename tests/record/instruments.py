@@ -1,6 +1,6 @@
 """Texts as programs and instruments write them: one record, in every form that a bench has.
 
-:data:`INSTRUMENTS` writes the same record in each of them, :mod:`tests.record.makers` adds the
+:data:`TEXTS` writes the same record in each of them, :mod:`tests.record.makers` adds the
 files that are no texts; beside a file stands what a user has to say of its columns, where they can
 mean several things. Nothing here uses bwbayes to write.
 """
@@ -27,7 +27,7 @@ class Written(NamedTuple):
 
 
 Writer = Callable[[Path], Written]
-INSTRUMENTS: dict[str, Writer] = {}
+TEXTS: dict[str, Writer] = {}
 
 TIME = INTERVAL * np.arange(SAMPLES)  # s
 VOLTAGE = np.round(60 * np.exp(-0.5 * TIME) * np.sin(2 * np.pi * TIME / 0.5), 4)
@@ -75,7 +75,7 @@ def _text(
         (folder / file).write_bytes(("\r\n".join([*head, *rows]) + "\r\n").encode(encoding))
         return Written(folder / file, *said)
 
-    INSTRUMENTS[name] = write
+    TEXTS[name] = write
 
 
 # Programs

@@ -17,10 +17,10 @@ from tests.record.instruments import (
     BOTH,
     COLUMNS,
     DISPLACEMENT,
-    INSTRUMENTS,
     INTERVAL,
     MICRONS,
     SAMPLES,
+    TEXTS,
     TIME,
     UNITS,
     VOLTAGE,
@@ -31,6 +31,7 @@ from tests.record.instruments import (
 
 COUNTS = np.rint(DISPLACEMENT / 1e-5).astype(np.int32)  # exact, as it has five decimals
 NAMES = ("time_s", "voltage_V", "displacement_um")
+INSTRUMENTS: dict[str, Writer] = dict(TEXTS)
 PAIR = np.stack(COLUMNS[1:], axis=1)
 
 

@@ -47,11 +47,7 @@ def assert_same(record: Record, sign: float = 1.0) -> None:
 @pytest.mark.parametrize(
     ("columns", "units", "line"),
     [
-        (
-            {"displacement": "poss"},
-            UNIT,
-            "no column 'poss' for the displacement; choose another.",
-        ),
+        ({"displacement": "poss"}, UNIT, "no column 'poss' for the displacement; choose another."),
         ({}, {}, r"which unit has 'pos' \(displacement\)\? .* 'pos' \(-3.*; say .*units={'disp"),
         (
             {},

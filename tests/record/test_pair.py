@@ -42,14 +42,9 @@ def written(
     decimal=st.sampled_from(".,"),
 )
 def test_two_files_are_a_record_whatever_their_only_columns_are_called(
-    tmp_path_factory: pytest.TempPathFactory,
-    headers: tuple[str, str],
-    timed: tuple[bool, bool],
-    separator: str,
-    decimal: str,
+    folder: Path, headers: tuple[str, str], timed: tuple[bool, bool], separator: str, decimal: str
 ) -> None:
     """With times in both, one or neither; a column without a name has no unit either."""
-    folder = tmp_path_factory.mktemp("pair")
     files = {}
     for quantity, header, has_times in zip(VALUES, headers, timed, strict=True):
         # Times need a name, or nothing tells them from values.

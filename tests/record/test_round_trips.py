@@ -54,11 +54,11 @@ def assert_same(expected: Record, got: Record) -> None:
 @settings(max_examples=50)
 @given(record=records, way=st.lists(st.sampled_from(SUFFIXES), min_size=1, max_size=6))
 def test_a_record_survives_any_way_through_the_formats(
-    tmp_path_factory: pytest.TempPathFactory, record: Record, way: list[str]
+    folder: Path, record: Record, way: list[str]
 ) -> None:
     got = record
     for suffix in way:
-        got = through(got, tmp_path_factory.getbasetemp(), suffix)
+        got = through(got, folder, suffix)
     assert_same(record, got)
 
 
@@ -87,12 +87,7 @@ def in_unit(values: FloatArray, power: int) -> FloatArray:
     second=st.sampled_from(sorted(TIMES)),
 )
 def test_a_record_in_any_units_is_the_same_record(
-    tmp_path_factory: pytest.TempPathFactory,
-    suffix: str,
-    record: Record,
-    volt: str,
-    length: str,
-    second: str,
+    folder: Path, suffix: str, record: Record, volt: str, length: str, second: str
 ) -> None:
     """To one unit in the last place, which the conversion there and back may cost."""
     if suffix == "mat":  # whose names have no micro sign
@@ -105,7 +100,7 @@ def test_a_record_in_any_units_is_the_same_record(
         f"voltage_{volt}": in_unit(record.voltage, VOLTS[volt]),
         f"displacement_{length}": in_unit(record.displacement, LENGTHS[length]),
     }
-    got = read_record(write(tmp_path_factory.getbasetemp() / f"units.{suffix}", columns))
+    got = read_record(write(folder / f"units.{suffix}", columns))
     assert got.displacement is not None
     np.testing.assert_allclose(got.voltage, record.voltage, rtol=LAST_PLACE, atol=1e-290)
     np.testing.assert_allclose(got.displacement, record.displacement, rtol=LAST_PLACE, atol=1e-290)

@@ -58,12 +58,10 @@ def assert_holds(path: Path, table: Any, rows: Cells) -> None:
     st.data(),
 )
 def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
-    tmp_path_factory: pytest.TempPathFactory,
-    blocks: list[tuple[str, str, int]],
-    data: st.DataObject,
+    folder: Path, blocks: list[tuple[str, str, int]], data: st.DataObject
 ) -> None:
     headers, titles, lengths = ([block[i] for block in blocks] for i in range(3))
-    path = tmp_path_factory.getbasetemp() / "tables.csv"
+    path = folder / "tables.csv"
     content = tables(lengths)  # type: ignore[arg-type]
     written(path, headers, titles, content)  # type: ignore[arg-type]
     number = data.draw(st.integers(1, len(blocks)))
@@ -83,16 +81,11 @@ def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
     st.data(),
 )
 def test_a_block_below_an_empty_line_in_which_times_begin_again_is_a_table(
-    tmp_path_factory: pytest.TempPathFactory,
-    lengths: list[int],
-    header: str,
-    between: str,
-    separator: str,
-    data: st.DataObject,
+    folder: Path, lengths: list[int], header: str, between: str, separator: str, data: st.DataObject
 ) -> None:
     content = tables(lengths)
     blocks = ["\n".join(separator.join(map(repr, row)) for row in rows) for rows in content]
-    path = tmp_path_factory.getbasetemp() / "blocks.csv"
+    path = folder / "blocks.csv"
     header = header.replace(",", separator)
     path.write_text(f"{header}\n{f'\n{between}\n'.join(blocks)}\n")
     number = data.draw(st.integers(1, len(blocks)))

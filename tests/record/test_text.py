@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
+from tests.record.conftest import quiet
 
 HEADER = "time_s,voltage_V,displacement_um"
 ROWS = [f"{i * 0.005:.3f},{np.sin(i):.4f},{20 * np.cos(1.3 * i):.4f}" for i in range(30)]
@@ -98,10 +99,9 @@ def test_lines_count_in_the_file_where_some_are_skipped(tmp_path: Path) -> None:
     st.lists(st.sampled_from(["Mean,0.1,0.2", "End of file", "Mean", "", "# end"]), max_size=3),
 )
 def test_a_line_that_is_cut_off_and_words_below_the_numbers_are_skipped_with_a_remark(
-    tmp_path_factory: pytest.TempPathFactory, lost: int, below: list[str]
+    folder: Path, lost: int, below: list[str]
 ) -> None:
     """Wherever a logger was killed, in mid-line or in mid-number, and whatever stands below."""
-    folder = tmp_path_factory.mktemp("cut")
     cut = lines(*LINES, *below) if below else GOOD[: -1 - lost]
     whole = read(folder, lines(*(LINES if below else LINES[:-1])))
     if any(line[:1].isalpha() for line in below) or not cut.endswith("\n"):
@@ -120,13 +120,12 @@ def test_times_alone_at_the_end_are_skipped_with_a_remark(tmp_path: Path, times:
     assert record.sha256 == read(tmp_path, GOOD).sha256
 
 
+@quiet
 def test_a_row_like_one_above_the_numbers_stays(tmp_path: Path) -> None:
     rows = ["0.1,OVLD", *(f"{np.sin(i):.4f},{np.cos(i):.4f}" for i in range(250)), "0.1,OVLD"]
     path = tmp_path / "record.csv"
     path.write_text(lines("voltage_V,displacement_um", *rows, "0.2,0.3"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        record = read_record(path, fs=100.0)
+    record = read_record(path, fs=100.0)
     assert record.voltage[-2:].tolist() == [0.1, 0.2]
 
 
@@ -147,6 +146,7 @@ def test_what_c_writes_for_no_number_is_a_missing_reading(tmp_path: Path, text: 
     assert read(tmp_path, cell(9, 2, text)).readings == 29
 
 
+@quiet
 @given(
     separator=st.sampled_from([";", "\t", "|", ",", " "]),
     decimal=st.sampled_from(".,"),
@@ -158,7 +158,7 @@ def test_what_c_writes_for_no_number_is_a_missing_reading(tmp_path: Path, text: 
     seed=st.integers(0, 2**32),
 )
 def test_thousands_are_read_whatever_marks_them(
-    tmp_path_factory: pytest.TempPathFactory,
+    folder: Path,
     separator: str,
     decimal: str,
     is_quoted: bool,
@@ -183,11 +183,7 @@ def test_thousands_are_read_whatever_marks_them(
     if separator == "," or (is_quoted and separator != " "):
         rows = [[f'"{text}"' for text in row] for row in rows]
     header = separator.join([f"time_{'ms' if millis else 's'}", "voltage_mV", "displacement_nm"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        record = read(
-            tmp_path_factory.getbasetemp(), lines(header, *(separator.join(row) for row in rows))
-        )
+    record = read(folder, lines(header, *(separator.join(row) for row in rows)))
     expected = values / 1000
     expected[1, 50] = np.nan if word else expected[1, 50]
     assert 0.005 == record.interval
@@ -195,6 +191,7 @@ def test_thousands_are_read_whatever_marks_them(
     np.testing.assert_allclose(np.asarray(record.displacement), expected[1], rtol=1e-12)
 
 
+@quiet
 @given(
     start=st.integers(0, 1),
     form=st.sampled_from([".6f", ".18e", ".1f", "g", "d"]),
@@ -202,7 +199,7 @@ def test_thousands_are_read_whatever_marks_them(
     seed=st.integers(0, 2**32),
 )
 def test_numbers_for_names_are_no_reading_and_a_first_sample_of_such_is_one(
-    tmp_path_factory: pytest.TempPathFactory, start: int, form: str, separator: str, seed: int
+    folder: Path, start: int, form: str, separator: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     columns = [5.0 * np.arange(60), *np.rint(rng.uniform(-300, 300, (2, 60)))]
@@ -210,23 +207,22 @@ def test_numbers_for_names_are_no_reading_and_a_first_sample_of_such_is_one(
         separator.join(f"{int(x) if form == 'd' else x:{form}}" for x in row)
         for row in zip(*columns, strict=True)
     ]
-    path = tmp_path_factory.getbasetemp() / "numbered.csv"
+    path = folder / "numbered.csv"
     units = {"time": "ms", "voltage": "V", "displacement": "um"}
     options: dict[str, Any] = {
         "columns": {"time": 1, "voltage": 2, "displacement": 3},
         "units": units,
     }
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        path.write_text(lines(separator.join(str(start + i) for i in range(3)), *rows))
-        record = read_record(path, **options)
-        assert (60, 0.005) == (record.samples, record.interval)
-        np.testing.assert_array_equal(record.voltage, columns[1])
-        ramp = [separator.join(f"{x + i:g}" for x in range(3)) for i in range(60)]
-        path.write_text(lines(*ramp))
-        assert 60 == read_record(path, **options).samples
+    path.write_text(lines(separator.join(str(start + i) for i in range(3)), *rows))
+    record = read_record(path, **options)
+    assert (60, 0.005) == (record.samples, record.interval)
+    np.testing.assert_array_equal(record.voltage, columns[1])
+    ramp = [separator.join(f"{x + i:g}" for x in range(3)) for i in range(60)]
+    path.write_text(lines(*ramp))
+    assert 60 == read_record(path, **options).samples
 
 
+@quiet
 @pytest.mark.parametrize(
     "header",
     [
@@ -241,20 +237,17 @@ def test_names_of_several_words_stand_above_numbers_between_blanks(
     tmp_path: Path, header: str
 ) -> None:
     text = lines(header, *(row.replace(",", " ") for row in ROWS))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        assert read(tmp_path, text).sha256 == read(tmp_path, GOOD).sha256
+    assert read(tmp_path, text).sha256 == read(tmp_path, GOOD).sha256
 
 
+@quiet
 @pytest.mark.parametrize(
     "end", [[",,"], [",,", '"","",""', ""], ["0.150,,"], ["0.150,,", "0.155,,"]]
 )
 def test_rows_without_a_voltage_and_a_displacement_at_the_end_are_none(
     tmp_path: Path, end: list[str]
 ) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        assert read(tmp_path, lines(*LINES, *end)).sha256 == read(tmp_path, GOOD).sha256
+    assert read(tmp_path, lines(*LINES, *end)).sha256 == read(tmp_path, GOOD).sha256
 
 
 def test_of_equal_columns_of_one_name_one_is_taken_and_of_others_none(tmp_path: Path) -> None:
@@ -289,6 +282,7 @@ def test_whole_numbers_with_marks_alone_are_said_to_be_such(tmp_path: Path) -> N
     assert 2.9 == record.voltage[-1]
 
 
+@quiet
 @given(
     order=st.sampled_from(["names, units", "units, names"]),
     settings=st.lists(
@@ -299,22 +293,19 @@ def test_whole_numbers_with_marks_alone_are_said_to_be_such(tmp_path: Path) -> N
     comma=st.sampled_from(["", ","]),
 )
 def test_units_may_stand_above_names_below_settings(
-    tmp_path_factory: pytest.TempPathFactory, order: str, settings: list[str], comma: str
+    folder: Path, order: str, settings: list[str], comma: str
 ) -> None:
     """As oscilloscopes write them, each line of the header with a comma at its end or without."""
     head = ["time,voltage,displacement", "s,V,um"][:: 1 if order == "names, units" else -1]
     head = [*(settings if order == "units, names" else []), *head]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        record = read(
-            tmp_path_factory.getbasetemp(), lines(*(f"{line}{comma}" for line in head), *ROWS)
-        )
-    assert record.sha256 == read(tmp_path_factory.getbasetemp(), GOOD).sha256
+    record = read(folder, lines(*(f"{line}{comma}" for line in head), *ROWS))
+    assert record.sha256 == read(folder, GOOD).sha256
 
 
 UNIT_ROWS = {"time": ["s", "ms"], "voltage": ["V", "mV"], "displacement": ["um", "\u00b5m", "nm"]}
 
 
+@quiet
 @given(
     rows=st.lists(
         st.tuples(*map(st.sampled_from, UNIT_ROWS.values())).map(list), min_size=2, max_size=3
@@ -324,11 +315,7 @@ UNIT_ROWS = {"time": ["s", "ms"], "voltage": ["V", "mV"], "displacement": ["um",
     said=st.sampled_from([{}, {"time": "s", "voltage": "V", "displacement": "um"}]),
 )
 def test_rows_of_units_that_contradict_are_asked_for(
-    tmp_path_factory: pytest.TempPathFactory,
-    rows: list[list[str]],
-    place: int,
-    left_out: set[int],
-    said: dict[str, str],
+    folder: Path, rows: list[list[str]], place: int, left_out: set[int], said: dict[str, str]
 ) -> None:
     """Wherever the names are among them: nothing but what differs, unless the user has said it.
 
@@ -338,25 +325,23 @@ def test_rows_of_units_that_contradict_are_asked_for(
         rows[0][column] = ""
     head = [",".join(row) for row in rows]
     head.insert(min(place, len(rows)), "time,voltage,displacement")
-    path = tmp_path_factory.getbasetemp() / "rows.csv"
+    path = folder / "rows.csv"
     path.write_text(lines(*head, *ROWS), encoding="utf-8")
     alike = [{cell.replace("\u00b5", "u") for cell in c} - {""} for c in zip(*rows, strict=True)]
     asked = [q for q, units in zip(UNIT_ROWS, alike, strict=True) if len(units) > 1]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        if asked and not said:
-            with pytest.raises(ColumnsError) as caught:
-                read_record(path)
-            assert asked == list(caught.value.guess["units"])
-            return
-        record = read_record(path, units=said)
+    if asked and not said:
+        with pytest.raises(ColumnsError) as caught:
+            read_record(path)
+        assert asked == list(caught.value.guess["units"])
+        return
+    record = read_record(path, units=said)
     taken = said or {q: units.pop() for q, units in zip(UNIT_ROWS, alike, strict=True)}
-    expected = read_record(_good(tmp_path_factory), units=taken)
+    expected = read_record(_good(folder), units=taken)
     assert record.sha256 == expected.sha256
 
 
-def _good(factory: pytest.TempPathFactory) -> Path:
-    path = factory.getbasetemp() / "good.csv"
+def _good(folder: Path) -> Path:
+    path = folder / "good.csv"
     path.write_text(lines("time,voltage,displacement", *ROWS), encoding="utf-8")
     return path
 
@@ -413,9 +398,7 @@ def test_a_cell_without_a_number_is_a_missing_reading_but_no_time_or_voltage(
     word=st.from_regex("[A-Z#<>*][A-Za-z0-9*/! -]{0,9}|-{1,5}", fullmatch=True),
     where=st.sets(st.integers(0, len(ROWS) - 1), min_size=1, max_size=len(ROWS) // 2 - 1),
 )
-def test_words_are_missing_readings_and_are_said(
-    tmp_path_factory: pytest.TempPathFactory, word: str, where: set[int]
-) -> None:
+def test_words_are_missing_readings_and_are_said(folder: Path, word: str, where: set[int]) -> None:
     # Numbers to Python, or missing to pandas.
     assume(word.strip().lower().lstrip("-") not in ("inf", "infinity", "na", "nan", "none", "null"))
     rows = [
@@ -424,7 +407,7 @@ def test_words_are_missing_readings_and_are_said(
     ]
     line = rf"record.csv:{2 + min(where)}: displacement_um: .*: {len(where)} cells? without"
     with pytest.warns(InputWarning, match=line):
-        record = read(tmp_path_factory.mktemp("words"), lines(HEADER, *rows))
+        record = read(folder, lines(HEADER, *rows))
     assert sorted(where) == np.flatnonzero(~record.has_reading).tolist()
 
 
@@ -444,6 +427,7 @@ def test_a_text_packed_by_gzip_is_the_text(tmp_path: Path) -> None:
     assert "damaged" in fault(tmp_path, gzip.compress(GOOD.encode())[:-20])
 
 
+@quiet
 @given(
     separator=st.sampled_from([";", "\t", "|", ","]),
     empty=st.lists(st.integers(0, 3), min_size=1, max_size=6),
@@ -451,11 +435,7 @@ def test_a_text_packed_by_gzip_is_the_text(tmp_path: Path) -> None:
     commas=st.booleans(),
 )
 def test_empty_columns_are_none(
-    tmp_path_factory: pytest.TempPathFactory,
-    separator: str,
-    empty: list[int],
-    names: str,
-    commas: bool,
+    folder: Path, separator: str, empty: list[int], names: str, commas: bool
 ) -> None:
     """However many there are, and wherever: names and units stay above their numbers."""
     rows = [row.split(",") for row in (names, *ROWS)]
@@ -464,10 +444,8 @@ def test_empty_columns_are_none(
     for position in empty:
         rows = [[*row[:position], "", *row[position:]] for row in rows]
     text = lines(*(separator.join(row) for row in rows))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        record = read(tmp_path_factory.getbasetemp(), text)
-        good = read(tmp_path_factory.getbasetemp(), GOOD)
+    record = read(folder, text)
+    good = read(folder, GOOD)
     assert record.sha256 == good.sha256
 
 

@@ -129,12 +129,7 @@ def test_impossible_values_are_named_in_one_line(build: Callable[[], object], na
 
 
 @pytest.mark.parametrize(
-    "carrier",
-    [
-        Sine(1.0, 50.0),
-        Triangle(1.0, 50.0),
-        Staircase((0.0, 1.0), dwell=0.01),
-    ],
+    "carrier", [Sine(1.0, 50.0), Triangle(1.0, 50.0), Staircase((0.0, 1.0), dwell=0.01)]
 )
 def test_sampling_at_twice_the_highest_frequency_is_refused(carrier: Carrier) -> None:
     wave = Waveform(carrier, duration=1.0)

@@ -34,7 +34,7 @@ FORMATS = {
 @example("duration", 0.25, 0.99999, False)  # beyond a day
 @example("date", 1e-5, 0.0, True)
 def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
-    tmp_path_factory: pytest.TempPathFactory, shown: str, dt: float, start: float, by_python: bool
+    folder: Path, shown: str, dt: float, start: float, by_python: bool
 ) -> None:
     """As 15 digits of days, or as openpyxl writes Python's times; both far below 1 ms."""
     # Of a date 15 digits of days are 9 us.
@@ -48,7 +48,7 @@ def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
         value = (EPOCH + delta if shown == "date" else delta) if by_python else days
         book.active.append([value, v, d])
         book.active.cell(i + 2, 1).number_format = FORMATS[shown]
-    path = tmp_path_factory.getbasetemp() / "times.xlsx"
+    path = folder / "times.xlsx"
     book.save(path)
     record = read_record(path)
     assert record.interval == pytest.approx(dt, rel=1e-9)
