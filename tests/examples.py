@@ -26,8 +26,7 @@ from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
 from bwbayes.report.figures import picture_of
 from bwbayes.report.page import NO_PLOTS
 from tests.app import small
-from tests.app.specimens import CONFIG, specimens
-from tests.app.specimens import record as specimen
+from tests.app.specimens import CONFIG, record as specimen, specimens
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -27,6 +27,7 @@ from bwbayes.report.report import (
     Banner,
     Facts,
     Figure,
+    Kind as BannerKind,
     Picture,
     Product,
     Report,
@@ -35,9 +36,6 @@ from bwbayes.report.report import (
     kind_of,
     remarks_banner,
     standing_banner,
-)
-from bwbayes.report.report import (
-    Kind as BannerKind,
 )
 from bwbayes.shown import brief
 

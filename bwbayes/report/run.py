@@ -15,8 +15,7 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.prediction.bands import Bands
 from bwbayes.report import tables
 from bwbayes.report.calibration import outcome
-from bwbayes.report.figures.pictures import Pictures
-from bwbayes.report.figures.pictures import pictures as all_pictures
+from bwbayes.report.figures.pictures import Pictures, pictures as all_pictures
 from bwbayes.report.figures.style import title
 from bwbayes.report.report import (
     Banner,

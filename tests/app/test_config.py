@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.app.config.config import dump, is_config, load, parse
 from bwbayes.app.config.keywords import config_of, models_of

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.control.gains import ANGLES, Gains, Margins, Robustness, design, margins
 from bwbayes.control.sampled import SampledModel

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.control.codegen import c_functions, to_ascii
 from bwbayes.errors import InputError

@@ -10,8 +10,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from bwbayes.diagnosis import explanations, model
-from bwbayes.diagnosis import residual_analysis as scenes
+from bwbayes.diagnosis import explanations, model, residual_analysis as scenes
 from bwbayes.diagnosis.defects import DEFECTS, LONG_DELAY
 from bwbayes.diagnosis.explanations import (
     LIMIT,

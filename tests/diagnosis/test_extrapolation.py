@@ -5,8 +5,7 @@ False alarms: none in 100 drives of the fitted kind, with noise and other sampli
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited

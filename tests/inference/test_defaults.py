@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.defaults import join_ranges, ranges_of, rounding_sd
@@ -14,8 +13,7 @@ from bwbayes.model.declaration import Ranges
 from bwbayes.model.distributions import Distribution
 from bwbayes.model.inputs import Inputs
 from bwbayes.record.teststand import RingBender
-from tests.declared import NAMES as EVERY
-from tests.declared import context, declared, joint, parameter
+from tests.declared import NAMES as EVERY, context, declared, joint, parameter
 
 NAMES = tuple(name for name in EVERY if name not in ("mass", "stiffness", "exponent"))
 HYSTERESIS = ("d", "alpha", "beta", "gamma", "exponent", "initial")

@@ -14,8 +14,7 @@ from typing import NamedTuple, cast
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError

@@ -13,8 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bwbayes.inference import map_estimate as pointfit
-from bwbayes.inference import voltage_noise
+from bwbayes.inference import map_estimate as pointfit, voltage_noise
 from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.record.voltage_path import estimate_path
 from tests.inference.problems import decaying_sine, short_posterior

@@ -8,8 +8,7 @@ from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-from bwbayes.population import normal as normal_module
-from bwbayes.population import population as module
+from bwbayes.population import normal as normal_module, population as module
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
 from bwbayes.population.population import PopulationParameter, next_specimen, population
 from bwbayes.population.specimen import Specimen, likelihoods, shared, specimen_of

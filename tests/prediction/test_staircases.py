@@ -12,8 +12,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.importance import MIN_EFFECTIVE, resample

@@ -14,8 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record

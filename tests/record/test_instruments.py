@@ -8,8 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record

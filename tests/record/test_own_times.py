@@ -11,8 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from nptdms import ChannelObject, TdmsWriter
 
 from bwbayes.errors import InputError, InputWarning

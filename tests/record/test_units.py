@@ -1,7 +1,6 @@
 """Units as names of columns, users and data sheets write them."""
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.record.io.units import scale_of, unit_in
 

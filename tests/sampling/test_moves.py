@@ -12,8 +12,7 @@ import emcee
 import numpy as np
 import pytest
 from emcee.moves import DEMove, Move
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.moves import (

@@ -54,8 +54,7 @@ def calibrate(
     with working():
         from bwbayes.app.config.config import load
         from bwbayes.app.fit.calls import open_converged
-        from bwbayes.app.jobs.calibrate import calibrate as calibrate_run
-        from bwbayes.app.jobs.calibrate import resume, start
+        from bwbayes.app.jobs.calibrate import calibrate as calibrate_run, resume, start
         from bwbayes.app.running.folder import CalibrationFolder
         from bwbayes.report.calibration import calibration_report
 

@@ -34,11 +34,12 @@ if TYPE_CHECKING:
     import xarray
 
     from bwbayes.app.fit.plots import Plots
-    from bwbayes.app.jobs.certificate import budget as budget_fit
-    from bwbayes.app.jobs.certificate import certificate as certificate_fit
-    from bwbayes.app.jobs.control import compensate as compensate_fit
-    from bwbayes.app.jobs.control import export as export_fit
-    from bwbayes.app.jobs.control import track as track_fit
+    from bwbayes.app.jobs.certificate import budget as budget_fit, certificate as certificate_fit
+    from bwbayes.app.jobs.control import (
+        compensate as compensate_fit,
+        export as export_fit,
+        track as track_fit,
+    )
     from bwbayes.app.jobs.design import design as design_fit
     from bwbayes.app.jobs.fit_methods import Scratch, fit_method
     from bwbayes.app.jobs.predict import predict as predict_record

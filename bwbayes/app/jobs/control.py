@@ -29,8 +29,7 @@ from bwbayes.control.gains import Robustness
 from bwbayes.control.loop import LoopNoise, Stand
 from bwbayes.control.predicted import Compensation
 from bwbayes.control.references import SHAPES, Reference, build_reference
-from bwbayes.control.tracking import Tracking
-from bwbayes.control.tracking import track as tracked
+from bwbayes.control.tracking import Tracking, track as tracked
 from bwbayes.diagnosis import extrapolation
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator

@@ -10,8 +10,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
-from bwbayes.record.waveforms import Sine, Waveform
-from bwbayes.record.waveforms import signal as named
+from bwbayes.record.waveforms import Sine, Waveform, signal as named
 from bwbayes.report.outputs import refuse_existing, write_summary
 
 
