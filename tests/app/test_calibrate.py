@@ -199,9 +199,6 @@ def test_unconverged_replicates_are_counted_and_end_with_status_four(
     assert "replicates 0, 1" in page
 
 
-# Of a run
-
-
 @pytest.mark.usefixtures("_without_pictures")
 def test_run_is_calibrated_in_its_folder_and_its_report_says_so(
     bwbayes: Type, copy: RunFolder
@@ -243,9 +240,6 @@ def test_run_that_fails_its_calibration_says_so_and_ends_with_status_four(
     assert "CALIBRATION FAILED: 1 of 1 replicates did not converge" in said.err
     page = (copy.path / "report.html").read_text(encoding="utf-8")
     assert "Calibration: CALIBRATION FAILED" in page
-
-
-# Bad input
 
 
 @pytest.mark.parametrize(

@@ -249,9 +249,6 @@ def test_existing_run_is_kept_with_a_hint(bwbayes: Type, tmp_path: Path) -> None
     assert before == folder.config.read_bytes()
 
 
-# A prediction leaves bands, scores and a picture, says what does not hold, replaces nothing
-
-
 @pytest.fixture
 def record(run: Path) -> Record:
     return read_record(run / "records/sine.h5")

@@ -76,9 +76,6 @@ def stopped(folder: Path, steps: int = 25) -> Run:
     return made.with_cache(outcome=outcome, kept={})
 
 
-# Arrays to bands
-
-
 def test_draws_and_summary_are_labeled_and_agree(fit: Run) -> None:
     assert ("chain", "draw") == tuple(fit.draws.sizes)
     table = fit.summary
@@ -99,9 +96,6 @@ def test_residuals_are_the_readings_less_the_bands_mean(fit: Run) -> None:
         expected = record.displacement[window] - fit.bands[name].mean
         np.testing.assert_array_equal(expected, residuals.values[window])
     np.testing.assert_array_equal(record.time, residuals.time)
-
-
-# What it shows
 
 
 def test_a_terminal_sees_a_table_and_a_notebook_html(fit: Run) -> None:
@@ -139,9 +133,6 @@ def test_every_figure_is_one_of_matplotlib(opened: Run) -> None:
     fit = opened
     with pytest.raises(bw.InputError, match=r"plot: no 'heldout' here; did you mean held-out\?"):
         fit.plot.bands("heldout")
-
-
-# One format, one path
 
 
 @pytest.mark.usefixtures("_without_pictures")
@@ -183,9 +174,6 @@ def test_a_prediction_is_the_command_lines(
     small.typed(cli, "predict", folder, "--record", copy, "--from-rest", "--out", out, *words)
     write_bands(tmp_path / "ours.csv", [opened.predict(copy, from_rest=True, **options)])
     assert out.read_bytes() == (tmp_path / "ours.csv").read_bytes()
-
-
-# Without convergence
 
 
 @pytest.mark.filterwarnings("ignore::bwbayes.InputWarning")
@@ -280,9 +268,6 @@ def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     assert [] == list(tmp_path.iterdir())
 
 
-# Remarks are warnings, at the line that asked
-
-
 def test_remarks_of_the_record_are_warnings(
     record: Record, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -318,9 +303,6 @@ def test_what_is_no_record_is_not_predicted(opened: Run) -> None:
     array: Any = np.zeros(20)
     with pytest.raises(bw.InputError, match="ndarray is no record; give a file, or "):
         opened.predict(array)
-
-
-# Keys
 
 
 @pytest.fixture

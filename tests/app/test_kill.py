@@ -240,9 +240,6 @@ def test_request_to_stop_ends_in_order(
         fitted.open_finished(RunFolder(folder))
 
 
-# Slow
-
-
 @pytest.mark.slow
 def test_kills_at_random_end_in_the_same_bits(run: Path, tmp_path: Path) -> None:
     """Each run is killed some ten times, wherever it is then, on its way to its end."""

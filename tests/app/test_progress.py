@@ -109,9 +109,6 @@ def test_each_step_after_the_sampling_counts_down_by_itself(
     ] == console.export_text().splitlines()
 
 
-# Where nothing else is new, a terminal says for how long
-
-
 def test_a_terminal_says_for_how_long_a_step_takes_by_itself() -> None:
     """Once a second brings nothing new, and not before; a moment later the line is gone."""
     screen = StringIO()
@@ -203,9 +200,6 @@ def test_every_command_that_takes_its_time_has_a_line_on_a_terminal(
 
 def again(command: str) -> tuple[str, ...]:
     return () if command in ("init", "check", "report") else ("--overwrite",)
-
-
-# Every step has a name, and tells what share of it is done
 
 
 JOBS: dict[str, tuple[str, tuple[object, ...], dict[str, object], tuple[str, ...]]] = {

@@ -106,9 +106,6 @@ def test_the_only_motion_of_a_step_or_ramp_is_fitted(
     assert sum(np.ptp(window) for window in inside) > 40
 
 
-# What is wrong
-
-
 def _turned(displacement: FloatArray) -> None:
     displacement *= -1
 
@@ -214,9 +211,6 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     assert problem.record.displacement is not None
     np.testing.assert_allclose(problem.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
     assert () == problem.findings["record"]
-
-
-# The commands
 
 
 def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write) -> None:

@@ -21,8 +21,6 @@ from bwbayes.sampling import sampler
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 
-# What a run leaves
-
 
 def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run: Path) -> None:
     """Of each draw it is that of all readings; with the log prior it makes the log density."""
@@ -43,9 +41,6 @@ def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run:
         expected = posterior.log_likelihood(posterior.prior.theta(free))
         np.testing.assert_allclose(found.values[[0, 20, 71], 3], expected, rtol=0, atol=1e-6)
         assert found.shape == tree["sample_stats"].to_dataset()["lp"].shape
-
-
-# The same bits, in however many pieces
 
 
 @pytest.mark.usefixtures("_without_pictures")
@@ -112,9 +107,6 @@ def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
     odd = replace(fit.problem, defaults={**fit.problem.defaults, "d": nanometres})
     (remark,) = open_finished(folder).with_cache(problem=odd, outcome=outcome, kept={}).remarks
     assert "Fix: check its unit" in remark
-
-
-# A run remembers its engine
 
 
 def test_another_engine_is_refused_unless_asked_for(copy: RunFolder) -> None:

@@ -103,9 +103,6 @@ def test_larger_budget_converges_to_what_it_would_have_been(
     small.assert_same_end(run, made.path)
 
 
-# Hard cases
-
-
 def not_a_number(_: Posterior, theta: FloatArray) -> FloatArray:
     return np.full(len(theta), np.nan)
 

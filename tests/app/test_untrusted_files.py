@@ -29,8 +29,6 @@ from tests.app import example
 from tests.app.mutations import QUICK, good_arrays, stored
 from tests.sampling.chains import finish, new
 
-# Code in data files
-
 
 class Payload:
     """Makes a folder when it is unpickled."""
@@ -180,8 +178,6 @@ def test_a_run_loads_no_code_while_it_reads(tmp_path: Path) -> None:
         listening[0] = False
 
 
-# Texts in the page and on the screen
-
 PAYLOADS = (
     "<script>alert(1)</script>",
     "</title><img src=x onerror=alert(1)>",
@@ -248,9 +244,6 @@ def test_texts_on_the_screen_are_what_they_are(text: str) -> None:
     # A long one may go on in the next line.
     shown = " ".join(as_text(report, width=500).split())
     assert " ".join(text.partition("\0")[0].split()) in shown
-
-
-# Names and paths
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,6 @@ def _text(
     TEXTS[name] = write
 
 
-# Programs
-
 _text(
     "Excel, German, cp1252, preamble",
     [
@@ -202,8 +200,6 @@ _text(
     file="a.itx",
 )
 
-# Oscilloscopes and recorders
-
 # With an empty line; the sensor's is a voltage.
 _text(
     "oscilloscope, units in brackets",
@@ -298,8 +294,6 @@ _text(
     (named("2", "3"), BOTH, 200.0),
 )
 
-# Loggers
-
 _MOMENTS = pd.Timestamp("2026-03-03T11:59:59") + pd.to_timedelta(np.rint(1e3 * TIME), unit="ms")
 _text(
     "logger with dates",
@@ -334,8 +328,6 @@ _text(
     ],
     _rows(COLUMNS, "\t"),
 )
-
-# Controllers and sensors
 
 _text(
     "data recorder of PI",

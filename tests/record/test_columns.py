@@ -315,9 +315,6 @@ def test_a_number_is_that_of_a_column_whatever_the_names_are(order: list[str]) -
         Naming({"displacement": 1.5})  # type: ignore[dict-item]
 
 
-# Names and units
-
-
 @given(
     st.floats(1e-9, 1e9),
     st.sampled_from(["{:.17g} {}", "-{:.17e}{}", "{:.17f}  {}"]),
@@ -351,9 +348,6 @@ def test_a_sensitivity_per_volt_is_not_taken_for_one_per_millivolt() -> None:
 def test_a_number_without_a_unit_or_with_a_strange_one_is_refused(unit: str) -> None:
     with pytest.raises(InputError, match=r"is unknown; write um, .* as '0.35 um'"):
         Record.from_arrays(VOLTAGE, DISPLACEMENT, interval=0.01, units={"displacement": unit})
-
-
-# Arrays and tables
 
 
 @pytest.mark.parametrize(("second", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6)])
