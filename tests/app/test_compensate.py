@@ -14,6 +14,8 @@ from bwbayes.control.references import build_reference
 from bwbayes.errors import InputError
 from tests.app.conftest import Type
 
+SINE = {"amplitude": 1.0, "frequency": 1.0}
+
 
 @pytest.mark.filterwarnings(
     "ignore:the reference is smoothed", "ignore:between samples", "ignore:voltage and last reversal"
@@ -104,21 +106,13 @@ def test_a_limit_that_is_not_kept_is_no_success(
         ("sine", {"amplitude": "much", "frequency": 1.0}, "sine: amplitude 'much'; must be a num"),
         (None, {}, "reference: NoneType is none; give one of sine, triangle"),
         ([0.0, 1.0] * 10, {"amplitude": 1.0}, "displacements take no amplitude; leave it out, or"),
-        (
-            build_reference("sine", 0.02, 1.0, 1.0),
-            {"smoothed": 0.1},
-            "made already takes no smoothed",
-        ),
-        (
-            build_reference("sine", 0.02, 40.0, 10.0),
-            {"slew": 500.0},
-            "it is faster than the amplifier's",
-        ),
+        (build_reference("sine", 0.02, 1.0, 1.0), {"smoothed": 0.1}, "already takes no smoothed"),
+        (build_reference("sine", 0.02, 40.0, 10.0), {"slew": 500.0}, "faster than the amplifier's"),
         ([0.0, *[900.0] * 49], {}, "on it is beyond the amplifier's"),
         ("sine", {"amplitud": 1.0}, "compensate: amplitud is unknown; did you mean amplitude?"),
         (
             "sine",
-            {"amplitude": 1.0, "frequency": 1.0, "command": "best"},
+            {**SINE, "command": "best"},
             "command: 'best' is unknown; known are mean, expected",
         ),
     ],

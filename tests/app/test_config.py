@@ -15,6 +15,7 @@ from bwbayes.errors import InputError
 from bwbayes.record.record import Record
 
 RECORD = '[record]\nfile = "record.csv"\n'
+SIGNAL = "[record]\nsignal = {duration = 1.0, "
 
 
 def refused(text: str) -> str:
@@ -31,17 +32,11 @@ def refused(text: str) -> str:
     [
         ("sead = 1\n" + RECORD, "sead: unknown key; did you mean seed?"),
         ('[recrod]\nfile = "a.csv"\n', "recrod: unknown key; did you mean record?"),
+        ("[record]\nsignal = {amplitud = 1.0}", "signal.amplitud: unknown key; did you mean ampl"),
+        (RECORD + "[parameters.d]\nfixd = 1.0", "d.fixd: unknown key; did you mean fixed?"),
         (
-            "[record]\nsignal = {amplitud = 1.0}",
-            "signal.amplitud: unknown key; did you mean amplitude?",
-        ),
-        (
-            RECORD + "[parameters.d]\nfixd = 1.0",
-            "d.fixd: unknown key; did you mean fixed?",
-        ),
-        (
-            RECORD + "[validation.a]\nsignal = {amplitude = 1.0, frequncy = 1.0, duration = 1.0}",
-            "validation.a.signal.frequncy: unknown key; did you mean frequency?",
+            RECORD + "[validation.a]\nsignal = {frequncy = 1.0}",
+            "a.signal.frequncy: unknown key; did",
         ),
         (RECORD + "[sampling]\ndraws = 100", "sampling.draws: unknown key; did you mean ess?"),
         (RECORD + "xyzzy = 1", "record.xyzzy: unknown key; known are file, signal, voltage_is, "),
@@ -51,26 +46,20 @@ def refused(text: str) -> str:
         (RECORD + "[parameters.d]\nprior = 3", "prior: write a table like { distribution"),
         ("record = 3", "record: is not a table; known keys are file, signal"),
         ("", "record: is missing"),
+        (RECORD + "signal = 'step10'", "record: give either file or signal; correct it"),
         (
-            '[record]\nfile = "a.csv"\nsignal = "identification"\n',
-            "record: give either file or signal; correct it",
-        ),
-        (
-            RECORD + "[validation.a]\nfile = 'a.csv'\nsignal = 'step10'",
-            "validation.a: give one of window, file and signal; correct",
+            RECORD + "[validation.a]\nfile = 'a'\nsignal = 'step10'",
+            "a: give one of window, file and",
         ),
         (
             RECORD + "[validation.a]\nwindow = [1.0, 2.0]\nlead_in_start = 0.5",
-            "validation.a: lead_in_start is for another record; give file or signal",
+            "is for another record",
         ),
         (RECORD + "[validation.record]\nsignal = 'step10'", "'record' is taken"),
         ("seed = 9223372036854775808\n" + RECORD, "seed"),
         (f"seed = 0x{5000 * 'f'}\n{RECORD}", "seed: "),
         (RECORD + "train = [[0.0, nan]]", "finite"),
-        (
-            RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan, sd = 1.0}",
-            "finite",
-        ),
+        (RECORD + "[parameters.d]\nprior = {distribution = 'normal', mean = nan}", "finite"),
     ],
 )
 def test_hints_are_near_in_meaning_or_all_keys(text: str, hint: str) -> None:
@@ -120,13 +109,9 @@ def test_a_text_is_a_list_of_one(table: str, key: str, text: str) -> None:
         ("seed = '1'\n" + RECORD, "seed"),
         (RECORD + "train = [1.0, 2.0, 3.0]", "record.train"),
         (RECORD + "voltage_is = 'both'", "record.voltage_is"),
+        (f"{SIGNAL}amplitude = -1.0, frequency = 1.0}}", "record.signal.amplitude"),
         (
-            "[record]\nsignal = {amplitude = -1.0, frequency = 1.0, duration = 1.0}",
-            "record.signal.amplitude",
-        ),
-        (
-            "[record]\nsignal = {shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0, "
-            "duration = 1.0}",
+            f"{SIGNAL}shape = 'steps', levels = [1.0], dwell = 1.0, amplitude = 1.0}}",
             "record.signal",
         ),
         (RECORD + "[parameters.d]\nprior = {distribution = 3}", "parameters.d"),

@@ -167,6 +167,7 @@ def test_python_takes_a_list_or_a_dict_of_records(tmp_path: Path) -> None:
 
 
 LONE = '[record.a]\nfile = "a.h5"\n'
+HELD = "[validation.v]\nwindow = [0.0, 1.0]\n"
 
 
 @pytest.mark.parametrize(
@@ -177,13 +178,10 @@ LONE = '[record.a]\nfile = "a.h5"\n'
         (LONE + '[record.training]\nfile = "b.h5"', "the name 'training' of a record is taken"),
         (LONE + '[record.b]\nfile = "b.h5"\n[validation.a]\nfile = "c.h5"', "'a' is taken by a"),
         (
-            LONE + '[record.b]\nfile = "b.h5"\n[validation.v]\nwindow = [0.0, 1.0]',
-            'its window is of one of several records; say of which, of = "a" for instance',
+            LONE + f'[record.b]\nfile = "b.h5"\n{HELD}',
+            'its window is of one .*, of = "a" for instance',
         ),
-        (
-            LONE + '[validation.v]\nof = "b"\nwindow = [0.0, 1.0]',
-            "validation.v.of: no training record 'b'",
-        ),
+        (LONE + f'{HELD}of = "b"', "validation.v.of: no training record 'b'"),
     ],
 )
 def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
@@ -194,29 +192,29 @@ def test_configs_of_several_records_that_say_too_much_or_too_little_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("old", "new", "message"),
     [
         (
-            ("train = [[0.0, 3.0]]", "train = [[9.0, 10.0]]"),
-            r"^record\.loops\.train: window 9 to 10 s: reaches outside the record; choose",
+            "[[0.0, 3.0]]",
+            "[[9.0, 10.0]]",
+            r"^record\.loops\.train: window 9 to 10 s: reaches outside",
         ),
         (
-            ("decimate = 2", "decimate = 2\nstart = 1.0\ntrain = [[0.0, 0.8]]"),
-            r"record\.step\.train: no readings from 0 to 0\.78 s; .* in \[record\.step\]",
+            "decimate = 2",
+            "start = 1.0\ntrain = [[0.0, 0.8]]",
+            r"no readings .* in \[record\.step\]",
         ),
+        ("[model]", "[model]\nper_record = ['creep_1']", "per_record: no part here has 'creep_1'"),
         (
-            ('dynamics = "none"', 'dynamics = "none"\nper_record = ["creep_1"]'),
-            r"model\.per_record: no part here has 'creep_1'",
-        ),
-        (
-            ("gamma = { fixed = 0.0172 }", '"offset[stp]" = { fixed = 0.0 }'),
-            r"parameters\.offset\[stp\]: no such parameter here; did you mean offset\[step\]",
+            "gamma =",
+            '"offset[stp]" =',
+            r"\[stp\]: no such parameter here; did you mean offset\[step",
         ),
     ],
 )
-def test_what_several_records_cannot_be_is_refused(change: tuple[str, str], message: str) -> None:
+def test_what_several_records_cannot_be_is_refused(old: str, new: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        problem(change)
+        problem((old, new))
 
 
 def test_readings_do_not_count_twice(tmp_path: Path) -> None:
