@@ -77,7 +77,7 @@ def test_each_command_takes_its_lines() -> None:
 RUN_HERE = [line for line in COMMANDS if line not in PATTERNS + FIRST and not elsewhere(line)]
 
 # The first line of each command that is neither among those of a first record, nor takes long and
-# is run by ``app/test_track.py`` and ``app/test_campaign.py``.
+# is run by ``app/test_control.py`` and ``app/test_campaign.py``.
 QUICK_LINES = {line.split()[1]: line for line in reversed(RUN_HERE)}
 for name in (*(line.split()[1] for line in FIRST), "track", "campaign"):
     QUICK_LINES.pop(name, None)
