@@ -30,7 +30,6 @@ def build(folder: Path) -> None:
 
 
 def every_module() -> Iterator[ModuleType]:
-    """Import all modules of the package."""
     for module in walk_packages(bwbayes.__path__, "bwbayes."):
         yield import_module(module.name)
 

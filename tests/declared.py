@@ -26,7 +26,6 @@ def declared(name: str) -> Declaration:
 def parameter(
     name: str, known: Distribution | float, lower: float | None = None, upper: float | None = None
 ) -> Parameter:
-    """Return a declared parameter with a prior or a fixed value, and bounds."""
     one = Parameter.of(declared(name), known)
     return replace(
         one,
@@ -36,7 +35,6 @@ def parameter(
 
 
 def joint(parameters: list[Parameter], *, passive: bool = True) -> JointPrior:
-    """Return a joint prior with Bouc-Wen's constraints."""
     own = {d.name: d for d in BoucWen(passive).parameters}
     every = [replace(p, declared=own.get(p.name, p.declared)) for p in parameters]
     return JointPrior(every, BoucWen(passive).holds)
@@ -45,6 +43,5 @@ def joint(parameters: list[Parameter], *, passive: bool = True) -> JointPrior:
 def context(
     ranges: Ranges, exponent: float | Distribution = 1.0, stiffness: float | None = None
 ) -> Context:
-    """Return what default priors may know."""
     stated: dict[str, float | Distribution] = {"exponent": exponent}
     return Context(ranges, stated if stiffness is None else stated | {"stiffness": stiffness})

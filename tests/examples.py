@@ -95,7 +95,6 @@ def guides() -> dict[str, str]:
 
 
 def blocks(language: str, text: str = README) -> list[str]:
-    """Return a text's blocks of a language."""
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
@@ -173,7 +172,6 @@ def with_files(line: str, folder: Path, run: Path) -> None:
 
 
 def shorter(text: str) -> str:
-    """Return a text with what takes long replaced."""
     for long, short in SHORTER.items():
         text = text.replace(long, short)
     return text
@@ -210,7 +208,6 @@ def typed(line: str) -> str:
 
 
 def _changes() -> dict[Path, tuple[int, int]]:
-    """Return size and time of the last change of every file here."""
     files = [path for path in Path().rglob("*") if path.is_file()]
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 

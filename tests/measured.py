@@ -30,7 +30,6 @@ REDUCE: dict[str, Callable[[list[float]], list[float]]] = {
 
 
 def measured() -> dict[str, Any]:
-    """Return all figures, by promise."""
     figures: dict[str, Any] = json.loads(PATH.read_text(encoding="utf-8"))
     return figures
 
@@ -45,7 +44,6 @@ def keep(promise: str, figures: Mapping[str, Any]) -> None:
 
 
 def figures(*expressions: str) -> list[float]:
-    """Return the numbers of expressions, one expression after the other."""
     return [value for expression in expressions for value in _figures(expression)]
 
 
@@ -84,7 +82,6 @@ LEAVES = {
 
 
 def numbers(text: str) -> list[str]:
-    """Return the numbers of a text, as they are printed."""
     return [number.rstrip(",") for number in NUMBER.findall(text)]
 
 

@@ -16,7 +16,6 @@ print(status["VmHWM"].split()[0])
 
 
 def peak(script: str, *arguments: object) -> int:
-    """Run a script in a new process, and return its largest memory, bytes."""
     done = subprocess.run(
         [sys.executable, "-c", script + LARGEST, *map(str, arguments)],
         stdout=subprocess.PIPE,

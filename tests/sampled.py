@@ -16,7 +16,6 @@ from bwbayes.sampling.sampler import init_chain, sample
 
 
 def sampled(problem: Problem, workers: int = 1) -> tuple[SamplingResult, Chain]:
-    """Return how the sampling of a problem ended, and the chain."""
     posterior, seed = problem.posterior, problem.config.seed
     with one_thread(), open_executor(workers, posterior.engine) as pool:
         point = pointfit.fit(posterior, generator(seed, "point fit"))

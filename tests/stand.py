@@ -29,7 +29,6 @@ def autoregressive(
 
 
 def play(values: FloatArray, threshold: float) -> FloatArray:
-    """Follow values with play, from zero."""
     followed, reached = np.empty_like(values), 0.0
     for number, value in enumerate(values.tolist()):
         reached = min(max(reached, value - threshold), value + threshold)

@@ -52,7 +52,6 @@ FULL = 500
 
 
 def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
-    """Return the config's problem; parameters are fixed at, or given, something else."""
     config = load(CONFIG)
     medians = {"d": 0.7, "alpha": 0.35, "beta": 0.03, "gamma": 0.0, "lag": 0.03, "offset": 0.0}
     lines = [f"{name} = {{ fixed = {medians[name]} }}" for name in fixed]

@@ -170,7 +170,6 @@ def band_limit(bands: int, count: int) -> float:
 
 
 def calibrated(variant: Variant, folder: Path, count: int) -> Sound:
-    """Make the first replicates of a variant."""
     common = typical_experiment(variant, folder)
     return common, made(common, count)
 
@@ -181,7 +180,6 @@ def remarks(outcome: Calibration) -> list[str]:
 
 
 def figures(common: CalibrationSetup, every: list[Replicate]) -> dict[str, Any]:
-    """Return what is kept of a calibration."""
     outcome = evaluate_calibration([one.entry for one in every], np.random.default_rng(SEED))
     ranked = [one for one in every if len(one.draws)]
     return {

@@ -86,7 +86,6 @@ MALFORMED = {
 
 
 def truths() -> dict[str, dict[str, float]]:
-    """Draw the specimens' parameters."""
     generator = np.random.default_rng(11)
     return {
         f"s{number:03d}": {

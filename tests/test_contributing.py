@@ -46,7 +46,6 @@ TEXT = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encod
 
 
 def example(name: str) -> str:
-    """Return the code of an example."""
     found = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", TEXT, re.DOTALL)
     assert found is not None
     return found[1]

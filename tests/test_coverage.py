@@ -40,7 +40,6 @@ class Replicate:
 
 
 def replicate(seed: int, discrepancy: str) -> Replicate:
-    """Simulate, fit and predict, by the same path as a run."""
     text = CONFIG.read_text(encoding="utf-8").replace(
         'discrepancy = "process"', f'discrepancy = "{discrepancy}"'
     )

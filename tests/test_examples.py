@@ -47,7 +47,6 @@ ELSEWHERE = {
 
 @pytest.fixture
 def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Go to an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -38,7 +38,6 @@ ESS = 500
 
 
 def run(folder: Path, config: Path, statuses: tuple[int, ...] = (0,)) -> Any:
-    """Run a config on the measured record and return its summary."""
     argv = ["bwbayes", "run", str(config), "--record", str(RECORD), "--out", str(folder), "--quiet"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", argv)
@@ -64,7 +63,6 @@ def honest(folder: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def white(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Run the same with white noise alone."""
     folder = tmp_path_factory.mktemp("white")
     start = PLAIN.index("[parameters.discrepancy_time]")
     text = PLAIN[:start] + PLAIN[PLAIN.index("[sampling]") :]

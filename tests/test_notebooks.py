@@ -28,7 +28,6 @@ every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: pat
 
 
 def outputs_as_text(outputs: list[Any]) -> str:
-    """All outputs but the pictures."""
     parts = []
     for output in outputs:
         parts.append(output.get("text", ""))

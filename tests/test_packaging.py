@@ -43,7 +43,6 @@ def done(*command: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the sdist."""
     folder = tmp_path_factory.mktemp("sdist")
     code = (
         f"import hatchling.build as b, os; os.chdir({str(ROOT)!r}); b.build_sdist({str(folder)!r})"
@@ -55,7 +54,6 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(sdist: Path) -> Path:
-    """Build the wheel from the sdist, as a package index would."""
     with tarfile.open(sdist) as archive:
         archive.extractall(sdist.parent, filter="data")
     (source,) = (path for path in sdist.parent.iterdir() if path.is_dir())

@@ -124,7 +124,6 @@ def test_what_the_map_names_exists() -> None:
 
 
 def completion(instruction: str, **environment: str) -> str:
-    """Return what the command prints for a shell."""
     done = subprocess.run(
         [Path(sys.executable).with_name("bwbayes")],
         env={**os.environ, "_BWBAYES_COMPLETE": instruction, **environment},

@@ -27,7 +27,6 @@ FALSE_ALARM = 0.01
 
 
 def measured(seed: int, seconds: float = 16.0) -> Record:
-    """Return a record of a decaying sine that was cut out in motion."""
     time = np.arange(round((seconds + 1.1) * RATE)) / RATE
     voltage = 100 * np.sin(2 * np.pi * time) * (1 - 0.5 * time / time[-1])
     return STAND.measure(voltage, np.random.default_rng([21, seed]), cut=110)

@@ -30,7 +30,6 @@ RECORDS = 40
 
 
 def steady_sine(seed: int, folder: Path) -> Problem:
-    """Simulate a record and put the default config's problem together."""
     voltage = 150 * np.sin(2 * np.pi * np.arange(3 * RATE) / RATE)
     record = STAND.measure(voltage, np.random.default_rng([7, seed]), offset=0.0)
     path = folder / f"sine_{seed}.csv"

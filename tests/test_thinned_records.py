@@ -71,7 +71,6 @@ def drive(time: FloatArray, seconds: float = 3.5) -> FloatArray:
 
 
 def measured(lag: float, seed: int, rate: float = RATE, seconds: float = 3.5) -> Record:
-    """Return a record from rest."""
     voltage = drive(np.arange(round(seconds * rate)) / rate, seconds)
     stand = Stand(lag=lag, memory=0.1, rate=rate)
     return stand.measure(voltage, np.random.default_rng([31, seed]))

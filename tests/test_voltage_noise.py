@@ -52,7 +52,6 @@ class Answer:
 
 
 def records(kind: str, rate: float, seed: int) -> tuple[Record, Record]:
-    """Return a record to fit, and another to predict, with clean voltages."""
     rng = np.random.default_rng([91, seed])
     actuator = Actuator("lag", "first", 1 / rate)
     model = np.array([[TRUTH.get(name, 0.0) for name in actuator.parameters]])
@@ -67,7 +66,6 @@ def records(kind: str, rate: float, seed: int) -> tuple[Record, Record]:
 
 
 def noisy(record: Record, part: float, seed: int) -> Record:
-    """Return a record whose voltage has noise of a part of the range."""
     noise = part * RANGE * np.random.default_rng([92, seed]).standard_normal(record.samples)
     return replace(record, voltage=record.voltage + noise)
 

@@ -34,7 +34,6 @@ LENGTHS = dict.fromkeys(MODELS, (100, 1000, 10000)) | {"bouc-wen": (100, 1_000, 
 
 
 def measured_on(drive: Waveform, rate: float) -> Record:
-    """Measure a drive on the stand."""
     stand = VirtualTestStand(discrepancy="none", sample_rate=rate)
     return stand.run(drive, np.random.default_rng(1))
 

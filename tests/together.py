@@ -25,7 +25,6 @@ Plant = Callable[[FloatArray], FloatArray]
 
 
 def made(common: CalibrationSetup, count: int, seed: int = SEED) -> list[Replicate]:
-    """Make so many replicates, on one thread."""
     with one_thread():
         return [replicate(common, seed, number) for number in range(count)]
 
@@ -56,7 +55,6 @@ def narrowed(draws: FloatArray, by: float = 0.2) -> FloatArray:
 
 
 def shifted(draws: FloatArray, sds: float = 0.3) -> FloatArray:
-    """Put a bias of so many sds on every coordinate."""
     return draws + sds * np.std(draws, axis=0)
 
 

@@ -28,7 +28,6 @@ POPULATION = {"d": (0.7, 0.05), "alpha": (0.35, 0.1), "beta": (0.03, 0.1), "lag"
 
 
 def written(folder: Path, count: int) -> None:
-    """Write the records of so many actuators of the population."""
     folder.mkdir()
     config, source = load(CONFIG), np.random.default_rng(5)
     model = config.stand.model.model_copy(update={"dynamics": "lag"})

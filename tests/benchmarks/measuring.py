@@ -24,7 +24,6 @@ class Cost(NamedTuple):
 
 
 def timed(call: Call) -> Cost:
-    """Return what one call costs."""
     wall, cpu = time.perf_counter(), cpu_time()
     call()
     return Cost(time.perf_counter() - wall, cpu_time() - cpu)

@@ -80,7 +80,6 @@ def our_run(problem: Problem) -> Run:
 
 
 def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
-    """Move an ensemble by emcee's default move."""
     return advance(posterior, [state], [{"stretch": (StretchMove(), 1.0)}], steps)[0]
 
 

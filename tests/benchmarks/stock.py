@@ -58,5 +58,4 @@ class StockPosterior(Posterior):
 
 
 def stock(posterior: Posterior) -> StockPosterior:
-    """Return the same posterior on the stock path."""
     return StockPosterior(**{f.name: getattr(posterior, f.name) for f in fields(posterior)})

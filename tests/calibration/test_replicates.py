@@ -119,7 +119,6 @@ def calibrated(experiment: CalibrationSetup, count: int) -> Calibration:
 
 
 def moved(experiment: CalibrationSetup, shift: float, width: float) -> CalibrationSetup:
-    """Move the draws by so many of their sds, and make these so many times as wide."""
     assert experiment.around is not None
     sampled = experiment.around.draws
     middle = np.mean(sampled, axis=0)

@@ -92,7 +92,6 @@ def test_large_loops_are_told_from_small_ones_and_four_from_one(
 
 
 def both(posterior: Posterior, voltage: FloatArray, reading: FloatArray) -> Posterior:
-    """Return the posterior of the first record and a new one."""
     first, whole = replace(posterior.single_record, name="first"), (slice(0, voltage.size),)
     inputs = replace(first.inputs, voltage=voltage)
     second = replace(first, name="new", inputs=inputs, displacement=reading, training=whole)

@@ -36,7 +36,6 @@ PLAN = SamplingPlan(ess=1000, walkers=24, block=25)
 def estimated(
     posterior: Posterior, plan: SamplingPlan = PLAN, source: np.random.Generator | None = None
 ) -> Evidence:
-    """Draw by the normal path, and estimate."""
     chain = converged(posterior, plan)
     source = source or np.random.default_rng(2)
     return evidence(posterior, draws(posterior, chain), log_densities(chain), source)

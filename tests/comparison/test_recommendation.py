@@ -31,7 +31,6 @@ def model(
     hysteresis: bool = True,
     worth: float = 50.0,
 ) -> Candidate:
-    """Return a converged model with those log scores of one part."""
     parts = {} if scores is None else {FUTURE: Part(scores, 200, worth)}
     evidence = Evidence(log_evidence, 0.02, 0.0, 1000.0, 7.0, log_evidence + 20)
     return Candidate(

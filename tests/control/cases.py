@@ -63,7 +63,6 @@ OTHERS = {
 
 
 def actuator(name: str, hold: Hold = "first", interval: float = 1e-3) -> Actuator:
-    """Return an actuator."""
     hysteresis, dynamics, nonlinearity, creep = ACTUATORS[name]
     return Actuator(dynamics, hold, interval, hysteresis, nonlinearity, creep, SPAN)
 

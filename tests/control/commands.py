@@ -102,7 +102,6 @@ def about(of: Problem, spread: float, count: int, source: np.random.Generator) -
 
 
 def compensated(of: Problem, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
-    """Return the command for a reference of an actuator that starts demagnetized."""
     options = {"from_rest": True, "limits": LIMITS, **options}
     return compensate(of.posterior, flat, asked, np.random.default_rng(7), **options)
 
@@ -190,5 +189,4 @@ def study(name: str, parts: Iterable[Mapping[tuple[str, int], float]]) -> dict[s
 
 
 def rms(error: FloatArray) -> float:
-    """Return the root mean square."""
     return float(np.sqrt(np.mean(error**2)))

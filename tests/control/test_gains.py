@@ -29,7 +29,6 @@ def models(name: str, count: int = 20, interval: float = 1e-3) -> SampledModel:
 
 
 def without_hysteresis(slope: float) -> SampledModel:
-    """Return a gain behind a hold."""
     actuator = Actuator("none", "zero", 1e-3, BoucWen())
     values = {"d": slope, "alpha": 1e-12 * slope, "beta": 1.0, "exponent": 1.0}
     return SampledModel.of(

@@ -34,7 +34,6 @@ VALUES = {
 
 
 def problem(**keys: Any) -> Problem:
-    """Return that of a ring bender driven on one side, whose sensor has an offset."""
     stand = VirtualTestStand("none", 1 / INTERVAL, true={"offset": OFFSET})
     run = stand.run(50 * (1 - np.cos(4 * np.pi * TIME)), np.random.default_rng(1))
     config, records = config_of(run, {"from_rest": True, **keys})

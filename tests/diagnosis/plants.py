@@ -56,7 +56,6 @@ class Plant:
 
 
 def drawn(rng: np.random.Generator) -> Plant:
-    """Draw a good plant."""
     d = float(rng.uniform(0.5, 1.0))
     return Plant(
         d,
@@ -110,7 +109,6 @@ def plays(part: Plant, voltage: FloatArray) -> FloatArray:
 
 
 def lagged(values: FloatArray, time: float) -> FloatArray:
-    """Follow values by a lag, at the fine steps."""
     kept = np.exp(-1 / RATE / FINE / time)
     moved = lfilter([1 - kept], [1.0, -kept], values - values[0])
     return np.asarray(values[0] + moved)
@@ -138,7 +136,6 @@ def limited(values: FloatArray, rate: float) -> FloatArray:
 
 
 def at_actuator(kind: str, fine: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the voltage that the actuator gets, at the fine steps."""
     time = np.arange(fine.size) / RATE / FINE
     fastest = float(np.max(np.abs(np.diff(fine)))) * RATE * FINE
     match kind:

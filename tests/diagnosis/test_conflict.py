@@ -40,7 +40,6 @@ def lognormal(median: float, sigma: float) -> Distribution:
 
 
 def with_prior(name: str, prior: Distribution | float, upper: float = np.inf) -> JointPrior:
-    """Return the default joint prior but for one parameter."""
     known = joint_prior(NAMES, RANGES, {})
     other = parameter(name, prior, upper=upper)
     return joint([other if p.name == name else p for p in known.parameters])

@@ -35,7 +35,6 @@ from tests.stand import Stand
 def scene(
     kind: str, seed: int, folder: Path, seconds: float = 10.0, parameters: str = ""
 ) -> ResidualAnalysis:
-    """Fit the good model to a plant, with some priors stated."""
     (folder / "record.h5").unlink(missing_ok=True)
     write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
     text = f'[record]\nfile = "record.h5"\nfrom_rest = true\n[parameters]\n{parameters}\n'

@@ -25,7 +25,6 @@ def sine(
 
 
 def fitted(voltage: FloatArray, interval: float) -> Posterior:
-    """Return a posterior trained with a drive; only its voltage matters here."""
     return short_posterior(samples=20).altered(
         voltage=voltage,
         displacement=0.5 * voltage,

@@ -63,7 +63,6 @@ def put(records: Sequence[Record], folder: Path) -> None:
 
 
 def shifted(record: Record, delay: float) -> Record:
-    """Move the voltage of a record by so many s."""
     voltage = np.interp(record.time - delay, record.time, record.voltage)
     return replace(record, voltage=voltage)
 

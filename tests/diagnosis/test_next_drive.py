@@ -20,7 +20,6 @@ SEEDS, GOOD = range(5), 100
 
 
 def fitted(kind: str, seed: int, folder: Path) -> tuple[BandValidation, float]:
-    """Return the verdict on a plant's fit, and how much its bands cover of the next record."""
     put(bench(kind, (7, seed)).records, folder)
     source = np.random.default_rng((7, seed))
     judged = judge(problem_of(parse(CONFIG, "config"), folder), source)

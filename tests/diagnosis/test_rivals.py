@@ -85,7 +85,6 @@ class Rivals:
 
 
 def agreeing(*_: object) -> tuple[Rival, ...]:
-    """Return no rival that differs."""
     return ()
 
 

@@ -29,7 +29,6 @@ COVERS, CLOSE = 0.85, 4.0
 
 
 def drive(generator: np.random.Generator, seconds: float) -> FloatArray:
-    """Return a voltage from rest: a sine, which decays to a half or stays as it is."""
     time = np.arange(round(seconds * RATE)) / RATE
     decay = 0.5 * (generator.random() < 0.7)
     frequency = generator.choice([0.5, 1.0, 2.0])
@@ -38,7 +37,6 @@ def drive(generator: np.random.Generator, seconds: float) -> FloatArray:
 
 
 def after(record: Record, first: int, added: FloatArray | float) -> Record:
-    """Add to the readings from a sample on."""
     assert record.displacement is not None
     displacement = record.displacement.copy()
     displacement[first:] += added
@@ -62,7 +60,6 @@ def spikes(generator: np.random.Generator, samples: int) -> FloatArray:
 def spoil(
     kind: str, record: Record, other: Record, half: int, generator: np.random.Generator
 ) -> tuple[Record, Record]:
-    """Spoil the fitted part of a record, the rest of it, or the other record."""
     first, second = record.displacement, other.displacement
     assert first is not None
     assert second is not None
@@ -149,7 +146,6 @@ def made(
 
 
 def right(told: Judged, where: str) -> bool:
-    """Tell whether the answer is right nevertheless."""
     if where != "training":
         return covered(told.bands[where]) >= COVERS
     columns = [(told.column(name), truth) for name, truth in (("d", 0.7), ("gamma", 0.0172))]

@@ -90,7 +90,6 @@ def posterior_of(
     priors: Mapping[str, Distribution] | None = None,
     from_rest: bool = True,
 ) -> Posterior:
-    """Return the posterior with default priors, of a record that starts from rest."""
     model = noise_model(noise, actuator.interval)
     fixed = {"initial": 0.0} if fixed is None else fixed
     inputs = Inputs(voltage, interval=actuator.interval)
@@ -113,7 +112,6 @@ def short_posterior(
     training: tuple[slice, ...] | None = None,
     priors: Mapping[str, Distribution] | None = None,
 ) -> Posterior:
-    """Return the posterior of a short simulated record of the ring bender."""
     actuator = Actuator(dynamics, "first", INTERVAL)
     voltage = decaying_sine(samples)
     displacement = ring_bender(actuator, noise, voltage, seed)
@@ -133,5 +131,4 @@ def posterior_of_record(record: Record, fixed: Mapping[str, float]) -> Posterior
 def single(
     name: str, prior: Distribution, lower: float = -np.inf, upper: float = np.inf
 ) -> JointPrior:
-    """Return the joint prior of one parameter alone."""
     return joint([parameter(name, prior, lower, upper)])

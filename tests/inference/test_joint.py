@@ -29,7 +29,6 @@ RECORDS = {"loops": (240, 4.0, 100.0, INTERVAL, True), "slow": (150, 1.5, 60.0, 
 
 
 def dataset(name: str, noise: str = "discrepancy", dynamics: str = "lag") -> Dataset:
-    """Return one of the records, simulated, with an offset of its own."""
     samples, periods, amplitude, interval, from_rest = RECORDS[name]
     actuator = Actuator(dynamics, "first", interval)
     voltage = decaying_sine(samples, periods, amplitude)
@@ -47,7 +46,6 @@ def joint(
     shared: tuple[str, ...] = (),
     engine: Engine = "numpy",
 ) -> Posterior:
-    """Return the posterior of records with the default priors of the first."""
     first = datasets[0]
     names = tuple(one.name for one in datasets)
     table = replace(first.table, records=names, per_record=per_record, shared=shared)

@@ -109,7 +109,6 @@ def test_the_unknown_start_is_integrated_out(
 
 
 def assert_dense(likelihood: Likelihood, theta: FloatArray) -> None:
-    """Compare density and start with the dense Gaussian's."""
     start = likelihood.start(theta)
     for row, one in enumerate(theta):
         density, mean, covariance = dense(likelihood, one)

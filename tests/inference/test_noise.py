@@ -49,7 +49,6 @@ def covariance(theta: FloatArray, time: FloatArray) -> FloatArray:
 
 
 def dense(theta: FloatArray, rows: IntArray, interval: float) -> FloatArray:
-    """Covariance of readings at those rows."""
     lags = covariance(theta, interval * np.arange(rows[-1] - rows[0] + 1.0))
     full: FloatArray = lags[np.abs(np.subtract.outer(rows, rows))]
     full += theta[0] ** 2 * np.eye(rows.size)
@@ -67,7 +66,6 @@ def parameters(sensor: float, time: float, quality: float | None) -> FloatArray:
 def whitened(
     noise: Noise, theta: FloatArray, series: FloatArray, skipped: FloatArray
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Whiten series with each engine that there is."""
     yield noise.whiten(theta, series, skipped)
     if importlib.util.find_spec("numba"):
         readings = Readings(np.empty(0, dtype=np.int64), np.empty(0), 1, skipped)

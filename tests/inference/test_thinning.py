@@ -29,7 +29,6 @@ from tests.inference.problems import (
 
 
 def record_of(voltage: FloatArray) -> Dataset:
-    """Return a record of which only the voltage matters."""
     actuator, noise = Actuator("none", "first", INTERVAL), noise_model("white", INTERVAL)
     inputs = Inputs(voltage, interval=INTERVAL)
     return Dataset(inputs, np.zeros(voltage.size), (slice(0, voltage.size),), actuator, noise)

@@ -110,7 +110,6 @@ def drive(samples: int = 600, seed: int = 3) -> FloatArray:
 
 
 def inputs_of(voltage: FloatArray) -> Inputs:
-    """Return the voltage with a temperature that drifts and swings."""
     time = np.arange(voltage.size) / 600
     temperature = 20 + 8 * time + 2 * np.sin(9 * time)
     return Inputs(voltage, interval=INTERVAL, covariates={"temperature_degC": temperature})
@@ -119,7 +118,6 @@ def inputs_of(voltage: FloatArray) -> Inputs:
 def actuator(
     *names: str, hold: Hold = "first", operator: Operator | None = None, **parts: Any
 ) -> Actuator:
-    """Return an actuator with stages by name."""
     stages = tuple(STAGES[name]() for name in names)
     return Actuator("lag", hold, INTERVAL, operator or BoucWen(), span=SPAN, stages=stages, **parts)
 

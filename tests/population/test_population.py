@@ -73,7 +73,6 @@ def of(specimens: list[Specimen], seed: int = 1) -> PopulationParameter:
 
 
 def misses(level: float, count: int) -> float:
-    """Return three standard errors of a coverage."""
     return 3 * float(np.sqrt(level * (1 - level) / count))
 
 
@@ -128,7 +127,6 @@ def test_intervals_cover_over_a_hundred_populations() -> None:
 
 
 def without_outliers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take all specimens for ones of a normal population."""
     monkeypatch.setattr(normal_module, "ODD", 1e-12)
     monkeypatch.setattr(module, "ODD", 1e-12)
 

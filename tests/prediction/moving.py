@@ -107,14 +107,12 @@ def record_of(case: Case, generator: np.random.Generator) -> Record:
 
 
 def predicted(case: Case, posterior: Posterior, record: Record, seed: int) -> Bands:
-    """Predict a record with draws that are all the truth."""
     start = InitialConditions(case.from_rest, lead_in=case.lead_in)
     draws = np.zeros((DRAWS, posterior.prior.dimensions))
     return predict_record(posterior, draws, record, start, np.random.default_rng(seed))
 
 
 def studied(case: Case, records: int, seed: int = 0) -> list[Bands]:
-    """Predict many records of a case."""
     posterior = posterior_of_case(case)
     generator = np.random.default_rng(seed)
     return [

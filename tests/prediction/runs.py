@@ -144,6 +144,5 @@ def no_rivals(*_: object) -> None:
 
 
 def covered(bands: Bands, level: int = 95) -> float:
-    """Part of the judged readings inside the sensor band."""
     assert bands.measured is not None
     return float(np.mean(bands.covers("sensor", level, bands.measured)[bands.scored_from :]))

@@ -40,7 +40,6 @@ def narrow_bands(generator: np.random.Generator, length: float, sensor: float = 
 
 
 def coverage(bands: Bands) -> float:
-    """Part of the judged readings inside the corrected band."""
     assert bands.corrected is not None
     assert bands.measured is not None
     lower, upper = bands.corrected

@@ -74,7 +74,6 @@ EVERY = [
 
 
 def name_of(case: Case) -> str:
-    """Name the dynamics of a case."""
     return f"lag {1e3 * case.lag:g} ms" if case.dynamics == "lag" else case.dynamics
 
 

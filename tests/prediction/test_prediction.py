@@ -26,7 +26,6 @@ def random() -> np.random.Generator:
 
 
 def made(samples: int = 1200, start: float = 0.0) -> Record:
-    """Simulate a record of a decaying sine."""
     time = np.arange(samples) * INTERVAL
     voltage = 100 * np.sin(2 * np.pi * 0.5 * time + start) * np.exp(-0.1 * time)
     return STAND.measure(voltage, np.random.default_rng(4), offset=TRUTH["offset"])

@@ -21,7 +21,6 @@ INTERVAL = 0.01
 
 
 def problem(actuator: Actuator, **fixed: float) -> tuple[Posterior, FloatArray]:
-    """Return a posterior whose loop is fixed, and draws from the rest's prior."""
     voltage = decaying_sine(300)
     known = {"d": 0.7, "alpha": 0.36, "beta": 0.027, "gamma": 0.017, "exponent": 1.0, **fixed}
     of = posterior_of(voltage, 0.6 * voltage, actuator, "discrepancy", known, from_rest=True)
@@ -29,7 +28,6 @@ def problem(actuator: Actuator, **fixed: float) -> tuple[Posterior, FloatArray]:
 
 
 def measured(of: Posterior, draws: FloatArray, step: Step) -> dict[str, Estimate]:
-    """Return the estimates that there are."""
     every = measure_step(of, draws, step).estimates.items()
     return {name: estimate for name, estimate in every if estimate is not None}
 

@@ -41,7 +41,6 @@ MOST_CALLS = 12_000_000
 
 
 def compiled() -> Loops:
-    """Return the plain loops, compiled."""
     compiler: Callable[[Any], Any] = import_module("numba").njit
     return Loops(*(compiler(loop) for loop in (PLAIN.hysteresis, PLAIN.dynamics, PLAIN.kalman)))
 

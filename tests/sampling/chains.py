@@ -33,7 +33,6 @@ def state(generator: np.random.Generator) -> EnsembleState:
 
 @cache
 def blocks(phase: Phase, number: int) -> list[Block]:
-    """Make up the block of every ensemble: always the same one."""
     generator = np.random.default_rng([PHASES.index(phase), number])
     made = []
     for _ in range(ENSEMBLES):
@@ -73,7 +72,6 @@ def new(path: Path) -> ChainFile:
 
 
 def finish(chain: Chain) -> None:
-    """Do what is left of the plan, as a sampling does."""
     for phase, count in PLAN:
         if phase != "pilot" and not chain.blocks(phase):
             chain.freeze(phase, proposal(phase))
@@ -82,7 +80,6 @@ def finish(chain: Chain) -> None:
 
 
 def arrays(chain: Chain) -> dict[str, Any]:
-    """Return all that a chain holds, by name."""
     held: dict[str, Any] = {}
     if isinstance(chain, ChainFile):
         held |= {f"point {name}": np.array(value) for name, value in vars(chain.point).items()}

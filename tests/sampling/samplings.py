@@ -37,7 +37,6 @@ def run(
     point: MAPEstimate = POINT,
     watcher: ProgressCallback = lambda *_: None,
 ) -> tuple[Chain, SamplingResult]:
-    """Sample a target to its end."""
     chain = init_chain(posterior, point, plan, np.random.default_rng(seed))
     with ThreadPoolExecutor(1) as executor:
         return chain, sample(posterior, plan, chain, executor, watcher)

@@ -60,7 +60,6 @@ class Gaussian:
 
 
 def target(log_density: Callable[[FloatArray], FloatArray], free: int) -> Posterior:
-    """Return a target that the sampler takes for a posterior."""
     return cast(Posterior, Target(log_density, Unchanged(free)))
 
 
@@ -88,7 +87,6 @@ class Known:
 
 
 def student(center: FloatArray, factor: FloatArray) -> StudentMixture:
-    """Return one Student-t distribution as a proposal."""
     return StudentMixture(np.ones(1), center[np.newaxis], factor[np.newaxis])
 
 
@@ -186,7 +184,6 @@ TARGETS = {
 
 
 def worst_score(known: Known, moves: WeightedMoves, steps: int) -> float:
-    """Largest |t| of means and mean squares over the replicates."""
     walkers = 200
     posterior = target(known.log_density, known.free)
     _, point = gaussian(known.free)

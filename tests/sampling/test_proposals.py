@@ -108,7 +108,6 @@ def banana(count: int, seed: int = 1) -> FloatArray:
 
 
 def log_banana(x: FloatArray) -> FloatArray:
-    """Log density of the ridge, up to a constant."""
     across = x[:, 1] / WIDTH - BEND * (x[:, 0] ** 2 - 1)
     beside = x[:, 2] - 0.5 * x[:, 0]
     return np.asarray(-0.5 * (x[:, 0] ** 2 + across**2 + beside**2))
@@ -128,7 +127,6 @@ def any_skew(free: int, generator: np.random.Generator) -> SkewMap:
 
 
 def any_bend(free: int, generator: np.random.Generator) -> QuadraticMap:
-    """Return a bend with coefficients wherever there may be any."""
     longest = min(free, LONGEST)
     bends = generator.normal(0, 0.3, (longest * (longest + 1) // 2, free))
     place = 0

@@ -63,7 +63,6 @@ def test_a_chain_whose_target_is_made_smaller_is_judged_at_its_end(
 
 
 def flat(draws: FloatArray, *_: object) -> StudentMixture:
-    """Fit nothing."""
     raise np.linalg.LinAlgError(f"{len(draws)} draws in a plane")
 
 

@@ -29,14 +29,12 @@ from tests.sampling.chains import (
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the chain of a run that was never interrupted."""
     chain = new(tmp_path_factory.mktemp("whole") / "chain")
     finish(chain)
     return chain.path
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return a chain's files in the order in which they are written."""
     names = ["start"]
     for phase, count in PLAN:
         names += [f"{phase}-proposal"] if phase != "pilot" else []

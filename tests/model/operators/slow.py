@@ -23,7 +23,6 @@ Slope = Callable[[float, float, float], float]
 
 
 def rows(**columns: float | Sequence[float] | FloatArray) -> Rows:
-    """Bring parameters to columns of one length."""
     size = max(np.size(values) for values in columns.values())
     return {name: np.resize(np.asarray(v, dtype=float), size) for name, v in columns.items()}
 
@@ -34,7 +33,6 @@ def run(
     voltage: FloatArray,
     span: Span | None = SPAN,
 ) -> FloatArray:
-    """Run an operator along a record; without a span it starts from rest."""
     start = Span(0.0, 0.0) if span is None else span
     memory = operator.begin(column, float(voltage[0]), start, from_rest=span is None)
     return operator.advance(column, voltage, memory)[0]
@@ -201,5 +199,4 @@ def random_walk(seed: int, turns: int = 25, samples: int = 6) -> FloatArray:
 
 
 def assert_close(expected: FloatArray, got: FloatArray, tolerance: float) -> None:
-    """Compare with an error in units of the record's largest |h|."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * np.abs(expected).max())

@@ -57,7 +57,6 @@ def top_of(model: Model) -> float:
 
 
 def integrated(voltage: FloatArray, model: Model, start: float) -> FloatArray:
-    """Return h by the equation as it is written."""
     alpha, beta, gamma, n = model
 
     def slope(_: float, h: float, s: float) -> float:

@@ -28,7 +28,6 @@ from tests.model.operators.slow import RANGES, SPAN, drawn, run
 
 
 def has_step(name: str) -> bool:
-    """Tell whether an operator brings a step of its own."""
     return type(build_part("hysteresis", name, HYSTERESIS, {})).step is not Operator.step
 
 
@@ -42,7 +41,6 @@ def posterior(
     from_rest: bool = False,
     parts: bool = False,
 ) -> Posterior:
-    """Return a posterior of a short record with an operator."""
     operator = build_part("hysteresis", name, HYSTERESIS, options or {})
     voltage = decaying_sine(300)[60:]
     nonlinearity = PolynomialNonlinearity() if parts else None
@@ -53,7 +51,6 @@ def posterior(
 
 
 def drawn_from(of: Posterior, count: int) -> FloatArray:
-    """Return θ of draws from the prior."""
     return of.prior.theta(of.prior.draw(np.random.default_rng(2), count))
 
 
@@ -71,13 +68,11 @@ def test_pieces_of_a_record_equal_the_whole(name: str) -> None:
 
 
 def models(name: str, size: int, seed: int) -> tuple[Operator, dict[str, FloatArray]]:
-    """Return an operator and some models that hold, drawn from its default priors."""
     operator = build_part("hysteresis", name, HYSTERESIS, {})
     return operator, drawn(operator, size, seed)
 
 
 def assert_near(name: str, expected: FloatArray, got: FloatArray) -> None:
-    """Compare to the error that is promised, in units of the range."""
     tolerance = 1e-6 if name in ("jiles-atherton", "domain-wall") else 1e-12
     size = np.ptp(expected, axis=1, keepdims=True) + np.abs(expected[:, :1]) + 1e-9
     assert (np.abs(got - expected) <= tolerance * size).all()
@@ -291,7 +286,6 @@ def test_every_operator_is_fitted(name: str) -> None:
 
 
 def assert_finite(name: str, draws: int) -> None:
-    """Every draw of the default priors has a likelihood, on both engines."""
     of = posterior(name, parts=True)
     voltage = of.single_record.voltage[::8].copy()
     displacement = of.single_record.displacement[::8].copy()

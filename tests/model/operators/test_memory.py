@@ -94,7 +94,6 @@ spans = st.sampled_from(SPANS)
 
 
 def assert_close(expected: FloatArray, got: FloatArray, part: float = 1e-9) -> None:
-    """Compare to a part of the range."""
     assert np.max(np.abs(got - expected)) <= part * max(np.ptp(expected), 1e-9)
 
 
