@@ -36,7 +36,7 @@ from bwbayes.model.operator import Span
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.record.io import formats
 from bwbayes.record.io.series import Source, array_source
-from bwbayes.record.true_values import true_values
+from bwbayes.record.teststand import true_values
 from bwbayes.sampling.moves import IndependenceMove
 from tests.app import small
 from tests.diagnosis.plants import plant

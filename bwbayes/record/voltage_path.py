@@ -7,9 +7,15 @@ and it has to be monotone between them:
 
 1. The noise's sd comes from differences of rising order p, sd(Δᵖ u) = s √C(2p, p) for noise alone:
    the share of a smooth voltage dies out. While the estimates still fall, noise cannot be detected.
-2. Given this sd, the real reversals and the path between them follow, see
-   :mod:`bwbayes.record.monotone_path`.
-3. Lines of the residual's spectrum, such as mains hum, move the actuator too: they are set aside
+2. Local quadratics over windows of 4, 8, 16, ... samples to the left, to the right and around each
+   sample, each as long as the intervals of all windows so far intersect (Goldenshluger and
+   Nemirovski, Math. Methods Stat. 6 (1997) 135; Katkovnik, IEEE Trans. Signal Process. 47 (1999)
+   2567), joined by their precision. Where the sides contradict each other, the sd grows.
+3. A reversal is real if it goes beyond √(2 ln n), the largest of n normal deviates, times the sds
+   of the two samples that it is between.
+4. Between reversals the path is the isotonic regression of the fits. The samples about an extreme
+   that their mean describes become this mean, or a parabola, where that is the more certain.
+5. Lines of the residual's spectrum, such as mains hum, move the actuator too: they are set aside
    before and added again. Hum of the monitor alone cannot be distinguished from them.
 """
 
@@ -19,26 +25,16 @@ from dataclasses import dataclass
 from math import comb, log, sqrt
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
-from bwbayes.arrays import FloatArray
-from bwbayes.record.monotone_path import fit_path
+from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.shown import brief
 
-# Limits of the noise's sd as parts of the range: from the first on, the path is too uncertain for
-# parameters; beyond the second, the voltage changes too fast for its sampling.
-REPAIRABLE, LARGEST = 0.005, 0.03
+# Harmless excess of the path, as a part of the path.
+HARMLESS = 1e-3
 
-# The same limit for a step to which the voltage is rounded: a hold is known to half of a step.
-COARSE = 0.003
-
-# Harmless excess of the path, as a part of the path, and the smallest clear excess, in sds.
-HARMLESS, DOUBTFUL = 1e-3, 3.0
-
-# Fewer samples show no noise.
-FEWEST = 50
-
-# Spectral lines that are set aside, and rounds to find them.
-LINES, ROUNDS = 3, 8
+# Half width, in sds, of the windows' intervals that have to intersect.
+WITHIN = 1.5
 
 
 @dataclass(frozen=True)
@@ -71,12 +67,12 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
     """
     low, high = float(np.min(voltage)), float(np.max(voltage))
     extent, center = high - low, (high + low) / 2
-    if voltage.size < FEWEST or extent == 0:
+    if voltage.size < 50 or extent == 0:  # fewer samples show no noise
         return VoltagePath(voltage)
     u = voltage - center
     step = rounding_step(u)
     hum, frequencies, last = np.zeros_like(u), list[float](), 0.0
-    for searched in range(ROUNDS):
+    for searched in range(8):
         sd, settled = noise_sd(u - hum)
         # Rounding is monotone, so that it adds no reversal.
         if sd == 0 or (settled and sd < 1.1 * step / sqrt(12)):
@@ -84,14 +80,14 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         if not (settled or searched):
             remark = "voltage changes too fast for its sampling to tell its noise: none is removed"
             return VoltagePath(voltage, remark=remark)
-        fitted = fit_path(u - hum, max(sd, step / 2))
+        fitted, reversals, length_sd = _fit_path(u - hum, max(sd, step / 2))
         # The first and the last reversal may be real without enough evidence.
-        if not searched and turns(u) <= fitted.reversals + 1:
+        if not searched and turns(u) <= reversals + 1:
             return VoltagePath(voltage)
-        residual = u - hum - fitted.path
+        residual = u - hum - fitted
         frequency = _line(residual, sd)
         is_known = any(abs(frequency - other) < 6 / u.size for other in frequencies)
-        if not frequency or (len(frequencies) == LINES and not is_known):
+        if not frequency or (len(frequencies) == 3 and not is_known):
             break
         frequencies += [] if is_known else [frequency]
         phases = np.outer(np.arange(u.size), frequencies)
@@ -104,18 +100,19 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
         ratio = size / last if is_known and last else 0.0
         last = 0.0 if ratio else size
         hum = hum + (more / (1 - ratio) if ratio < 0.95 else more)
-    path = fitted.path + hum
+    path = fitted + hum
     shown = f"noise of {sd:.2g} V SD ({100 * sd / extent:.2g}% of its range)"
     length = _length(path)
     excess = _length(u) - length
-    if excess <= max(HARMLESS * length, DOUBTFUL * fitted.length_sd):
+    if excess <= max(HARMLESS * length, 3 * length_sd):  # beyond three sds it is clear
         left_in = f"voltage may have {shown}, which cannot be told from the drive: none is removed"
         return VoltagePath(voltage, remark=left_in * (excess > HARMLESS * length))
     remark = (
-        f"voltage has {shown}: the model is driven by its estimated path, with {fitted.reversals} "
+        f"voltage has {shown}: the model is driven by its estimated path, with {reversals} "
         f"reversals for {turns(u)}"
     )
-    if sd > REPAIRABLE * extent or step > COARSE * extent:
+    # Beyond these the path is too uncertain for parameters; a hold is known to half of a step.
+    if sd > 0.005 * extent or step > 0.003 * extent:
         remark = (
             f"voltage has {shown}, too much to repair: do not trust the parameters; measure the "
             'voltage with less noise, or give the command (voltage_is = "command")'
@@ -149,7 +146,8 @@ def noise_sd(voltage: FloatArray) -> tuple[float, bool]:
         return 0.0, True
     if sds[-1] < 0.8 * sds[-3]:  # it still falls
         return (0.0, True) if sds[-1] < 1e-4 * extent else (sds[-1], False)
-    return min(sds), min(sds) < LARGEST * extent
+    # Beyond this the voltage changes too fast for its sampling.
+    return min(sds), min(sds) < 0.03 * extent
 
 
 def turns(voltage: FloatArray) -> int:
@@ -179,3 +177,150 @@ def _line(residual: FloatArray, noise_sd: float) -> float:
     offsets = 2 * np.pi / n * np.linspace(-1, 1, 81)
     sizes = np.abs(np.exp(-1j * np.outer(offsets, parts)) @ sums)
     return float(2 * np.pi * k / n + offsets[int(np.argmax(sizes))])
+
+
+def _fit_path(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, int, float]:
+    """Return a voltage's path (samples,), V, its reversals, and a bound of its length's sd, V.
+
+    The white noise on the voltage has a known sd, V.
+    """
+    fits, sd, agreeing_sd = _local_fits(voltage, noise_sd)
+    extrema, first_is_top = _real_reversals(fits, sqrt(2 * log(voltage.size)) * sd)
+    weights = 1 / sd**2
+    path = _monotone(fits, extrema, first_is_top, weights)
+    path = _leveled(voltage, path, noise_sd, agreeing_sd, extrema, first_is_top)
+    path = _monotone(path, extrema, first_is_top, weights)
+    return path, extrema.size, float(2 * np.sum(agreeing_sd[extrema]))
+
+
+class _Side:
+    """The local fits (samples,) of windows to one side, as long as their intervals intersect."""
+
+    def __init__(self, voltage: FloatArray, noise_sd: float) -> None:
+        self.fit = voltage.copy()
+        self.variance = np.full(voltage.size, noise_sd**2)
+        self.low, self.high = voltage - WITHIN * noise_sd, voltage + WITHIN * noise_sd
+        self.open = np.ones(voltage.size, dtype=np.bool_)
+
+    def lengthen(self, samples: slice, fit: FloatArray, variance: float) -> bool:
+        """Take the fits of longer windows, where they agree; return whether any does."""
+        low = np.maximum(self.low[samples], fit - WITHIN * sqrt(variance))
+        high = np.minimum(self.high[samples], fit + WITHIN * sqrt(variance))
+        agrees: BoolArray = self.open[samples] & (low <= high)
+        self.open[:] = False
+        self.open[samples], self.low[samples], self.high[samples] = agrees, low, high
+        self.fit[samples] = np.where(agrees, fit, self.fit[samples])
+        self.variance[samples] = np.where(agrees, variance, self.variance[samples])
+        return bool(agrees.any())
+
+
+def _local_fits(voltage: FloatArray, noise_sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return fits (samples,) to a voltage, their sds, and the sds if both sides agree, V.
+
+    A window of m samples has the orthogonal polynomials 1, x and x² − q about its center, whose
+    coefficients are sums of u, j u and j² u over it: those of two windows of half its length.
+    """
+    sides = [_Side(voltage, noise_sd) for _ in range(3)]
+    sum0, sum1, sum2 = voltage, np.zeros(voltage.size), np.zeros(voltage.size)
+    m, lengthened = 1, True
+    while lengthened and 2 * m <= voltage.size:
+        windows = sum0.size - m
+        sum2 = sum2[:windows] + sum2[m:] + 2 * m * sum1[m:] + m * m * sum0[m:]
+        sum1 = sum1[:windows] + sum1[m:] + m * sum0[m:]
+        sum0 = sum0[:windows] + sum0[m:]
+        m *= 2
+        if m < 4:
+            continue
+        center, quadratic = (m - 1) / 2, m >= 8
+        norm1, q = m * (m * m - 1) / 12, (m * m - 1) / 12
+        norm2 = m * (m * m - 1) * (m * m - 4) / 180
+        mean, slope = sum0 / m, (sum1 - center * sum0) / norm1
+        bend = (sum2 - 2 * center * sum1 + (center**2 - q) * sum0) / norm2
+        lengthened = False
+        for side, at in zip(sides, (0, m - 1, m // 2) if quadratic else (0, m - 1), strict=False):
+            x = at - center
+            fit, variance = mean + slope * x, 1 / m + x * x / norm1
+            if quadratic:
+                fit, variance = fit + bend * (x * x - q), variance + (x * x - q) ** 2 / norm2
+            samples = slice(at, at + windows)
+            lengthened |= side.lengthen(samples, fit, noise_sd**2 * variance)
+    weight = sum(1 / side.variance for side in sides)
+    fits = sum(side.fit / side.variance for side in sides) / weight
+    apart = sum((side.fit - fits) ** 2 / side.variance for side in sides) / weight
+    min_variance = np.minimum.reduce([side.variance for side in sides])
+    return fits, np.sqrt(min_variance + apart), np.sqrt(min_variance)
+
+
+def _real_reversals(fits: FloatArray, margin: FloatArray) -> tuple[IntArray, bool]:
+    """Return the samples of the real reversals, and whether the first is a maximum: see step 3.
+
+    The first of them is the extreme at which the path begins.
+    """
+    reached_above, reached_below = (fits - margin).tolist(), (fits + margin).tolist()
+    reversals: list[int] = []
+    top = bottom = direction = 0
+    first_is_top = False
+    for i in range(1, fits.size):
+        if direction >= 0 and reached_above[i] > reached_above[top]:
+            top = i
+        if direction <= 0 and reached_below[i] < reached_below[bottom]:
+            bottom = i
+        if direction <= 0 and reached_above[i] > reached_below[bottom]:
+            reversals.append(bottom)
+            direction, top = 1, i
+        elif direction >= 0 and reached_below[i] < reached_above[top]:
+            first_is_top = first_is_top or not reversals
+            reversals.append(top)
+            direction, bottom = -1, i
+    return np.array(reversals, dtype=np.int64), first_is_top
+
+
+def _monotone(
+    path: FloatArray, extrema: IntArray, first_is_top: bool, weights: FloatArray
+) -> FloatArray:
+    """Return the weighted isotonic regression of a path between its extrema."""
+    if not extrema.size:
+        return np.full_like(path, np.average(path, weights=weights))
+    result, rising, start = np.empty_like(path), first_is_top, 0
+    for end in [*extrema.tolist(), path.size - 1]:
+        # Each extreme belongs to the branch behind it.
+        branch = slice(start, end + 1)
+        fitted = isotonic_regression(path[branch], weights=weights[branch], increasing=rising)
+        result[branch] = fitted.x
+        rising, start = not rising, end
+    return result
+
+
+def _leveled(
+    voltage: FloatArray,
+    path: FloatArray,
+    noise_sd: float,
+    sd: FloatArray,
+    extrema: IntArray,
+    first_is_top: bool,
+) -> FloatArray:
+    """Return a path with the samples about each extreme at one level or a parabola: see step 4."""
+    result, is_top = path.copy(), first_is_top
+    bounds = np.concatenate([[0], extrema, [path.size - 1]])
+    for before, extremum, after in zip(bounds, extrema, bounds[2:], strict=False):
+        away = np.abs(path[before : after + 1] - path[extremum])
+        nearest = np.argsort(away, kind="stable")
+        count = np.arange(1, nearest.size + 1)
+        outermost = away[nearest] - np.cumsum(away[nearest]) / count
+        # Stop at the first sample that lies outside: more samples at another level would agree.
+        outside = outermost > 3 * noise_sd / np.sqrt(count)
+        inside = nearest[: np.argmax(outside) if outside.any() else None]
+        samples = slice(before + inside.min(), before + inside.max() + 1)
+        near = voltage[samples]
+        level, error = np.full(near.size, np.mean(near)), noise_sd / sqrt(near.size)
+        x = np.arange(near.size) - (near.size - 1) / 2
+        bend = x * x - (near.size**2 - 1) / 12
+        if near.size >= 5 and (bend @ near) * (-1 if is_top else 1) > 3 * noise_sd * sqrt(
+            bend @ bend
+        ):
+            level += (bend @ near) / (bend @ bend) * bend + (x @ near) / (x @ x) * x
+            error *= 1.5
+        if near.size >= 3 and error < sd[extremum]:
+            result[samples] = level
+        is_top = not is_top
+    return result

@@ -40,7 +40,7 @@ from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.model.stage import Stage, Timing
 from bwbayes.model.stages.gain import Temperature
 from bwbayes.model.stages.saturation import Saturation
-from bwbayes.record.true_values import RING_BENDER, true_values
+from bwbayes.record.teststand import RING_BENDER, true_values
 from tests.control.compiled import Compiled
 from tests.programs import needs
 

@@ -20,8 +20,7 @@ from bwbayes.prediction.bands import KINDS, Bands, Kind
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
-from bwbayes.record.teststand import RingBender
-from bwbayes.record.true_values import true_values
+from bwbayes.record.teststand import RingBender, true_values
 from tests.inference.problems import posterior_of
 from tests.prediction.runs import covered as inside
 from tests.stand import process

@@ -23,7 +23,7 @@ from bwbayes.model import registry
 from bwbayes.model.declaration import Context, Declaration
 from bwbayes.model.distributions import FAMILIAR
 from bwbayes.model.registry import build_part
-from bwbayes.record.true_values import RING_BENDER
+from bwbayes.record.teststand import RING_BENDER
 from bwbayes.record.waveforms import signal_names
 
 Maker = Callable[..., Any]

@@ -22,16 +22,16 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.quantities import DEFAULT, DISPLACEMENT, TIME, VOLTAGE, Quantities
 from bwbayes.record.instruments import EXACT, Instruments, part_of_range, split_uncertainty
-from bwbayes.record.io.own_times import with_own_times
-from bwbayes.record.io.questions import columns_error
 from bwbayes.record.io.recognition import (
     beside,
+    columns_error,
     counts_samples,
     finite,
     is_demand,
     likeness,
     series_named,
     unit_of,
+    with_own_times,
 )
 from bwbayes.record.io.series import Clock, Series, Source
 from bwbayes.record.io.stated import conversion, in_stated_quantities
@@ -42,36 +42,12 @@ from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, epoch_unit, scale_
 class Naming:
     """Columns of a file that hold the quantities, and their units.
 
-    Parameters
-    ----------
-    columns
-        The column of a quantity, "time", "voltage" or "displacement": its name, the end of its
-        path, or its number, counted from 1. The others are recognized.
-    units
-        The unit of a quantity, where the file does not state it or states another. A number before
-        it is what 1 in the column stands for, as the sensor's sensitivity: ``"0.35 um"`` for volts
-        of 0.35 um each. A minus turns the sign: ``"-um"`` is a displacement counted backwards. The
-        uncertainty of a scale, ``"0.35 +- 0.004 um"``, goes to the instruments.
-    fs
-        The sampling rate, Hz, in place of a time column.
-    table
-        Table to read from a file with several: its number, from 1 on, or its title.
-    displacement_file
-        The file with the displacement, if it is another one than that with the voltage.
-    covariates
-        The columns of covariates by the covariates' names, or a list of columns with those names.
-    input, output
-        Quantities in place of voltage and displacement, such as ``"H (A/m)"``.
-    linearity
-        The sensor's largest departure from a straight line: ``"0.1 %"`` of the range.
-    instruments
-        Uncertainties of the instruments, from the units and the linearity.
+    The fields are the keyword arguments of :func:`~bwbayes.record.io.formats.read_record`; columns
+    and units go by "time", "voltage" and "displacement". ``instruments`` have the uncertainties
+    that the units and the linearity state.
 
-    Raises
-    ------
-    InputError
-        A quantity that does not exist, a unit that it cannot have, one column for two quantities,
-        or a rate that is none.
+    Raises InputError: a quantity that does not exist, a unit that it cannot have, one column for
+    two quantities, or a rate that is none.
     """
 
     columns: Mapping[str, str | int] = field(default_factory=dict)
@@ -247,17 +223,10 @@ class ColumnTable:
 def select(source: Source, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
     """Return the columns of a file that are time, voltage, displacement and truth.
 
-    Raises
-    ------
-    ColumnsError
-        A column that is needed and not known, or one whose unit is not.
-    InputError
-        A column that is named and not there, or whose values are not real numbers.
-
-    Warns
-    -----
-    InputWarning
-        If a column is recognized by nothing but its unit, or columns of a text are ignored.
+    Raises ColumnsError: a column that is needed and not known, or one whose unit is not;
+    InputError: a column that is named and not there, or whose values are not real numbers.
+    Warns InputWarning: if a column is recognized by nothing but its unit, or columns of a text are
+    ignored.
     """
     as_asked = naming
     source, naming, quantities = in_stated_quantities(source, naming, needed)

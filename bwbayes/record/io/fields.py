@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning, path_text
 from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.instruments import Instruments
-from bwbayes.record.io.clocks import align_clocks
+from bwbayes.record.io.alignment import align_clocks
 from bwbayes.record.io.columns import ColumnTable
 from bwbayes.record.io.grid import Grid, clock, is_smooth, require_plausible, time_grid
 from bwbayes.record.io.series import INSTRUMENT_NOTES, Clock
@@ -36,15 +36,8 @@ def record_fields(
     ``voltage_is`` overrides what the file says; a file that says nothing means "output". Without
     the need of a displacement, one that is missing everywhere is a planned voltage.
 
-    Raises
-    ------
-    InputError
-        For the first problem, in one line.
-
-    Warns
-    -----
-    InputWarning
-        If samples are missing, or times scatter.
+    Raises InputError: for the first problem, in one line.
+    Warns InputWarning: if samples are missing, or times scatter.
     """
     table = align_clocks(table)
     _check_lengths(table)
@@ -109,10 +102,7 @@ def _instruments(table: ColumnTable) -> Instruments:
 def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:
     """Return a reference displacement (samples,), um, and its sampling interval, s.
 
-    Raises
-    ------
-    InputError
-        For the first problem, in one line.
+    Raises InputError: for the first problem, in one line.
     """
     _check_lengths(table)
     table, grid = _grid(_without_empty_ends(table))
@@ -235,10 +225,7 @@ def _without_gaps(
     An interpolation fills a gap if it is right elsewhere to 1% of the range: the line between both
     ends, else a polynomial, else the line if no value between ends as far apart lies beyond both.
 
-    Raises
-    ------
-    InputError
-        The column is interpolated, and no interpolation is right elsewhere.
+    Raises InputError: the column is interpolated, and no interpolation is right elsewhere.
     """
     positions, sources = grid.positions, grid.sources
     if positions is None or sources is None:

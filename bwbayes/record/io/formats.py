@@ -24,13 +24,12 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.inputs import VoltageIs, require_voltage_is
+from bwbayes.record.io.alignment import select_pair
 from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.fields import record_fields, reference_fields
-from bwbayes.record.io.hdf5 import read_hdf5, write_hdf5
+from bwbayes.record.io.hdf5 import read_hdf5, read_netcdf, write_hdf5
 from bwbayes.record.io.labview import read_tdms
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
-from bwbayes.record.io.netcdf import read_netcdf
-from bwbayes.record.io.pair import select_pair
 from bwbayes.record.io.series import Source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
@@ -149,10 +148,7 @@ def read_named(
 ) -> Record:
     """Read and check a record by a naming, as :func:`read_record`, with errors of any quantities.
 
-    Raises
-    ------
-    InputError
-        For every problem, in one line.
+    Raises InputError: for every problem, in one line.
     """
     if voltage_is is not None:
         require_voltage_is(voltage_is)
@@ -179,10 +175,7 @@ def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[Floa
     The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes,
     or those of the ``naming``; a voltage in it does not count.
 
-    Raises
-    ------
-    InputError
-        For every problem, in one line, as of :func:`read_record`.
+    Raises InputError: for every problem, in one line, as of :func:`read_record`.
     """
     return reference_fields(read_table(Path(path), naming or Naming(), ("time", "displacement")))
 
@@ -190,10 +183,7 @@ def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[Floa
 def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
     """Read the columns of a file that a record needs, with the naming that recognized them.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read, or a column that is needed is not known.
+    Raises InputError: the file cannot be read, or a column that is needed is not known.
     """
     if naming.displacement_file is None:
         return select(read_source(path, naming.table), naming, needed)
@@ -204,10 +194,7 @@ def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES)
 def read_source(path: Path, table: int | str | None = None) -> Source:
     """Return the series of a file of any format, or those of one ``table`` in it.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read.
+    Raises InputError: the file cannot be read.
     """
     path = _existing(path)
     if path.is_dir():
@@ -249,7 +236,7 @@ def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path
         return read_numpy
     suffix = path.suffix.lower()
     if begin.startswith(b"PK") and suffix in (".xlsx", ".xlsm"):
-        from bwbayes.record.io.workbook import read_workbook  # noqa: PLC0415  # as of text
+        from bwbayes.record.io.text import read_workbook  # noqa: PLC0415  # pandas is slow to load
 
         return partial(read_workbook, table=table)
     if begin.startswith((b"PK", b"\xd0\xcf\x11\xe0")):

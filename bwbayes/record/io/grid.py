@@ -82,15 +82,8 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
 
     The table is without the samples that repeat others.
 
-    Raises
-    ------
-    InputError
-        Times are repeated too often or go back, or a gap makes the record too long.
-
-    Warns
-    -----
-    InputWarning
-        If samples are missing, or times are repeated or not uniform.
+    Raises InputError: times are repeated too often or go back, or a gap makes the record too long.
+    Warns InputWarning: if samples are missing, or times are repeated or not uniform.
     """
     column = table.columns["time"]
     is_float = column.values.dtype.kind == "f"
@@ -153,15 +146,8 @@ def _without_repeats(
     move on or back to times where samples are missing, as if a late logger had written them, or are
     left out.
 
-    Raises
-    ------
-    InputError
-        More than one in twenty would be left out.
-
-    Warns
-    -----
-    InputWarning
-        Always.
+    Raises InputError: more than one in twenty would be left out.
+    Warns InputWarning: always.
     """
     steps = np.diff(elapsed)
     is_repeat = np.append(False, steps == 0)

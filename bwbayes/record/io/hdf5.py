@@ -1,11 +1,11 @@
-"""Records in HDF5 files: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
+"""Records in HDF5 and netCDF: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
 
 Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
 says a dataset's unit, one like ``fs`` or ``dt`` how fast it was sampled; packed numbers, as netCDF
 has them, are unpacked by ``scale_factor``, ``add_offset`` and ``_FillValue``; columns of a table or
 matrix are series of their own, ``table.u`` and ``log[2]``. Beside the datasets may stand
 ``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``, as attributes or, in MATLAB's
-files of version 7.3, as variables.
+files of version 7.3, as variables. NetCDF of version 4 is HDF5; older versions are read by SciPy.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from scipy.io import netcdf_file
 
 from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.quantities import DEFAULT, DISPLACEMENT, VOLTAGE
@@ -41,15 +42,11 @@ from bwbayes.record.io.series import (
 )
 from bwbayes.record.record import Record
 
-# Attributes with the names, or units, of a matrix's columns.
-_NAMES = re.compile("column|channel|field|header|^names?$|^labels?$|^unit")
 # Attributes that may scale or shift raw numbers in an unknown way, and their neutral values.
 _FACTORS = {
     **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
     **dict.fromkeys(("sensitivity", "offset", "bias"), (0.0,)),
 }
-# Beginning of the attribute NAME of a netCDF dimension that has no numbers.
-_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 def read_hdf5(path: Path) -> Source:
@@ -145,7 +142,8 @@ def _series(
         is_text = "MATLAB_class" in item.attrs and _note(item.attrs, "MATLAB_class") == "char"
         if "MATLAB_empty" in item.attrs or item.shape is None:
             continue
-        if "NAME" in item.attrs and _note(item.attrs, "NAME").startswith(_NO_VARIABLE):
+        no_variable = "This is a netCDF dimension but not a netCDF variable"
+        if "NAME" in item.attrs and _note(item.attrs, "NAME").startswith(no_variable):
             continue
         if "MATLAB_object_decode" in item.attrs:
             pass_over_object(path, name, _note(item.attrs, "MATLAB_class"))
@@ -190,10 +188,11 @@ def _columns(
         }
     if dataset.ndim != 2 or dataset.dtype.kind not in "iuf":
         return {}
+    names_or_units = re.compile("column|channel|field|header|^names?$|^labels?$|^unit")
     stated = {
         key: notes_of(dataset.attrs[key])
         for key in dataset.attrs
-        if _is_text(dataset.attrs.get_id(key).dtype) and _NAMES.search(key.lower())
+        if _is_text(dataset.attrs.get_id(key).dtype) and names_or_units.search(key.lower())
     }
     texts = [
         notes_of(other.asstr()[()] if h5py.check_string_dtype(other.dtype) else other[()])
@@ -221,15 +220,8 @@ def _note(attributes: Any, name: str) -> str:
 def _open(path: Path, *, remark: bool = False) -> Any:
     """Open a file for reading, if possible even while another program writes it.
 
-    Raises
-    ------
-    InputError
-        Too little of it is written.
-
-    Warns
-    -----
-    InputWarning
-        If another program has it open, where a ``remark`` is wanted.
+    Raises InputError: too little of it is written.
+    Warns InputWarning: if another program has it open, where a ``remark`` is wanted.
     """
     try:
         return h5py.File(path, "r", locking="best-effort")
@@ -308,3 +300,44 @@ def _stands_still(data: mmap.mmap, _: int, collection: int) -> bool:
             return True
         at += step
     return False
+
+
+def read_netcdf(path: Path) -> Source:
+    """Return the variables of a classic netCDF file; a damaged file may raise any exception.
+
+    Numbers are unpacked as those of HDF5 files are, by the CF conventions.
+
+    Raises InputError: it is of the 64-bit data format, which SciPy does not read.
+    """
+    with path.open("rb") as raw:
+        if raw.read(4) == b"CDF\x05":
+            raise InputError(f"{path}: netCDF of the 64-bit data format; write it as netCDF-4")
+    with netcdf_file(path, "r", mmap=False, maskandscale=True) as file:
+        stated = {key: note(getattr(file, key)) for key in (*NOTES, *RATES) if hasattr(file, key)}
+        variables = {name: _values(variable) for name, variable in file.variables.items()}
+        units = {name: note(getattr(v, "units", "")) for name, v in file.variables.items()}
+        dimensions = {name: v.dimensions for name, v in file.variables.items()}
+    series: list[Series] = []
+    for name, values in variables.items():
+        # A variable of words along the same dimension names the columns of a matrix.
+        words = [
+            [str(word).strip() for word in others]
+            for other, others in variables.items()
+            if others.dtype.kind == "U" and dimensions[other][:1] == dimensions[name][1:2]
+        ]
+        columns = {name: (words[0], ())} if words else None
+        unit = units[name].partition(" since ")[0]
+        load = partial(np.asarray, values)
+        series += vectors("", name, values.shape, values.dtype, load, unit, columns)
+    return Source(path, tuple(series), {"": stated})
+
+
+def _values(variable: Any) -> Any:
+    """Return a variable's numbers, nan for those that are missing, or its words."""
+    values: Any = np.ma.asarray(variable[:] if variable.shape else variable.getValue())
+    if values.dtype.kind == "S":
+        rows = values.filled(b" ")
+        return np.array([b"".join(row).decode(errors="replace").rstrip("\0 ") for row in rows])
+    if values.dtype.kind in "iu" and not np.ma.is_masked(values):
+        return values.filled().astype(values.dtype.newbyteorder("="))
+    return values.astype(np.float64).filled(np.nan)

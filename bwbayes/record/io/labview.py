@@ -26,10 +26,7 @@ def plain_lvm(path: Path, text: str) -> tuple[str, dict[int, Clock]]:
     Segments follow each other; the line numbers of the first one stay as they are, and its header
     counts.
 
-    Raises
-    ------
-    InputError
-        There are no rows in it.
+    Raises InputError: there are no rows in it.
     """
     head, *parts = text.split("***End_of_Header***")
     separator = "," if "Comma" in _keys(head, ",").get("Separator", []) else "\t"
@@ -93,10 +90,7 @@ def _keys(header: str, separator: str) -> dict[str, list[str]]:
 def read_tdms(path: Path) -> Source:
     """Return the channels of a TDMS file; npTDMS may raise any exception for a damaged one.
 
-    Raises
-    ------
-    InputError
-        npTDMS is not installed.
+    Raises InputError: npTDMS is not installed.
     """
     try:
         from nptdms import TdmsFile  # noqa: PLC0415  # an extra

@@ -1,7 +1,8 @@
-"""Layout of the numbers in a text: their separator, their first line, and the names above them.
+"""Layout of a text: its tables, their separator and first line, and what stands above the numbers.
 
 Commas, semicolons, tabs, bars or blanks separate the columns, if there are several. The line above
-the numbers names the columns; a second line may hold their units.
+the numbers names the columns; a second line may hold their units. Instruments write notes, units,
+rate and settings above that.
 """
 
 from __future__ import annotations
@@ -9,20 +10,22 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
-from itertools import zip_longest
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from bwbayes.errors import InputError, NoNumbersError
-from bwbayes.record.io.series import NOTES
+from bwbayes.errors import InputError, NoNumbersError, one_line
+from bwbayes.record.io.series import NOTES, RATES, Clock, Source
 from bwbayes.record.io.units import (
     QUANTITIES,
     is_other_unit,
     is_time_form,
     scale_of,
+    unit_in,
     unit_in_brackets,
 )
 
@@ -174,7 +177,8 @@ def find_header(
             units = [_either(*pair) for pair in zip_longest(bare, units, fillvalue="")]
     # The rows go upwards from the numbers: comments, units and names, or names alone.
     # Rows below the names with their units may describe the columns, with other units.
-    stating = [sum(_states_unit(cell) for cell in cells) for _, cells in rows]
+    bracketed = [[unit_in_brackets(cell) or "" for cell in cells] for _, cells in rows]
+    stating = [sum(any(scale_of(u, q) for q in QUANTITIES) for u in row) for row in bracketed]
     best = stating.index(max(stating)) if rows else 0
     used = rows[best : best + 1]
     if unit_row is not None:
@@ -188,12 +192,6 @@ def find_header(
     units += [""] * (fields - len(units))
     names += [""] * (fields - len(names))
     return [name or f"column {i}" for i, name in enumerate(names, start=1)], units, first
-
-
-def _states_unit(name: str) -> bool:
-    """Tell whether a name has a unit of one of the quantities in brackets."""
-    unit = unit_in_brackets(name)
-    return unit is not None and any(scale_of(unit, q) for q in QUANTITIES)
 
 
 def _either(unit: str, other: str) -> str:
@@ -226,3 +224,180 @@ def split_header(line: str, layout: Layout) -> list[str]:
         if len(cells) >= needed and not more and is_name:
             return cells
     return []
+
+
+# A row begins with a number, a date, or an empty cell before one.
+_CELL = re.compile(r"[+-]?(?:nan|inf|[.,]?\d[\d.,]*(?:[eEdD][+-]?\d+)?)", re.IGNORECASE)
+_ROW = re.compile(rf"[\s\"',;|]*(?:[+-]?[.,]?\d|{_CELL.pattern}(?![^\s\"',;|]))", re.IGNORECASE)
+
+
+class TextTable(NamedTuple):
+    """A table in a text: its lines, with those above its header, its title and its header."""
+
+    lines: range
+    title: str
+    header: str
+
+
+def tables_of(lines: Sequence[str]) -> list[TextTable]:
+    """Return the tables in a text.
+
+    A table ends where a header follows its rows: a line of words, as many as the cells of the
+    three rows or more below it. The same header once more, as after a pause of the logger, ends it
+    only if the first column does not go on. An empty line ends a table, too, if a first column that
+    rose all the way begins again below it where it began, or before.
+    """
+    tables: list[tuple[int, str, str]] = []
+    between: list[int] = []
+    header, separator, rows, last = "", "", 0, 0
+    first, is_gap = 0, False
+    for index, line in enumerate(lines):
+        if not line.strip() or line[0] in "#%":
+            is_gap |= not line.strip()
+            continue
+        if not _ROW.match(line) or separator not in line:
+            between = between if rows < 3 else []
+            between.append(index)
+            rows = 0
+            continue
+        if is_gap and rows >= 3 and _begins_again(lines[first : last + 1], line):
+            tables += [] if tables else [(first, f"line {first + 1}", "")]
+            tables.append((index, f"line {index + 1}", header))
+            rows = 0
+        rows += 1
+        first = index if rows == 1 else first
+        is_gap = False
+        if rows == 3 and between:
+            separator = _separator(line)
+            heads = [lines[i] for i in between if _is_header(lines[i], line, separator)]
+            is_pause = heads[:1] == [header] and len(heads) == len(between)
+            if heads and not (is_pause and _goes_on(lines[last], line, separator)):
+                header = heads[0]
+                tables.append((between[0], one_line(lines[between[0]])[:40], header))
+            between = []
+        last = index if rows >= 3 else last
+    starts = [0, *(start for start, *_ in tables[1:]), len(lines)]
+    named = [(title, header) for _, title, header in tables] or [("", "")]
+    return [TextTable(range(*starts[i : i + 2]), *names) for i, names in enumerate(named)]
+
+
+def described(tables: Sequence[TextTable], lines: Sequence[str]) -> list[str]:
+    """Describe each of several tables by its number of rows and its header."""
+    rows = [sum(map(bool, map(_ROW.match, lines[t.lines.start : t.lines.stop]))) for t in tables]
+    heads = [f" below {t.header[:60]!r}" * (t.header not in ("", t.title)) for t in tables]
+    return [f" ({n} rows{head})" for n, head in zip(rows, heads, strict=True)]
+
+
+def index_of(
+    path: Path, titles: Sequence[str], table: int | str | None, said: Sequence[str] = ()
+) -> int:
+    """Return the index of the table that is meant, by its number from 1 on or its title.
+
+    The error lists the tables with their titles and descriptions, ``said``.
+
+    Raises InputError: there is none, or there are several and nothing says which is meant.
+    """
+    if table is None and len(titles) == 1:
+        return 0
+    if table in titles:
+        return titles.index(str(table))
+    if str(table).isdecimal() and 1 <= int(str(table)) <= len(titles):
+        return int(str(table)) - 1
+    labels = [f"{title!r}{more}" for title, more in zip_longest(titles, said, fillvalue="")]
+    listed = ", ".join(f"{i} {text}" for i, text in enumerate(labels, start=1))
+    if table is None:
+        raise InputError(
+            f"{path}: {len(titles)} tables with numbers: {listed}; choose one, as `table=1`"
+        )
+    raise InputError(f"{path}: no table {table!r}; choose from {listed}")
+
+
+def _is_header(line: str, row: str, separator: str) -> bool:
+    names, values = (cells_of(text.rstrip(f"{separator} \t"), separator) for text in (line, row))
+    is_number = any(_CELL.fullmatch(name) for name in names)
+    return len(names) == len(values) and len({*names} - {""}) > 1 and not is_number
+
+
+def _separator(row: str) -> str:
+    return next(mark for mark in SEPARATORS if mark in row or mark == " ")
+
+
+def _begins_again(rows: Sequence[str], row: str) -> bool:
+    """Tell whether a row's first cell is at most that of the first of rows that all rise."""
+    mark = _separator(row)
+    rows = [line for line in rows if _ROW.match(line)]
+    if mark == " " and mark not in row.strip():  # a column alone
+        return False
+    return not _goes_on(rows[0], row, mark) and all(
+        _goes_on(before, after, mark) for before, after in pairwise(rows)
+    )
+
+
+def _goes_on(last: str, row: str, separator: str) -> bool:
+    """Tell whether a row's first cell is a larger number than that of the last row before it."""
+    with suppress(ValueError):
+        first = (next(filter(None, cells_of(line, separator)), "") for line in (last, row))
+        before, after = (float(cell.replace(",", ".")) for cell in first)
+        return before < after
+    return True
+
+
+def stated_above(lines: Sequence[str]) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Return the notes in the lines above a header, and the values they list for each channel."""
+    notes: dict[str, str] = {}
+    preamble: dict[str, list[str]] = {}
+    for line in lines:
+        key, sign, value, *_ = [*re.split(r"([:=,;\t])", line, maxsplit=1), "", ""]
+        key = re.sub(r"\W+", "_", re.sub(r"\(.*", "", key)).strip("_").lower()
+        if line.startswith("#") and sign in ("=", ":"):
+            notes["voltage_is" if key == "voltage" else key] = value.strip()
+        elif sign:
+            preamble[key] = [cell.strip(' "') for cell in value.split(sign)]
+    return notes | {key: cells[0] for key, cells in preamble.items() if key in RATES}, preamble
+
+
+def clock_above(
+    notes: Mapping[str, str], preamble: Mapping[str, list[str]], n_samples: int
+) -> Clock | None:
+    """Return the clock of a stated rate, if the stated number of samples is right, or None."""
+    rate = Source(Path(), (), {"": notes}).stated_rate()
+    is_confirmed = preamble.get("record_length", [""])[0] == str(n_samples)
+    return Clock(1 / rate) if rate and is_confirmed else None
+
+
+def with_units(
+    names: Sequence[str], units: Sequence[str], preamble: Mapping[str, list[str]]
+) -> list[str]:
+    """Return the columns' units, with those that an oscilloscope's preamble states for channels.
+
+    The time stands before the channels, if there is one column more than units. A name that stands
+    twice gets a number behind its unit; the unit without that number is returned.
+    """
+    units = [
+        unit or next((u for q in QUANTITIES if (u := unit_in(name, q))), "")
+        if names.count(name) > 1
+        else unit
+        for name, unit in zip(names, units, strict=True)
+    ]
+    channels = [unit for unit in preamble.get("vertical_units", []) if unit]
+    time = preamble.get("horizontal_units", [""])[:1]
+    stated = [*(time if len(channels) == len(units) - 1 else []), *channels]
+    if not channels or len(stated) != len(units):
+        return units
+    return [unit or other for unit, other in zip(units, stated, strict=True)]
+
+
+def settings_in(names: Sequence[str], units: Sequence[str]) -> tuple[Clock | None, dict[str, str]]:
+    """Return the clock that an oscilloscope writes into the header, or None, and all settings.
+
+    A setting is a number below its name, ``Increment``, or behind it, ``tInc = 1e-6``.
+    """
+    settings = {}
+    for name, unit in zip(names, units, strict=True):
+        key, _, value = name.partition("=")
+        with suppress(ValueError):
+            text = (value or unit).strip().removesuffix("s")
+            settings[key.strip().lower()] = repr(float(text))
+    rate = Source(Path(), (), {"": settings}).stated_rate()
+    start = float(settings.get("start", settings.get("t0", "0")))
+    return Clock(1 / rate, start) if rate else None, settings

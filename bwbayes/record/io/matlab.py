@@ -51,10 +51,7 @@ _IS_LOGICAL, _IS_COMPLEX = 0x0200, 0x0800
 def read_mat(path: Path) -> Source:
     """Return the series of a MATLAB file of version 5; a damaged file may raise any exception.
 
-    Raises
-    ------
-    InputError
-        It is of another version.
+    Raises InputError: it is of another version.
     """
     data = path.read_bytes()
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])

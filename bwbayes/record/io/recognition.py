@@ -1,4 +1,9 @@
-"""Recognition of the quantity of a file's series by its name, unit and numbers."""
+"""Recognition of the quantity of a file's series by its name, unit and numbers.
+
+What is not recognized is asked for, all at once and with a guess. Some programs write a column of
+times for each channel: in the series' group of the file or, in a text, in the last column of times
+before it. Where the times of voltage and displacement differ, each gets a clock.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +11,30 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.errors import InputError, InputWarning
-from bwbayes.record.io.series import Series, Source
-from bwbayes.record.io.units import QUANTITIES, factor_in, unit_in, unit_in_brackets, unit_scale
+from bwbayes.errors import ColumnsError, InputError, InputWarning, one_line
+from bwbayes.record.io.series import Clock, Series, Source
+from bwbayes.record.io.units import (
+    COMMON_UNITS,
+    QUANTITIES,
+    factor_in,
+    power_of,
+    rates_by_unit,
+    scale_of,
+    unit_in,
+    unit_in_brackets,
+    unit_scale,
+)
 
-# Words in the names of displacements that are commanded, not measured.
-_DEMANDS = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
+if TYPE_CHECKING:
+    from bwbayes.record.io.columns import Naming
+
+
 # Common names of the quantities, in lower case and without a unit.
 WORDS = {
     "time": (
@@ -62,7 +81,8 @@ def bare_name(label: str, quantity: str) -> str:
 
 def is_demand(series: Series) -> bool:
     """Tell whether a series is, by its name, a commanded displacement, not a measured one."""
-    return re.search(_DEMANDS, series.label.lower()) is not None
+    demands = "target|set.?point|command|demand|reference|desired|nominal|soll|consigne"
+    return re.search(demands, series.label.lower()) is not None
 
 
 def rises(series: Series) -> bool:
@@ -135,10 +155,7 @@ def listed(series: Sequence[Series], ranges: Mapping[str, tuple[float, float]]) 
 def series_named(source: Source, name: str | int, quantity: str) -> Series:
     """Return the series that a naming means: by its path, the end of its path, or its number.
 
-    Raises
-    ------
-    InputError
-        There is none, or several.
+    Raises InputError: there is none, or several.
     """
     word = str(name).strip()
     exact = [s for s in source.series if s.name == word and name == str(name)]
@@ -164,3 +181,187 @@ def _span(low: float, high: float) -> str:
     # Two more digits show how long a record is, not only that its ends differ.
     digits += 2 * (digits > 4)
     return f"{low:.{digits}g} to {high:.{digits}g}"
+
+
+def columns_error(
+    source: Source,
+    naming: Naming,
+    chosen: Mapping[str, Series],
+    missing: Sequence[str],
+    unknown: Sequence[str],
+) -> InputError:
+    """Return the error that lists all unknown columns and units, with a guess for each."""
+    where = str(source.path)
+    if source.lines and source.lines[0] > 1:
+        where += f":{source.lines[0] - 1}"
+    if all(series.size == 1 for series in source.series):
+        return InputError(
+            f"{where}: no column has more than one number; give a row for each sample"
+        )
+    ranges = ranges_of(source.series)
+    if not ranges:
+        return InputError(f"{where}: no column holds only numbers; export it as CSV")
+    candidates = _candidates(source, chosen, ranges)
+    clock = chosen["time"] if "time" in unknown else None
+    clocks = [s for s in candidates if s.size > 1 and rises(s)]
+    timeless = "time" in missing and not clocks
+    missing = [q for q in missing if not (q == "time" and timeless)]
+    columns, units = dict(naming.columns), naming.stated_units
+    proposed = {q: chosen[q] for q in unknown}  # those whose unit is open
+    for quantity in missing:
+        pool = clocks if quantity == "time" else sorted(candidates, key=rises)
+        if quantity == "displacement":
+            pool = sorted(pool, key=is_demand)
+        words = [word for word in WORDS[quantity] if len(word) > 3]
+        alike = [s for s in pool if any(word in s.label.lower() for word in words)]
+        in_unit = [s for s in pool if unit_of(s.label, s.unit, quantity)]
+        in_unit = in_unit or [s for s in pool if unit_scale(s.label, quantity)]
+        pool = in_unit or alike or pool
+        if not pool:
+            continue
+        columns[quantity] = pool[0].name.removeprefix("column ")  # without a name by its number
+        candidates = [s for s in candidates if s is not pool[0]]
+        if unit_of(pool[0].label, pool[0].unit, quantity) is None:
+            clock = pool[0] if quantity == "time" else clock
+            proposed[quantity] = pool[0]
+    sensitivities = _guess_units(proposed, units)
+    unknown = [q for q in unknown if units[q] == _guess(chosen[q].label, q)]
+    listing = listed(source.series, ranges)
+    lost = [q for q in missing if q not in columns]
+    if lost:
+        other = ", or say in which file it is, `displacement_file=FILE`"
+        advice = f"add it{other * (lost == ['displacement'])}"
+        return InputError(
+            f"{where}: no column for the {' and the '.join(lost)}; {advice}. {listing}"
+        )
+    questions = [f"which column is the {', which the '.join(missing)}"] if missing else []
+    if unknown:
+        names = ", which ".join(f"{chosen[q].name!r} ({q})" for q in unknown)
+        questions.append(f"which unit has {names}")
+    questions += sensitivities
+    if timeless:
+        questions.append(
+            "what is the sampling rate, Hz (no column can be the time; with any other rate "
+            "dynamics, creep and correlation times mean nothing)"
+        )
+    extent = float(np.ptp(ranges[clock.name])) if clock and clock.name in ranges else 0.0
+    rates = f"{clock.name!r} is {rates_by_unit(clock.size, extent)}. " if clock and extent else ""
+    problem = f"{where}: {', and '.join(questions)}? {rates}{listing}"
+    fs = source.stated_rate() or "HZ" if timeless else naming.fs
+    return ColumnsError(problem, columns, units, fs=fs)
+
+
+def _candidates(
+    source: Source, chosen: Mapping[str, Series], ranges: Mapping[str, tuple[float, float]]
+) -> list[Series]:
+    """Return the series that a missing quantity may be: as long as those chosen, and moving.
+
+    Series that number the samples are left out, and so are settings beside the first numbers.
+    """
+    others = [s for s in source.series if s.name not in {c.name for c in chosen.values()}]
+    if chosen:
+        others = [s for s in others if s.size in {c.size for c in chosen.values()}]
+    moving = [s for s in others if s.name in ranges and len(set(ranges[s.name])) == 2]
+    moving = [s for s in moving if 2 * finite(s).size > s.size] or moving
+    return [
+        s
+        for s in beside(moving or others, chosen)
+        if unit_of(s.label, s.unit, "time") or not counts_samples(s)
+    ]
+
+
+def _guess_units(proposed: Mapping[str, Series], units: dict[str, str]) -> list[str]:
+    """Add a guess of the units that are open; return questions for those that a file states."""
+    questions = []
+    for quantity, series in proposed.items():
+        guess = _guess(series.label, quantity)
+        foreign = foreign_unit(series, quantity)
+        if foreign and quantity not in units:  # for instance volts of a sensor
+            questions.append(f"how many {guess} is 1 {foreign} of {series.name!r}")
+            guess = f"? {guess}"
+        units.setdefault(quantity, guess)
+    return questions
+
+
+def _guess(label: str, quantity: str) -> str:
+    """Return the unit anywhere in a name, as in ``ms_since_midnight``, or the usual unit."""
+    *words, last = re.split(r"[\W_]+", label)
+    # Only at the end of a name is "in" or "min" an inch or a minute instead of a word.
+    units = [word for word in words if power_of(word, quantity) is not None]
+    units += [last] if unit_scale(last, quantity) else []
+    return units[0] if units else COMMON_UNITS[quantity][0]
+
+
+def with_own_times(
+    source: Source, chosen: Mapping[str, Series], naming: Naming
+) -> dict[str, Series]:
+    """Return the chosen series with times, or clocks where they have different times.
+
+    Raises InputError: their times differ, and are not uniform.
+    Warns InputWarning: their times differ, and one column of times is said to count for both.
+    """
+    read = {q: chosen[q] for q in ("voltage", "displacement") if q in chosen}
+    own_times = {q: times for q, series in read.items() if (times := _beside(source, series))}
+    seconds = {q: _seconds(times, naming) for q, times in own_times.items()}
+    # Other functions handle one column of times for both, or one that cannot be understood.
+    is_known = len({times.name for times in own_times.values()}) == 2
+    is_known &= all(times.size > 1 for times in seconds.values())
+    if naming.fs is not None or not is_known:
+        return dict(chosen)
+    first, last = seconds.values()
+    interval = float(first[-1] - first[0]) / (first.size - 1)
+    size = min(first.size, last.size)
+    apart = float(np.abs(first[:size] - last[:size]).max())
+    if first.size == last.size and apart <= 0.01 * interval:
+        return {"time": own_times["voltage"], **chosen}
+    names = [repr(times.name) for times in own_times.values()]
+    differ = f"{source.path}: {names[1]}: not the times of {names[0]}, by up to {apart:.6g} s"
+    if "time" in naming.columns:
+        advice = "name no column of times to put each by its own"
+        text = one_line(f"{differ}, but {chosen['time'].name!r} counts for both; {advice}")
+        warnings.warn(text, InputWarning, stacklevel=5)
+        return dict(chosen)
+    clocked = {q: _clocked(series, seconds[q]) for q, series in read.items()}
+    if not all(series.clock for series in clocked.values()):
+        advice = "write both at the same times, or name the column of times that counts for both"
+        raise InputError(one_line(f"{differ}, and not uniform; {advice}"))
+    return {**{q: s for q, s in chosen.items() if q != "time"}, **clocked}
+
+
+def _beside(source: Source, series: Series) -> Series | None:
+    """Return the times of one series; None if all series share their times or there are none."""
+    times = [
+        s
+        for s in source.series
+        if s.size == series.size and likeness(s.label, s.unit, "time") is not None
+    ]
+    if source.lines:
+        before = source.series[: source.series.index(series)]
+        return next((s for s in before[::-1] if s in times), None) if times[1:] else None
+    group_times = [s for s in times if s.group == series.group != ""]
+    return group_times[0] if len(group_times) == 1 else None
+
+
+def _seconds(times: Series, naming: Naming) -> FloatArray:
+    """Return times, s, up to their end; None if they do not rise or have no unit."""
+    unit = naming.units.get("time") or unit_of(times.label, times.unit, "time")
+    scale = scale_of(unit or "", "time")
+    values = times.numbers("", readings=True).astype(np.float64)
+    values = values[: values.size - int(np.argmax(np.isfinite(values[::-1])))]
+    if scale is None or not (np.diff(values) > 0).all():
+        return np.empty(0)
+    factor, power = scale
+    return np.asarray(factor * values * 10.0**power)
+
+
+def _clocked(series: Series, seconds: FloatArray) -> Series:
+    """Return a series with the clock of its times, up to where they end, if they are uniform."""
+    interval = float(seconds[-1] - seconds[0]) / (seconds.size - 1)
+    uniform = seconds[0] + interval * np.arange(seconds.size)
+    if np.abs(seconds - uniform).max() > 0.01 * interval:
+        return series
+    load_all, size = series.load_readings or series.load, seconds.size
+    clock = Clock(interval, float(seconds[0]))
+    return replace(
+        series, size=size, load=lambda: load_all()[:size], load_readings=None, clock=clock
+    )

@@ -83,10 +83,7 @@ class Series:
     def numbers(self, where: object, *, readings: bool = False) -> NDArray[Any]:
         """Load the numbers, (size,), of a series in the file ``where``; ``readings`` may be nan.
 
-        Raises
-        ------
-        InputError
-            They are not real numbers, or damaged.
+        Raises InputError: they are not real numbers, or damaged.
         """
         try:
             load = (readings and self.load_readings) or self.load

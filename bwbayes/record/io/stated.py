@@ -80,10 +80,7 @@ def in_stated_quantities(
     The naming states them, or the file does, as those that the package writes. In a file without
     any possible time, the samples themselves are the clock.
 
-    Raises
-    ------
-    InputError
-        A column's unit that cannot be converted.
+    Raises InputError: a column's unit that cannot be converted.
     """
     stated = naming.input, naming.output
     if stated == (None, None):

@@ -7,16 +7,17 @@ a remark, as are empty lines, comments and headers among the numbers, and words 
 is cut off below them. Lines ``# key: value`` above them may hold ``voltage`` (command or output),
 ``origin``, ``interval_s`` and ``time_offset_s``; a sampling rate or interval in any line above them
 counts as a guess. An empty cell or ``nan`` in the displacement is a missing reading. An error names
-the number of a line that cannot be read.
+the number of a line that cannot be read. The sheets of a workbook (``.xlsx``) are read as texts.
 """
 
 from __future__ import annotations
 
 import csv
 import gzip
+import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from functools import partial
 from io import StringIO
@@ -28,20 +29,25 @@ import pandas as pd
 from charset_normalizer import from_bytes
 from numpy.typing import NDArray
 
-from bwbayes.errors import InputError, InputWarning, one_line
+from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
 from bwbayes.record.io.hdf5 import record_arrays, record_notes
 from bwbayes.record.io.labview import plain_lvm
 from bwbayes.record.io.layout import (
     EXAMPLE,
     Layout,
     cells_of,
+    clock_above,
+    described,
     find_header,
     find_layout,
+    index_of,
+    settings_in,
     split_header,
+    stated_above,
+    tables_of,
+    with_units,
 )
-from bwbayes.record.io.preamble import clock_above, settings_in, stated_above, with_units
 from bwbayes.record.io.series import Clock, Series, Source, in_seconds
-from bwbayes.record.io.tables import described, index_of, tables_of
 from bwbayes.record.record import Record
 
 type Marks = tuple[str, str | None]
@@ -54,16 +60,9 @@ _BLANKS = r"[+-]?[1-9]\d{0,2}(?: \d{3})+(?:[.,]\d*)?"
 def read_text(path: Path, table: int | str | None = None) -> Source:
     """Return the columns of a text file, of one ``table`` if there are several.
 
-    Raises
-    ------
-    InputError
-        It is not text, holds no numbers, or several tables of which none is chosen; or a line has
-        another number of fields, and the text names the line.
-
-    Warns
-    -----
-    InputWarning
-        If lines above the header are skipped.
+    Raises InputError: it is not text, holds no numbers, or several tables of which none is chosen;
+    or a line has another number of fields, and the text names the line.
+    Warns InputWarning: if lines above the header are skipped.
     """
     return text_source(path, _decoded(path), table)
 
@@ -149,10 +148,7 @@ def text_source(
 def _different(path: Path, names: Sequence[str], frame: pd.DataFrame) -> list[str]:
     """Return names without repeats; the first of several columns with equal numbers keeps its name.
 
-    Warns
-    -----
-    InputWarning
-        If there are such columns.
+    Warns InputWarning: if there are such columns.
     """
     different = []
     for column, name in enumerate(names):
@@ -240,10 +236,7 @@ def _samples(
     off: with fewer fields than the others, or, unless the text ``is_whole``, without its last
     number or with fewer decimals in it than all lines above have alike.
 
-    Raises
-    ------
-    InputError
-        Another line has fewer fields than the others, or more than the header.
+    Raises InputError: another line has fewer fields than the others, or more than the header.
     """
     separator, fields = layout.separator, layout.fields
     samples, is_cut = list(numbered), False
@@ -346,10 +339,8 @@ def _likely_marks(path: Path, cells: pd.DataFrame, separator: str) -> list[Marks
     Decimals do not always have three digits: if a column has numbers below 1,000 without a mark,
     and none above, the mark separates thousands. Otherwise it is the decimal mark, as usual.
 
-    Warns
-    -----
-    InputWarning
-        How a number is read, except for decimal points beside commas that separate columns.
+    Warns InputWarning: how a number is read, except for decimal points beside commas that separate
+    columns.
     """
     columns = [column.dropna().str.strip() for _, column in cells.items()]
     read: tuple[str, str] | None = None
@@ -387,15 +378,9 @@ def _numbers(
 ) -> NDArray[Any]:
     """Return a column's numbers, nan for ``words``; dates and times of day in seconds.
 
-    Raises
-    ------
-    InputError
-        A cell is no number, or only begins like one, or most are words; the text names its line.
-
-    Warns
-    -----
-    InputWarning
-        If some cells are words.
+    Raises InputError: a cell is no number, or only begins like one, or most are words; the text
+    names its line.
+    Warns InputWarning: if some cells are words.
     """
     if column.dtype.kind in "iuf":
         return np.asarray(column)
@@ -435,3 +420,78 @@ def _numbers(
         warnings.warn(one_line(f"{where}: {cells}, taken as missing"), InputWarning, stacklevel=4)
         return np.asarray(numbers, dtype=np.float64)
     raise InputError(f"{where} is not a number; write it like 1.5, or nothing where it is missing")
+
+
+def read_workbook(path: Path, table: int | str | None = None) -> Source:
+    """Return the columns of the sheet with columns of numbers, or of ``table`` if several have.
+
+    Raises InputError: openpyxl is not installed, no sheet has such columns, or several have and
+    none is chosen.
+    Warns InputWarning: if rows above the header are skipped.
+    """
+    try:
+        from openpyxl import load_workbook  # noqa: PLC0415  # an extra
+    except ImportError:
+        advice = "pip install 'bwbayes[xlsx]', or export it as CSV"
+        raise InputError(f"{path}: reading a workbook needs openpyxl; {advice}") from None
+    with warnings.catch_warnings():  # of styles and validations, which do not matter here
+        warnings.filterwarnings("ignore", module="openpyxl")
+        texts = _texts(load_workbook(path, read_only=True, data_only=True))
+    tables: dict[str, tuple[Source, list[str]]] = {}
+    unread: dict[str, InputError] = {}
+    for sheet, text in texts.items():
+        titles = [text_table.title for text_table in tables_of(text.split("\n"))]
+        for number, title in enumerate(titles, start=1):
+            name = sheet if len(titles) == 1 else f"{sheet}: {title}"
+            try:
+                with warnings.catch_warnings(record=True) as remarks:
+                    warnings.simplefilter("always", InputWarning)
+                    source = text_source(path, text, number, is_whole=True)
+            except InputError as error:
+                unread[name] = error
+                continue
+            if any(series.size > 1 for series in source.series):  # else a number among words
+                tables[name] = source, [str(remark.message) for remark in remarks]
+    if str(table) in unread or not tables:
+        nothing = NoNumbersError(f"{path}: no sheet has columns of numbers; give a row a sample")
+        raise unread.get(str(table), nothing)
+    source, messages = [*tables.values()][index_of(path, [*tables], table)]
+    for remark in messages:
+        warnings.warn(remark, InputWarning, stacklevel=4)
+    return source
+
+
+def _texts(book: Any) -> dict[str, str]:
+    """Return the sheets of a workbook as text, and close it."""
+    # Read the numbers behind times, since openpyxl rounds times to milliseconds.
+    styles, book._date_formats = book._date_formats, set()
+    texts = {}
+    for sheet in book.worksheets:
+        sheet.reset_dimensions()  # the dimensions that programs write may be wrong
+        cells = [[_cell(cell, book, styles) for cell in row] for row in sheet.iter_rows()]
+        width = max(map(len, cells), default=0)
+        text = StringIO()
+        writer = csv.writer(text, delimiter="\t", lineterminator="\n")
+        writer.writerows([*row, *[""] * (width - len(row))] for row in cells)
+        texts[sheet.title] = text.getvalue()
+    book.close()
+    return texts
+
+
+def _cell(cell: Any, book: Any, styles: Collection[int]) -> str:
+    """Return a cell's text; one with the style of times becomes a date, or h:m:s.
+
+    Excel keeps 15 digits of days: 10 us for a date of today, 1 ns for less than a day.
+    """
+    value = cell.value
+    if value is None:
+        return ""
+    is_number = isinstance(value, int | float) and value >= 0
+    if not is_number or cell._style_id not in styles:
+        return " ".join(str(value).split())
+    digits = 9 if value < 1 else min(9, 9 - math.floor(math.log10(value)))
+    ns = round(value * 86400 * 10**digits) * 10 ** (9 - digits)
+    if value < 1 or cell._style_id in book._timedelta_formats:
+        minutes, ns = divmod(ns, 60 * 10**9)
+        return f"{minutes // 60}:{minutes % 60:02}:{ns // 10**9:02}.{ns % 10**9:09}"
+    return str(np.datetime64(book.epoch, "ns") + np.timedelta64(ns, "ns")).replace("T", " ")
