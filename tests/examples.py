@@ -24,7 +24,7 @@ from bwbayes.record import Record, write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Waveform
 from bwbayes.report.figures import picture_of
-from bwbayes.report.page import NO_PLOTS
+from bwbayes.report.outputs import NO_PLOTS
 from tests.app import small
 from tests.app.specimens import CONFIG, record as specimen, specimens
 

@@ -160,8 +160,8 @@ class Design(Product, Sequence[DesignScore]):
 
     def report(self) -> Report:
         """Return which signal teaches most, by how much, and what it looks like, to be shown."""
-        from bwbayes.report.figures.control import draw_promises  # noqa: PLC0415
-        from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415
+        from bwbayes.report.figures.products import draw_promises  # noqa: PLC0415
+        from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415
 
         best, amplifier = self.best, self.amplifier
         feasible = [score for score in self.scores if not score.refused]
@@ -288,7 +288,7 @@ class RivalDesign(Design):
 
     def report(self) -> Report:
         """Return which signals tell the model from its rivals, and by how much, to be shown."""
-        from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415
+        from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415
 
         validation, training = self.validation, self.training
         seconds = self.interval * self.signals[validation.name].size

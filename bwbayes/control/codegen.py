@@ -30,22 +30,12 @@ def c_functions(
 ) -> str:
     """Return functions and those that they call as static functions of C, callees first.
 
-    Parameters
-    ----------
-    functions
-        Functions of numbers, and of arrays. C returns the first number that they return, and writes
-        the others through pointers.
-    shapes
-        Shapes of the arrays by the names of arguments; those in ``WRITTEN`` are written to.
-    prefix
-        Beginning of the functions' names.
-    bindings
-        Functions that arguments stand for: C has these by their names.
+    They are of numbers and of arrays, with ``shapes`` by the names of arguments; those in
+    ``WRITTEN`` are written to. C returns the first number that a function returns, and writes the
+    others through pointers. ``bindings`` are functions that arguments stand for: C has these by
+    their names. All names begin with ``prefix``.
 
-    Raises
-    ------
-    InputError
-        An expression or statement that has no counterpart here.
+    Raises InputError: an expression or statement that has no counterpart here.
     """
     printed: dict[FunctionType, str] = {}
     for function in functions:

@@ -50,20 +50,10 @@ FILES = ("model.json", "actuator.c")
 class Exported(Product):
     """A model of an actuator that is ready for a controller.
 
-    Parameters
-    ----------
-    name
-        Its name.
-    model
-        The one model, a sample at a time.
-    limits
-        The voltages that its inverse may give, V, and how fast.
-    sds
-        Standard deviations of its parameters, by name, if they are known.
-    without_inverse
-        Why it has no inverse; None if it has one.
-    standing
-        How the validation of the run came out that it is of.
+    ``model`` is the one model, a sample at a time; its inverse gives voltages within ``limits``, V,
+    and changes them as fast; ``without_inverse`` says why it has none. ``sds`` are the standard
+    deviations of its parameters, by name, if they are known, and ``standing`` is how the validation
+    of its run came out.
     """
 
     NAME: ClassVar[str] = "model"
@@ -92,10 +82,7 @@ class Exported(Product):
     ) -> list[Path]:
         """Write ``model.json`` and ``actuator.c`` to a folder, and return them.
 
-        Raises
-        ------
-        InputError
-            A file that exists, unless it may be replaced, or that cannot be written.
+        Raises InputError: a file that exists, unless it may be replaced, or that cannot be written.
         """
         numbers, code = files = [Path(folder) / name for name in FILES]
         refuse_existing(files, overwrite=overwrite)
@@ -273,10 +260,7 @@ def exported(
     The actuator has parts, hold and the controller's sampling interval; the others are those of
     :class:`Exported`.
 
-    Raises
-    ------
-    InputError
-        A hysteresis that has no step of bounded time, or voltages without a limit.
+    Raises InputError: a hysteresis that has no step of bounded time, or voltages without a limit.
     """
     if not np.isfinite(limits.span).all():
         raise InputError(f"limits: {limits.low:g} to {limits.high:g} V; give two voltages")

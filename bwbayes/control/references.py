@@ -53,25 +53,12 @@ TRACKED: Mapping[str, bool] = {
 class Reference:
     """The displacement that is asked for, (samples,), um, at a sampling interval, s.
 
-    0 um is where the actuator stands at zero volts as the command begins. The smoothing keeps the
-    first value and the last.
+    0 um is where the actuator stands at zero volts as the command begins. ``smoothed`` is the sd of
+    the Gaussian that smooths it, s, which keeps the first value and the last; ``approach`` is the
+    length of the way from 0 um that was put before it, s: see :meth:`from_zero`.
 
-    Parameters
-    ----------
-    displacement, interval
-        As above.
-    name
-        Its name.
-    smoothed
-        Sd of the Gaussian that smooths it, s; zero leaves it as it is.
-    approach
-        Length of the way from 0 um that was put before it, s; see :meth:`from_zero`.
-
-    Raises
-    ------
-    InputError
-        Fewer than ten samples, one that is not finite, a constant, an interval that is not
-        positive, or a negative smoothing.
+    Raises InputError: fewer than ten samples, one that is not finite, a constant, an interval that
+    is not positive, or a negative smoothing.
     """
 
     __repr__ = brief
@@ -157,10 +144,7 @@ def build_reference(
     amplitude and middle in um, the frequency in Hz; ``smoothed`` is the sd of the smoothing, s, by
     default a hundredth of a period.
 
-    Raises
-    ------
-    InputError
-        An unknown shape, or a number that makes no sense.
+    Raises InputError: an unknown shape, or a number that makes no sense.
     """
     if shape not in SHAPES:
         raise InputError(f"reference: {shape!r} is unknown; {suggestion(shape, SHAPES)}")
@@ -198,19 +182,10 @@ def tracking_signals(
 ) -> tuple[FloatArray, int]:
     """Return the signals of ``TRACKED`` at a frequency, (signals, samples), um, and their begin.
 
-    Parameters
-    ----------
-    frequency, interval
-        Hz, s.
-    center, amplitude
-        The signals swing by the amplitude about the center, um. Before they begin the displacement
-        goes smoothly from zero, its rest, to the center.
-    rise
-        How many samples a jump takes: no actuator follows one that takes none.
-
-    Notes
-    -----
-    A signal has three periods, or as many as take a second, and a sample more than is judged.
+    Frequency in Hz, interval in s. The signals swing by the amplitude about the center, um. Before
+    they begin the displacement goes smoothly from zero, its rest, to the center. A jump takes
+    ``rise`` samples: no actuator follows one that takes none. A signal has three periods, or as
+    many as take a second, and a sample more than is judged.
     """
     periods = max(3, int(np.ceil(frequency)))
     samples = max(round(periods / (frequency * interval)), 2)

@@ -174,18 +174,7 @@ class SampledModel:
 
     They start demagnetized at zero volts, go to a first voltage and settle there, with dynamics and
     creep at rest. 0 um is where they stand at zero volts: the displacement is without the sensor's
-    offset.
-
-    Parameters
-    ----------
-    actuator
-        Parts, hold and sampling interval.
-    column
-        The columns (models,) of θ by name.
-    step
-        The operator's step.
-    sections
-        Dynamics and creep.
+    offset. ``column`` has the columns (models,) of θ by name; ``sections`` are dynamics and creep.
     """
 
     __repr__ = brief
@@ -199,10 +188,8 @@ class SampledModel:
     def of(cls, actuator: Actuator, theta: FloatArray) -> Self:
         """Return the models with parameters θ (models, parameters).
 
-        Raises
-        ------
-        InputError
-            The hysteresis has no step of bounded time, or a stage sees what a controller does not.
+        Raises InputError: the hysteresis has no step of bounded time, or a stage sees what a
+        controller does not.
         """
         column = {name: values.copy() for name, values in actuator.columns(theta).items()}
         actuator = actuator.without_events
@@ -420,11 +407,8 @@ def _undone(
 def require_inverse(model: SampledModel, limits: Span) -> None:
     """Refuse models that have no inverse a sample at a time.
 
-    Raises
-    ------
-    InputError
-        The displacement may turn back while the voltage goes on, or the dynamics between samples
-        are such that the voltage would swing ever wider from sample to sample.
+    Raises InputError: the displacement may turn back while the voltage goes on, or the dynamics
+    between samples are such that the voltage would swing ever wider from sample to sample.
     """
     for stage in model.actuator.stages:
         stage.require_inverse()

@@ -18,8 +18,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.gains import Gains, Margins, Robustness, design
-from bwbayes.control.loop import CONTROLLERS, LoopNoise, Stand, follow, plan_loops
+from bwbayes.control.loop import (
+    CONTROLLERS,
+    Gains,
+    LoopNoise,
+    Margins,
+    Robustness,
+    Stand,
+    design,
+    follow,
+    plan_loops,
+)
 from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.diagnosis.validation import ValidationSummary
@@ -150,7 +159,7 @@ class Tracking(Product):
 
     def report(self) -> Report:
         """Return margins, error against frequency, errors, gains and the stand, to be shown."""
-        from bwbayes.report.figures.control import draw_tracking  # noqa: PLC0415
+        from bwbayes.report.figures.products import draw_tracking  # noqa: PLC0415
 
         table, margins, requested = self.to_pandas(), self.margins, self.robustness
         stable = (
@@ -276,30 +285,16 @@ def track(
 ) -> Tracking:
     """Follow the paper's signals with four controllers.
 
-    Parameters
-    ----------
-    actuator
-        Parts and the controller's interval; the voltage is held.
-    theta, noise
-        (draws, parameters): the actuators that are simulated, and what each has beside them.
-    stand, generator, robustness
-        The test stand, the source of discrepancy and sensor noise, and the margins to keep.
-    frequencies
-        Hz; by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean model's dynamics
-        leave 71% of a sine, or to a tenth of the samples.
-    amplitude
-        Amplitude of the references, um; by default 80% of what the mean model reaches.
-    all_theta
-        (draws, parameters): all draws that the controller must be stable with, and whose mean is
-        the model; by default those that are simulated.
-    watch
-        Called with the name of a step and the share of it that is done.
+    The ``actuator`` has parts and the controller's interval; its voltage is held. ``theta`` (draws,
+    parameters) are the actuators that are simulated, each with its ``noise``; ``all_theta`` all
+    draws that the controller must be stable with, and whose mean is the model, by default the same.
+    ``frequencies``, Hz, are by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean
+    model's dynamics leave 71% of a sine, or to a tenth of the samples; the ``amplitude``, um, is by
+    default 80% of what the mean model reaches. ``watch`` is called with the name of a step and the
+    share of it that is done.
 
-    Raises
-    ------
-    InputError
-        A model that has no step or no inverse, margins that cannot be had, frequencies that are too
-        fast or too slow, or an amplitude that is out of reach.
+    Raises InputError: a model that has no step or no inverse, margins that cannot be had,
+    frequencies that are too fast or too slow, or an amplitude that is out of reach.
     """
     robustness, limits = robustness or Robustness(), stand.limits
     all_theta = theta if all_theta is None else all_theta

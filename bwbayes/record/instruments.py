@@ -67,17 +67,11 @@ class Scales(NamedTuple):
 class Instruments:
     """How well the instruments of a record are known.
 
-    Parameters
-    ----------
-    sensor_scale, amplifier_gain
-        Relative standard uncertainty of the sensor's and of the voltage monitor's scale.
-    linearity
-        The sensor's largest departure from a straight line, as a part of the range.
+    ``sensor_scale`` and ``amplifier_gain`` are the relative standard uncertainties of the sensor's
+    and of the voltage monitor's scale; ``linearity`` is the sensor's largest departure from a
+    straight line, as a part of the range.
 
-    Raises
-    ------
-    InputError
-        One of them is negative or above a fifth.
+    Raises InputError: one of them is negative or above a fifth.
     """
 
     sensor_scale: float = 0.0
@@ -129,12 +123,10 @@ class Instruments:
     @property
     def facts(self) -> dict[str, str]:
         """The stated uncertainties in words, by subject."""
+        known = "known to {:.3g} % (one standard uncertainty)"
         named = {
-            "sensor scale": (self.sensor_scale, "known to {:.3g} % (one standard uncertainty)"),
-            "monitor scale": (
-                self.amplifier_gain,
-                "known to {:.3g} % (one standard uncertainty)",
-            ),
+            "sensor scale": (self.sensor_scale, known),
+            "monitor scale": (self.amplifier_gain, known),
             "sensor linearity": (self.linearity, "within {:.3g} % of the range"),
         }
         return {name: text.format(100 * value) for name, (value, text) in named.items() if value}
@@ -147,10 +139,7 @@ EXACT = Instruments()
 def split_uncertainty(unit: str, where: str) -> tuple[str, float | None]:
     """Return a unit without its uncertainty, and the relative uncertainty, or None without one.
 
-    Raises
-    ------
-    InputError
-        An uncertainty that cannot be read.
+    Raises InputError: an uncertainty that cannot be read.
     """
     if not re.search(r"\+-|\+/-|±", unit):
         return unit, None
@@ -167,10 +156,7 @@ def split_uncertainty(unit: str, where: str) -> tuple[str, float | None]:
 def part_of_range(text: str, where: str) -> float:
     """Return the part of a range that a text such as ``0.1 %`` states.
 
-    Raises
-    ------
-    InputError
-        It is no percentage.
+    Raises InputError: it is no percentage.
     """
     match = re.fullmatch(rf"\s*({_NUMBER})\s*%\s*", text)
     if match is None:

@@ -133,7 +133,7 @@ def _bands(calibration: Calibration) -> Table:
 
 
 def _pictures(calibration: Calibration) -> list[Picture]:
-    from bwbayes.report.figures import studies  # noqa: PLC0415  # slow to load
+    from bwbayes.report.figures import products  # noqa: PLC0415  # slow to load
 
     return [
         Picture(
@@ -141,7 +141,7 @@ def _pictures(calibration: Calibration) -> list[Picture]:
             "Ranks",
             "Where the truth lies among the posterior's draws, over all replicates. Level is "
             "right; a bowl means posteriors that are too narrow, a hump too wide, a slope a bias.",
-            partial(studies.draw_histograms, calibration),
+            partial(products.draw_histograms, calibration),
         ),
         Picture(
             "rank_ecdf",
@@ -149,14 +149,14 @@ def _pictures(calibration: Calibration) -> list[Picture]:
             "The ranks' cumulative distribution less that of even ranks, with the band that even "
             "ranks leave anywhere no more often than the stated level allows; p of the smooth "
             "test.",
-            partial(studies.draw_ecdf, calibration),
+            partial(products.draw_ecdf, calibration),
         ),
         Picture(
             "coverage",
             "Coverage",
             "Left: how often the posteriors' central intervals hold the truth. Right: how far the "
             "coverage of the bands on held-out samples is off what they promise.",
-            partial(studies.draw_coverage, calibration),
+            partial(products.draw_coverage, calibration),
         ),
     ]
 

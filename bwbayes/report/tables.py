@@ -152,12 +152,8 @@ def scores_table(
 ) -> Table:
     """Return a table of the bands' scores on readings: a row for each of the bands.
 
-    Parameters
-    ----------
-    scores, verdicts, titles
-        Each by the bands' names, in their order; the titles are for the page.
-    records
-        The rows of the CSV.
+    Scores, validation and titles are by the bands' names, in their order; the titles are for the
+    page. ``records`` are the rows of the CSV.
     """
     rows = []
     for name, judged in scores.items():

@@ -14,7 +14,7 @@ from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures import draw_styled, plots_of
 from bwbayes.report.figures.pictures import pictures
-from bwbayes.report.page import render
+from bwbayes.report.outputs import render
 from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult

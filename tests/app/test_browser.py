@@ -18,7 +18,7 @@ from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.designed import Design, DesignScore
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.model.limits import Limits
-from bwbayes.report.page import render
+from bwbayes.report.outputs import render
 from tests.app import example, small
 from tests.programs import needs
 

@@ -26,7 +26,7 @@ from bwbayes.report.figures.chain import _rank_heights, draw_trace
 from bwbayes.report.figures.pictures import pictures
 from bwbayes.report.figures.series import _around_largest_error, draw_bands, draw_loop
 from bwbayes.report.figures.style import Color, envelope, zigzag
-from bwbayes.report.page import NO_PLOTS
+from bwbayes.report.outputs import NO_PLOTS
 from bwbayes.report.result import Result
 from tests.app import example
 

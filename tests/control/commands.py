@@ -16,8 +16,7 @@ from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.arrays import FloatArray
-from bwbayes.control.compensation import compensate
-from bwbayes.control.predicted import Compensation
+from bwbayes.control.compensation import Compensation, compensate
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.noise import noise_model

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from bwbayes.control.gains import ANGLES, Gains, Margins, Robustness, design, margins
+from bwbayes.control.loop import ANGLES, Gains, Margins, Robustness, design, margins
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.gains import Gains, Robustness, design
-from bwbayes.control.loop import LoopNoise, LoopPlan, Stand, follow
+from bwbayes.control.loop import Gains, LoopNoise, LoopPlan, Robustness, Stand, design, follow
 from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise, WhiteNoise
 from bwbayes.inference.state_space import Noise

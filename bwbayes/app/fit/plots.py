@@ -15,9 +15,9 @@ from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
 from bwbayes.report.figures import draw_styled
-from bwbayes.report.figures.control import draw_tracking
 from bwbayes.report.figures.pictures import PICTURES, draw_kind, pictures
-from bwbayes.report.figures.record import record_pictures
+from bwbayes.report.figures.products import draw_tracking
+from bwbayes.report.figures.series import record_pictures
 from bwbayes.report.report import Figure
 
 

@@ -43,8 +43,6 @@ from bwbayes.report.calibration import calibration_report
 from bwbayes.report.outputs import save
 from bwbayes.sampling.chain import draws
 
-AROUND = "draws of the posterior; each record is fitted together with the run's own readings"
-
 
 class _Request(BaseModel):
     """A line that says how many replicates were requested, of what."""
@@ -196,6 +194,10 @@ def _finish(
     with StepProgress(console, "judging and drawing ...") as watch:
         ordered = [entries[number] for number in sorted(entries)]
         packages = versions(problem.posterior.engine)
+        truths = "the prior's draws"
+        if common.around is not None:
+            truths = "draws of the posterior; each record is fitted together with the run's own "
+            truths += "readings"
         calibration = replace(
             evaluate_calibration(ordered, generator(seed, "ranks")),
             name=problem.config.name or "calibration",
@@ -203,7 +205,7 @@ def _finish(
             quantities=problem.quantities,
             facts=[
                 *problem.facts.items(),
-                ("truths", "the prior's draws" if common.around is None else AROUND),
+                ("truths", truths),
                 ("held out", ", ".join(common.bands and problem.validations) or "nothing"),
                 (
                     "sampling",

@@ -374,7 +374,7 @@ class Campaign(Product):
         }
 
     def _draw(self) -> Figure:
-        from bwbayes.report.figures.studies import draw_parameters  # noqa: PLC0415  # slow to load
+        from bwbayes.report.figures.products import draw_parameters  # noqa: PLC0415  # slow to load
 
         estimates = {row.name: self._estimates(row) for row in self.rows if row.parameters}
         return draw_parameters(estimates, {name: s.new for name, s in self._spreads.items()})

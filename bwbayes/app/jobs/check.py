@@ -32,7 +32,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
 
     Raises InputError: the config or its record cannot be used.
     """
-    from bwbayes.report.figures.record import record_pictures  # noqa: PLC0415  # slow to load
+    from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415  # slow to load
 
     problem, point, steps, explained = choose_model(resolve_config(config, folder), watch)
     posterior, seed = problem.posterior, config.seed

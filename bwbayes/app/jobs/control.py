@@ -23,11 +23,9 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import amplifier_limits
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator
-from bwbayes.control.compensation import compensate as compensated
+from bwbayes.control.compensation import Compensation, compensate as compensated
 from bwbayes.control.exported import Exported, exported
-from bwbayes.control.gains import Robustness
-from bwbayes.control.loop import LoopNoise, Stand
-from bwbayes.control.predicted import Compensation
+from bwbayes.control.loop import LoopNoise, Robustness, Stand
 from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.control.tracking import Tracking, track as tracked
 from bwbayes.diagnosis import extrapolation

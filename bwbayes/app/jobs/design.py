@@ -115,86 +115,43 @@ def design(
     # turns most.
     records = problem.records
     record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
+    measured, posterior = records[record], problem.posterior.for_record(record)
     low, high = voltage or fitted_voltages(problem)
-    if slew is None:
-        slew = _fastest(records[record]) if validate else np.inf
-    amplifier = Limits(low, high, slew, current, capacitance)
-    seconds = records[record].duration
+    seconds = measured.duration
     if validate:
-        # A short record: ten periods.
-        seconds = min(
-            seconds, 20 * time_between_turns(records[record].voltage, records[record].interval)
-        )
-    signals = candidates_of(candidates, records[record], amplifier, seconds)
-    if validate:
-        return _by_rivals(fit, record, signals, amplifier, watch)
-    quantity: str | FloatArray
+        # A short record, of ten periods, and as fast as the record's drive.
+        seconds = min(seconds, 20 * time_between_turns(measured.voltage, measured.interval))
+        path, interval = measured.path.voltage, measured.interval
+        fast = fastest(path, interval, PART * time_between_turns(path, interval))
+        slew = fast if slew is None else slew
+    amplifier = Limits(low, high, np.inf if slew is None else slew, current, capacitance)
+    signals = candidates_of(candidates, measured, amplifier, seconds)
+    flat = problem.posterior.select_draws(fit.flat_draws, record)
+    rng, ranking = generator(problem.config.seed, "design"), partial(watch, "candidates")
     parameter, drive = None, None
-    if isinstance(target, str):
-        quantity = parameter = target
-    elif isinstance(target, Path):
-        read_as = problem.config.records[record].read_as
-        quantity, drive = _drive(target, records[record].interval, read_as, reading), str(target)
+    kind: type[Design] = Design
+    scores: Sequence[DesignScore]
+    if validate:
+        kind, study = RivalDesign, problem.study.for_record(record)
+        rivals = fit.rivals(record, partial(watch, "rivals"))
+        scores = rank_by_rivals(posterior, flat, study, rivals, signals, amplifier, rng, ranking)
     else:
-        quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
-    scores = rank_designs(
-        problem.posterior.for_record(record),
-        problem.posterior.select_draws(fit.flat_draws, record),
-        signals,
-        quantity,
-        amplifier,
-        generator(problem.config.seed, "design"),
-        partial(watch, "candidates"),
-    )
-    _require_possible(scores)
-    return Design(
-        fit.folder.path.name,
-        parameter,
-        drive,
-        amplifier,
-        signals,
-        records[record].interval,
-        fit.standing,
-        scores,
-    )
-
-
-def _fastest(record: Record) -> float:
-    """Return the speed of a record's drive, V/s."""
-    over = PART * time_between_turns(record.path.voltage, record.interval)
-    return fastest(record.path.voltage, record.interval, over)
-
-
-def _by_rivals(
-    fit: Run, record: str, signals: dict[str, FloatArray], amplifier: Limits, watch: WatchSteps
-) -> RivalDesign:
-    """Rank signals by what they would tell of the model of a training record and its rivals."""
-    problem = fit.problem
-    rivals = fit.rivals(record, partial(watch, "rivals"))
-    scores = rank_by_rivals(
-        problem.posterior.for_record(record),
-        problem.posterior.select_draws(fit.flat_draws, record),
-        problem.study.for_record(record),
-        rivals,
-        signals,
-        amplifier,
-        generator(problem.config.seed, "design"),
-        partial(watch, "candidates"),
-    )
-    _require_possible(scores)
-    interval = problem.records[record].interval
-    return RivalDesign(
-        fit.folder.path.name, None, None, amplifier, signals, interval, fit.standing, scores
-    )
-
-
-def _require_possible(scores: Sequence[DesignScore]) -> None:
-    """Refuse candidates that the amplifier cannot make, if it can make none."""
+        quantity: str | FloatArray
+        if isinstance(target, str):
+            quantity = parameter = target
+        elif isinstance(target, Path):
+            read_as = problem.config.records[record].read_as
+            quantity, drive = _drive(target, measured.interval, read_as, reading), str(target)
+        else:
+            quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
+        scores = rank_designs(posterior, flat, signals, quantity, amplifier, rng, ranking)
     if scores[0].refused:
         raise InputError(
             f"design: the amplifier can make none of the candidates; {scores[0].name} "
             f"{scores[0].refused}"
         )
+    name, interval = fit.folder.path.name, measured.interval
+    return kind(name, parameter, drive, amplifier, signals, interval, fit.standing, scores)
 
 
 def candidates_of(

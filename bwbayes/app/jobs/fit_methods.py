@@ -27,8 +27,6 @@ from bwbayes.model.limits import Limits
 from bwbayes.model.operator import Span
 from bwbayes.report.report import Shown
 
-EARLIER = {"own_offset": "estimate_offset", "lead_in_from": "lead_in_start"}  # earlier names
-
 
 def fit_method[**P, R](
     job: Callable[Concatenate[Run, P], R],
@@ -39,12 +37,13 @@ def fit_method[**P, R](
     product's notes.
     """
     options = [*signature(job).parameters][1:]
+    earlier = {"own_offset": "estimate_offset", "lead_in_from": "lead_in_start"}
 
     @wraps(job)
     def method(fit: Run, /, *args: P.args, **kwargs: P.kwargs) -> R:
         for name in kwargs:
             if name not in options:
-                hint = suggestion(name, options, EARLIER)
+                hint = suggestion(name, options, earlier)
                 raise InputError(f"{job.__name__}: {name} is unknown; {hint}")
         fit.require_converged()
         say = fit.quantities.say

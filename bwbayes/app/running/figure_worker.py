@@ -27,7 +27,7 @@ from bwbayes.watching import Watch, unwatched, watched
 # All else is loaded where it is used: a worker starts before anything is loaded.
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
-    from bwbayes.report.page import PagePlots
+    from bwbayes.report.outputs import PagePlots
     from bwbayes.report.result import Result
 
 # The name under which plots to zoom and hover are drawn; no picture is called so.
@@ -69,7 +69,7 @@ class FigureWorker:
         ``watch`` is called with the share that is drawn.
         """
         from bwbayes.report.figures import save_pictures  # noqa: PLC0415
-        from bwbayes.report.page import NO_PLOTS  # noqa: PLC0415
+        from bwbayes.report.outputs import NO_PLOTS  # noqa: PLC0415
 
         self.draw(result)
         works = _works(result)

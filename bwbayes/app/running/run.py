@@ -33,8 +33,7 @@ from bwbayes.inference.engine import Engine, resolve_engine
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
-from bwbayes.report.outputs import write_bands, write_summary
-from bwbayes.report.page import render
+from bwbayes.report.outputs import render, write_bands, write_summary
 from bwbayes.sampling.chain import PHASES
 from bwbayes.sampling.sampler import init_chain, sample
 from bwbayes.sampling.storage import ChainFile

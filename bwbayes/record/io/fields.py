@@ -68,6 +68,11 @@ def record_fields(
             problem = f"too few readings: {readings.size}; give at least {_MINIMUM_SAMPLES}"
             raise table.error(problem, "displacement")
         _check_moving(table, "displacement", readings)
+    texts = [table.notes.get(name) or "0" for name in INSTRUMENT_NOTES]
+    try:
+        noted = Instruments(*map(float, texts))
+    except ValueError as error:  # an InputError is one
+        raise table.error(f"{', '.join(INSTRUMENT_NOTES)}: {error}; correct them") from error
     held = kind == "command"
     covariates = {
         name: _without_gaps(table, grid, name, values.pop(name), held=False)
@@ -83,20 +88,10 @@ def record_fields(
         "start": grid.start,
         "voltage_is": kind,
         "quantities": table.quantities,
-        "instruments": _instruments(table),
+        "instruments": noted.updated(table.naming.instruments),
         "origin": table.notes.get("origin") or path_text(table.source.path.name),
         "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
     }
-
-
-def _instruments(table: ColumnTable) -> Instruments:
-    """Return the instruments by the file's notes, updated by the uncertainties the user states."""
-    texts = [table.notes.get(name) or "0" for name in INSTRUMENT_NOTES]
-    try:
-        noted = Instruments(*map(float, texts))
-    except ValueError as error:  # an InputError is one
-        raise table.error(f"{', '.join(INSTRUMENT_NOTES)}: {error}; correct them") from error
-    return noted.updated(table.naming.instruments)
 
 
 def reference_fields(table: ColumnTable) -> tuple[FloatArray, float]:

@@ -27,8 +27,7 @@ from bwbayes.model.inputs import VoltageIs, require_voltage_is
 from bwbayes.record.io.alignment import select_pair
 from bwbayes.record.io.columns import ColumnTable, Naming, select
 from bwbayes.record.io.fields import record_fields, reference_fields
-from bwbayes.record.io.hdf5 import read_hdf5, read_netcdf, write_hdf5
-from bwbayes.record.io.labview import read_tdms
+from bwbayes.record.io.hdf5 import read_hdf5, read_netcdf, read_tdms, write_hdf5
 from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
 from bwbayes.record.io.series import Source, damaged, read_numpy
 from bwbayes.record.io.units import QUANTITIES
@@ -196,7 +195,10 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
 
     Raises InputError: the file cannot be read.
     """
-    path = _existing(path)
+    if not path.exists():  # undo the escapes of `path_text` for bytes not UTF-8
+        code = rb"\\x([0-9a-f]{2})"
+        name = re.sub(code, lambda found: bytes.fromhex(found[1].decode()), os.fsencode(path))
+        path = Path(os.fsdecode(name))
     if path.is_dir():
         raise InputError(f"{path}: is a directory; give the file in it")
     if not path.exists():
@@ -214,15 +216,6 @@ def read_source(path: Path, table: int | str | None = None) -> Source:
         raise
     except Exception as error:  # whatever a library raises of a damaged file
         raise damaged(path, error) from error
-
-
-def _existing(path: Path) -> Path:
-    """Return a path; if it does not exist, undo the escapes of `path_text` for bytes not UTF-8."""
-    if path.exists():
-        return path
-    encoded = os.fsencode(path)
-    name = re.sub(rb"\\x([0-9a-f]{2})", lambda code: bytes.fromhex(code[1].decode()), encoded)
-    return Path(os.fsdecode(name))
 
 
 def _reader(path: Path, begin: bytes, table: int | str | None) -> Callable[[Path], Source]:

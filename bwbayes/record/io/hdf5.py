@@ -1,4 +1,4 @@
-"""Records in HDF5 and netCDF: datasets ``time_s``, ``voltage_V``, ``displacement_um``, or others.
+"""Records in HDF5, netCDF and TDMS: datasets ``time_s``, ``voltage_V``, or others.
 
 Datasets may stand in groups, and are named by their path, ``run_3/hv_out``; an attribute ``unit``
 says a dataset's unit, one like ``fs`` or ``dt`` how fast it was sampled; packed numbers, as netCDF
@@ -6,6 +6,8 @@ has them, are unpacked by ``scale_factor``, ``add_offset`` and ``_FillValue``; c
 matrix are series of their own, ``table.u`` and ``log[2]``. Beside the datasets may stand
 ``voltage_is``, ``origin``, ``interval_s`` and ``time_offset_s``, as attributes or, in MATLAB's
 files of version 7.3, as variables. NetCDF of version 4 is HDF5; older versions are read by SciPy.
+National Instruments' ``.tdms`` files are read by npTDMS; channels are named by their group,
+``group/channel``, and waveforms state clocks.
 """
 
 from __future__ import annotations
@@ -32,8 +34,10 @@ from bwbayes.record.io.series import (
     INSTRUMENT_NOTES,
     NOTES,
     RATES,
+    Clock,
     Series,
     Source,
+    in_seconds,
     note,
     notes_of,
     pass_over_object,
@@ -341,3 +345,28 @@ def _values(variable: Any) -> Any:
     if values.dtype.kind in "iu" and not np.ma.is_masked(values):
         return values.filled().astype(values.dtype.newbyteorder("="))
     return values.astype(np.float64).filled(np.nan)
+
+
+def read_tdms(path: Path) -> Source:
+    """Return the channels of a TDMS file; npTDMS may raise any exception for a damaged one.
+
+    Raises InputError: npTDMS is not installed.
+    """
+    try:
+        from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+    except ImportError:
+        raise InputError(
+            f"{path}: reading TDMS needs npTDMS; pip install 'bwbayes[tdms]'"
+        ) from None
+
+    series = []
+    for channel in (c for group in TdmsFile.read(path).groups() for c in group.channels()):
+        wave, clock = channel.properties, None
+        if wave.get("wf_increment"):
+            start = float(wave.get("wf_start_offset", 0.0))
+            clock = Clock(float(wave["wf_increment"]), start, wave.get("wf_start_time"))
+        name, group = f"{channel.group_name}/{channel.name}", f"{channel.group_name}/"
+        load = partial(lambda channel: in_seconds(channel[:]), channel)
+        unit = str(wave.get("unit_string", ""))
+        series.append(Series(name, len(channel), load, unit, group, clock=clock))
+    return Source(path, tuple(series))

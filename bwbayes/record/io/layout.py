@@ -70,7 +70,10 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
     for candidate in SEPARATORS if rows else ():
         split = [cells_of(line, candidate) for line in rows]
         width = Counter(map(len, split)).most_common(1)[0][0]
-        if width < 2 or (candidate == "," and _is_one_with_decimals(split)):
+        pairs = [row for row in split if len(row) == 2]
+        # Decimal commas of a single column: a second number that begins with 0.
+        has_zeros = candidate == "," and any(re.fullmatch(r"0\d+", row[1]) for row in pairs)
+        if width < 2 or (has_zeros and len(pairs) > 0.5 * len(split)):
             continue
         full_rows = [row for row in split if len(row) == width]
         numeric = np.array([[bool(_NUMBER.fullmatch(cell)) for cell in row] for row in full_rows])
@@ -105,12 +108,6 @@ def find_layout(path: Path, lines: Sequence[str]) -> Layout:
         del in_a_row[0], below[0]
     empty = frozenset(i for i in range(fields) if not "".join(below[0][i : i + 1]))
     return Layout(separator, fields, in_a_row[0], empty)
-
-
-def _is_one_with_decimals(rows: Sequence[list[str]]) -> bool:
-    """Tell whether commas are decimal commas of a single column: no second number begins with 0."""
-    pairs = [row for row in rows if len(row) == 2]
-    return len(pairs) > 0.5 * len(rows) and any(re.fullmatch(r"0\d+", row[1]) for row in pairs)
 
 
 def _is_numbering(rows: Sequence[list[str]]) -> bool:

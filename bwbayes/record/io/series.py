@@ -141,18 +141,11 @@ def vectors(
 ) -> Iterator[Series]:
     """Yield the series in an array: the array, its columns, or a table's fields.
 
-    Parameters
-    ----------
-    group, leaf
-        The path of the array, with a separator at its end, and its name.
-    shape, dtype
-        Shape and type of the array that ``load()`` returns. An array without a shape, too large,
-        or with more than 64 columns (a picture, or samples in another order) is skipped.
-    unit
-        Unit of the array's numbers, if it is stated.
-    columns
-        Names and units of the columns, by the name of the array or the table's field, where as many
-        are stated; else columns are numbered.
+    ``group`` and ``leaf`` are the path of the array, with a separator at its end, and its name.
+    Shape and type are those of the array that ``load()`` returns; one without a shape, too large,
+    or with more than 64 columns (a picture, or samples in another order) is skipped. ``columns``
+    are names and units of the columns, by the name of the array or the table's field, where as many
+    are stated; else columns are numbered.
     """
     sides = [n for n in shape or () if n != 1]
     if shape is None or max(sides, default=1) > MAXIMUM_SAMPLES:

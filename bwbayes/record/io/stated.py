@@ -84,7 +84,11 @@ def in_stated_quantities(
     """
     stated = naming.input, naming.output
     if stated == (None, None):
-        stated = _noted(source)
+        notes = source.notes.get("", {})
+        noted = notes.get("input_is"), notes.get("output_is")
+        with suppress(InputError):  # notes of another form than the package's
+            Quantities.of(*noted)
+            stated = noted
     if stated == (None, None):
         return source, naming, naming.quantities
     quantities = Quantities.of(*stated)
@@ -115,16 +119,6 @@ def in_stated_quantities(
         quantities, fs = Quantities.of(*stated, has_clock=False), 1.0
     source = replace(source, series=tuple(changed[series.name] for series in source.series))
     return source, replace(naming, columns=columns, units=units, fs=fs), quantities
-
-
-def _noted(source: Source) -> tuple[str | None, str | None]:
-    """Return the quantities that a file's notes state in the form that this package writes."""
-    notes = source.notes.get("", {})
-    stated = notes.get("input_is"), notes.get("output_is")
-    with suppress(InputError):
-        Quantities.of(*stated)
-        return stated
-    return None, None
 
 
 def _parts(series: Series, quantity: Quantity) -> tuple[str, str]:

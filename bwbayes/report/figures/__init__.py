@@ -22,7 +22,7 @@ from bwbayes.report.figures.style import STYLE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from bwbayes.report.page import PagePlots
+    from bwbayes.report.outputs import PagePlots
     from bwbayes.report.result import Result
 
 __all__ = ["draw_styled", "picture_of", "plots_of", "prepare", "save_pictures"]
@@ -55,7 +55,7 @@ def prepare() -> None:
 def plots_of(result: Result) -> PagePlots:
     """Return a run's interactive plots, and the scripts that draw them, if there are any."""
     from bwbayes.report.figures import interactive  # noqa: PLC0415
-    from bwbayes.report.page import NO_PLOTS, PagePlots  # noqa: PLC0415
+    from bwbayes.report.outputs import NO_PLOTS, PagePlots  # noqa: PLC0415
 
     plots = interactive.draw(result) if result.outcome.converged else {}
     return PagePlots(plots, interactive.scripts()) if plots else NO_PLOTS

@@ -20,19 +20,6 @@ from bwbayes.report.result import Result
 
 RANK_BINS = 20
 
-# Options of corner for a pair: the contours are filled and opaque, and so hide the draws below.
-CONTOURS: style.Look = {
-    "levels": (0.5, 0.9),
-    "color": style.COLORS[0],
-    "contourf_kwargs": {"colors": ["none", "#AAD0E5", style.COLORS[0]]},
-    "smooth": 0.8,
-    "plot_density": False,
-    "plot_datapoints": False,
-    "fill_contours": True,
-    "no_fill_contours": True,
-    "quiet": True,
-}
-
 
 def pair_contours() -> Callable[..., None]:
     """Load corner's ``hist2d`` alone: the package loads all of arviz, which no picture needs."""
@@ -54,6 +41,18 @@ def draw_corner(result: Result) -> Figure:
     Lines mark the true values, if they are known. One panel holds all, and each parameter has a
     cell of side one in each direction: separate panels would take many times as long.
     """
+    # Options of corner for a pair: the contours are filled and opaque, and so hide the draws below.
+    contours: style.Look = {
+        "levels": (0.5, 0.9),
+        "color": style.COLORS[0],
+        "contourf_kwargs": {"colors": ["none", "#AAD0E5", style.COLORS[0]]},
+        "smooth": 0.8,
+        "plot_density": False,
+        "plot_datapoints": False,
+        "fill_contours": True,
+        "no_fill_contours": True,
+        "quiet": True,
+    }
     flat = result.flat_draws
     flat = flat[style.starts(flat.shape[0], 5_000)]
     free = len(result.free)
@@ -76,7 +75,7 @@ def draw_corner(result: Result) -> Figure:
             x, y = columns[j] + scaled[j], rows[i] + scaled[i]
             panel.plot(x, y, ",", color=style.COLORS[0], zorder=0.5)
             cell = [(columns[j], columns[j] + 1), (rows[i], rows[i] + 1)]
-            hist2d(x, y, ax=panel, range=cell, **CONTOURS)
+            hist2d(x, y, ax=panel, range=cell, **contours)
         if (truth := truths[i]) is not None:
             at = _scale(truth, ranges[i])
             panel.vlines(columns[i] + at, 0, rows[i] + 1, color=style.Color.TRUTH)
