@@ -27,8 +27,8 @@ void run_FUNCTION(double begin, const double *values, double *result, double *he
 }
 """
 BEGINNING = """
-#include <stddef.h>
 #include "actuator.c"
+#include <stddef.h>
 size_t state_bytes(void);
 size_t state_bytes(void) { return sizeof(actuator_state); }
 """
@@ -39,8 +39,7 @@ class Compiled:
 
     def __init__(self, made: Exported, folder: Path, compiler: str) -> None:
         (folder / "actuator.c").write_text(made.c_code(), encoding="ascii")
-        # By itself, as an engineer would compile it; then with a loop around it.
-        self._compile(compiler, folder, "-c", "actuator.c", "-o", "actuator.o")
+        # With nothing before it, as an engineer would compile it, and a loop behind it.
         functions = ["forward", *(["inverse"] if made.without_inverse is None else [])]
         loops = [DRIVER.replace("FUNCTION", one) for one in functions]
         (folder / "driver.c").write_text("".join([BEGINNING, *loops]), encoding="ascii")
