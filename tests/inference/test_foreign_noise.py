@@ -241,24 +241,17 @@ def test_a_likelihood_is_dense_with_gaps_and_an_unknown_start(case: Case, engine
 
 
 @EACH
-def test_draws_have_the_covariance(case: Case) -> None:
-    """1,000 draws of 30 samples: a mean square of independent scores within 4.5 standard errors."""
-    theta = stationary_theta(case, np.array([0.3, 0.6, 0.4]))
-    noise = noise_model(case.noise, INTERVAL)
-    every = np.tile(theta, (1_000, 1))
-    draws = np.sum(noise.draw_all(every, 30, np.random.default_rng(3)), axis=0)
-    factor = np.linalg.cholesky(dense(case, theta, np.arange(30)))
-    white = scipy.linalg.solve_triangular(factor, draws.T, lower=True)
-    assert np.abs(np.mean(white**2, axis=1) - 1).max() < 4.5 * np.sqrt(2 / 1_000)
-
-
-@EACH
 def test_draws_go_on_sample_by_sample(case: Case) -> None:
-    """A long draw is x ← F x + shock, one sample after the other, to 1e-12 of its largest value."""
+    """A long draw is x ← F x + shock, one sample after the other, to 1e-12 of its largest value.
+
+    So draws have the covariance that the density takes; the sensor's noise is white beside it.
+    """
     theta = stationary_theta(case, np.array([0.3, 0.6, 0.4]))[np.newaxis]
     noise, samples = noise_model(case.noise, INTERVAL), 3_000
-    drawn, _ = noise.draw(theta, samples, np.random.default_rng(3))
-    scores = np.random.default_rng(3).standard_normal((noise.states + 1, samples))[:-1].T
+    drawn, sensor = noise.draw(theta, samples, np.random.default_rng(3))
+    *of_states, white = np.random.default_rng(3).standard_normal((noise.states + 1, samples))
+    scores = np.transpose(of_states)
+    np.testing.assert_array_equal(sensor, theta[0, 0] * white)
     (kept,) = noise.transition(theta)
     shocks = scores @ root(noise.process_covariance(theta))[0]
     states = [scores[0] @ root(noise.stationary(theta))[0]]
