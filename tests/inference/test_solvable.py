@@ -8,6 +8,7 @@ are known to about 1.3%, so one sd that is 5% wrong is found six times in seven,
 7% wrong 998 times in a thousand.
 """
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy import stats
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.engine import resolve_engine
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.linear import CASES, Linear, Normal, every_case
@@ -80,7 +82,8 @@ def test_the_point_fit_is_the_normal(free: tuple[str, ...], noise: str) -> None:
 )
 def test_the_draws_are_from_the_normal(free: tuple[str, ...], noise: str) -> None:
     model = Linear(free, noise)
-    known, result = model.exact, draws(model.posterior, converged(model.posterior, PLAN))
+    posterior = replace(model.posterior, engine=resolve_engine())
+    known, result = model.exact, draws(posterior, converged(posterior, PLAN))
     off = scores(known, result)
     assert max(map(abs, off.values())) < ALARM, off
     # The twins: a likelihood that takes the noise for 0.8 times what it is ...

@@ -31,7 +31,7 @@ from tests.prediction.runs import covered as inside
 CREEP = Creep((0.1, 1.0, 10.0))
 ACTUATOR = Actuator("lag", "first", 1 / RATE, creep=CREEP)
 KNOWN = TRUE | {"lag": 3e-3, "discrepancy_sd": 0.01}
-DRAWS = 400
+DRAWS = 200
 RECORDS = 12
 
 
