@@ -1,4 +1,4 @@
-"""What all tests share: no deadline on a busy machine, and in CI the same examples each time.
+"""What all tests share: forty examples, no deadline, and in CI the same examples each time.
 
 Elsewhere hypothesis looks for new ones in every run, and keeps those that fail for the next.
 The tests of the whole come first: they take longest, and no worker shall end with one alone. Before
@@ -9,9 +9,14 @@ Commands of other processes take this checkout too, and what is compiled of it, 
 
 import gc
 import os
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 from tests.programs import REQUIRED, VARIABLE
@@ -21,8 +26,29 @@ gc.set_threshold(50_000)
 
 os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
 
-settings.register_profile("busy", deadline=None, derandomize=os.environ.get(VARIABLE) == REQUIRED)
+settings.register_profile(
+    "busy", deadline=None, max_examples=40, derandomize=os.environ.get(VARIABLE) == REQUIRED
+)
 settings.load_profile("busy")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let one worker at a time compile; the others find in the cache what it has compiled."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or find_spec("numba") is None:
+        yield
+        return
+    lock = FileLock(tmp_path_factory.getbasetemp().parent / "compile.lock")
+    dispatcher = import_module("numba.core.dispatcher").Dispatcher
+    compile_alone = dispatcher.compile
+
+    def compile_in_turn(function: Any, signature: Any) -> Any:
+        with lock:
+            return compile_alone(function, signature)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dispatcher, "compile", compile_in_turn)
+        yield
 
 
 QUICK_ROOMS = ("population", "record", "report")

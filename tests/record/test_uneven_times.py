@@ -127,7 +127,7 @@ def test_samples_are_uniform_whose_clock_ticks_too_slowly(
 )
 @example(20_000, 44_100.0, 5, "g", 0.0, False)
 @example(100, 1 / 3, 3, "g", 0.2, True)  # late times are rounded to the second
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_times_of_a_fixed_number_of_digits_are_uniform(
     samples: int, rate: float, digits: int, form: str, start: float, is_stated: bool
 ) -> None:
@@ -257,7 +257,7 @@ def test_copied_rows_leave_a_record_as_it_was(
 )
 @example(40, 300, 0.0, 0.05, 5)
 @example(1, 12.0, 0.0, 0.0, 0)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_gap_in_a_smooth_output_is_bridged_right_and_another_refused(
     missing: int, period: float, phase: float, noise: float, others: int
 ) -> None:
