@@ -28,16 +28,21 @@ def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[s
     )
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "latin-1", "gbk", "ascii"])
-def test_text_goes_to_a_stream_of_any_encoding(encoding: str) -> None:
-    for arguments in (
-        ["models"],
-        ["run", "--help"],
-        ["config"],
-        ["run", "\N{GREEK SMALL LETTER MU}"],
-    ):
+MU = "\N{GREEK SMALL LETTER MU}"
+
+
+@pytest.mark.parametrize(
+    ("encoding", "commands"),
+    [
+        ("cp1252", [["models"]]),
+        ("gbk", [["models"]]),
+        ("ascii", [["models"], ["run", "--help"], ["config"], ["run", MU]]),
+    ],
+)
+def test_text_goes_to_a_stream_of_any_encoding(encoding: str, commands: list[list[str]]) -> None:
+    for arguments in commands:
         ended = python("-m", "bwbayes", *arguments, PYTHONIOENCODING=encoding)
-        assert ended.returncode == (2 if arguments[-1] == "\N{GREEK SMALL LETTER MU}" else 0)
+        assert ended.returncode == (2 if arguments[-1] == MU else 0)
         assert "Traceback" not in ended.stderr
 
 
@@ -48,31 +53,31 @@ def test_a_reader_that_has_gone_is_no_error(stream: str) -> None:
     assert ended.stderr == b""
 
 
-@pytest.mark.parametrize("command", [["models"], ["run", "small.toml", "--quiet"]])
-def test_what_nobody_reads_ends_as_a_broken_pipe_does(tmp_path: Path, command: list[str]) -> None:
+@pytest.mark.parametrize("command", [["models"], ["export", "copy", "--quiet"]])
+def test_what_nobody_reads_ends_as_a_broken_pipe_does(copy: RunFolder, command: list[str]) -> None:
     """With 128 + SIGPIPE and no word; what prints nothing comes to its own end."""
-    (tmp_path / "small.toml").write_text(small.TEXT)
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write) as closed:
         ended = subprocess.run(
             [sys.executable, "-m", "bwbayes", *command],
-            cwd=tmp_path, stdout=closed, stderr=subprocess.PIPE, check=False,
+            cwd=copy.path.parent, stdout=closed, stderr=subprocess.PIPE, check=False,
         )  # fmt: skip
     assert ended.returncode == (0 if "--quiet" in command else 141)
     assert ended.stderr == b""
 
 
+@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 def test_a_run_behind_head_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(small.TEXT)
-    command = f"{sys.executable} -m bwbayes run small.toml --out run | head -n 1"
+    (tmp_path / "unexplained.py").write_text(small.UNEXPLAINED)
+    command = f"{sys.executable} unexplained.py run small.toml --out run | head -n 1"
     ended = subprocess.run(
         ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert "rror" not in ended.stderr
     assert len(ended.stdout.splitlines()) == 1
-    resumed = python("-m", "bwbayes", "resume", str(tmp_path / "run"))
-    assert resumed.returncode == 0, resumed.stderr
+    assert bw.resume(tmp_path / "run", progress=False).converged
 
 
 def test_numba_may_be_switched_off() -> None:

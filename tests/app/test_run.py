@@ -43,7 +43,7 @@ def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run:
         assert found.shape == tree["sample_stats"].to_dataset()["lp"].shape
 
 
-@pytest.mark.usefixtures("_without_pictures")
+@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 def test_larger_target_is_reached_with_the_same_draws_first(
     run: Path, copy: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,7 +91,7 @@ def test_whatever_builds_on_it_is_refused_with_its_status(
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("_without_pictures")
+@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
 def test_larger_budget_converges_to_what_it_would_have_been(
     run: Path, cut_short: tuple[RunFolder, int], tmp_path: Path
 ) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume
@@ -35,15 +35,23 @@ def noisy_record(seed: int, **options: object) -> Record:
     return Record(measured, reading, interval=0.002, **options)  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    write_record(noisy_record(1), tmp_path / "noisy.h5")
-    write_record(noisy_record(2), tmp_path / "next.h5")
-    return tmp_path
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with two records, for reading."""
+    path = tmp_path_factory.mktemp("records")
+    write_record(noisy_record(1), path / "noisy.h5")
+    write_record(noisy_record(2), path / "next.h5")
+    return path
 
 
-def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder: Path) -> None:
-    problem = resolve_config(parse(TEXT, "my.toml"), folder)
+@pytest.fixture(scope="module")
+def problem(folder: Path) -> Problem:
+    return resolve_config(parse(TEXT, "my.toml"), folder)
+
+
+def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(
+    problem: Problem,
+) -> None:
     record, measured = problem.record, noisy_record(1)
     np.testing.assert_array_equal(record.voltage, measured.voltage)
     assert record.sha256 == measured.sha256
@@ -60,9 +68,10 @@ def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(folder
     np.testing.assert_array_equal(bands.voltage, other.path.voltage)
 
 
-def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folder: Path) -> None:
-    problem = resolve_config(parse(TEXT, "my.toml"), folder)
-    kept = RunFolder.create(folder / "run", problem, overwrite=False)
+def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(
+    problem: Problem, tmp_path: Path
+) -> None:
+    kept = RunFolder.create(tmp_path / "run", problem, overwrite=False)
     again = RunFolder.open(kept.path).problem()
     np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
     np.testing.assert_array_equal(
@@ -71,11 +80,13 @@ def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(folde
     assert again.remarks == problem.remarks
 
 
-def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(folder: Path) -> None:
+def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(
+    folder: Path, tmp_path: Path
+) -> None:
     """And a chain from before the voltage's noise was removed is not read."""
     model = 'hysteresis = "linear"\nsearch = "none"\n'
     text = f"{TEXT}{model}[sampling]\ness = 100\nsteps = 200\nblock = 25\n"
-    kept = RunFolder.create(folder / "run", resolve_config(parse(text, "my.toml"), folder))
+    kept = RunFolder.create(tmp_path / "run", resolve_config(parse(text, "my.toml"), folder))
     fit = resume(kept, small.quiet(), workers=1, predict=False)
     posterior, chain = fit.problem.posterior, fit.chain
     more = np.array(json.loads(str(chain.attributes()[VOLTAGE_NOISE])))
