@@ -22,7 +22,7 @@ from bwbayes.model.distributions import Distribution
 from bwbayes.model.limits import Limits
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record import Record, read_record, write_record
-from bwbayes.record.io.stated import conversion
+from bwbayes.record.io.columns import conversion
 from bwbayes.report.report import Picture
 
 MAGNET = Quantities.of("H (A/m)", "B (T)")

@@ -18,7 +18,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from rich.console import Console
@@ -505,11 +505,10 @@ def resume(
         anywhere = CampaignFolder(folder.path.absolute())
         tasks = [(file, anywhere) for file in fitted if not folder.is_done(file)]
         folder.summary.unlink(missing_ok=True)
-        outcome: Ended
-        for outcome in batch(
+        for file, status, reason in batch(
             fit_record,
             tasks,
-            lambda outcome: "refused" if outcome.refused else outcome.short,
+            lambda outcome: outcome[1],
             console=console,
             kind="record",
             done=len(fitted) - len(tasks),
@@ -517,8 +516,8 @@ def resume(
             workers=workers,
             executor=executor,
         ):
-            if outcome.refused:
-                refused[outcome.file.name] = outcome.short
+            if status == "refused":
+                refused[file.name] = reason
         with StepProgress(console, "combining the records ...") as watch:
             campaign = Campaign.of(folder, files, refused, watch).said_in(folder.quantities())
             # Nothing in its files depends on when or how it was computed.
@@ -527,19 +526,12 @@ def resume(
     return campaign
 
 
-class Ended(NamedTuple):
-    """The outcome of a record: ``short`` says why it was refused, or that it did not converge."""
-
-    file: Path
-    short: str = ""
-    refused: bool = False
-
-
-def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
+def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
     """Fit a record of a campaign to its end, from wherever its run stands.
 
     A run of an earlier form of the record or config is replaced. Figures, report and bands are
-    written if the campaign has pictures.
+    written if the campaign has pictures. Returns the file, "refused", "not converged" or "", and
+    why it was refused.
     """
     origin, run = campaign.origin(), campaign.run(file.stem)
     with warnings.catch_warnings():
@@ -557,13 +549,13 @@ def fit_record(file: Path, campaign: CampaignFolder) -> Ended:
                 specimen = specimen_of(file.stem, fit.problem.posterior, fit.flat_draws, source)
                 specimen.save(run / SPECIMEN)
             (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
-            return Ended(file, "" if fit.converged else "not converged")
+            return file, "" if fit.converged else "not converged", ""
         except InputError as error:
             # The name of a file in the folder of the records is enough.
-            return Ended(file, str(error).replace(f"{file.parent}{os.sep}", ""), True)
+            return file, "refused", str(error).replace(f"{file.parent}{os.sep}", "")
         # One record must not end the others, whatever is wrong with it.
         except Exception as error:
-            return Ended(file, one_line(f"{type(error).__name__}: {error}"), True)
+            return file, "refused", one_line(f"{type(error).__name__}: {error}")
 
 
 def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Problem]:
