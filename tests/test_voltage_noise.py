@@ -140,7 +140,7 @@ def test_noise_on_the_voltage_changes_no_answer(tmp_path: Path) -> None:
 
 def test_one_noisy_record_is_right_and_as_measured_it_is_not(tmp_path: Path) -> None:
     """The twin says that a command, which has no noise, was measured: its gamma is far off."""
-    fitted, other = records("decaying sine", 1000.0, 1)
+    fitted, other = records("decaying sine", 400.0, 1)
     clean = answer(fitted, other, tmp_path)
     fitted, other = noisy(fitted, 1e-3, 1), noisy(other, 1e-3, 1)
     assert answer(fitted, other, tmp_path).right(clean)
