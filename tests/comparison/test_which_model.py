@@ -178,6 +178,6 @@ def test_a_record_without_hysteresis_is_said_to_have_none(
     assert record.displacement is not None
     fewer = Record(record.voltage[::3], record.displacement[::3], interval=3 * INTERVAL)
     runs = tmp_path / "runs"
-    comparison = compared(fewer, names, runs, future=False, walkers=24, steps=500)
+    comparison = compared(fewer, names, runs, future=False, walkers=24, steps=200)
     assert comparison.recommended == "linear + white"
     assert any("no hysteresis" in line for line in comparison.lines)
