@@ -1,17 +1,20 @@
-"""Of several tables in one file one is read, the one that is chosen, and as if it stood alone."""
+"""Of several tables in one file one is read, the one that is chosen; of cells what they hold."""
 
+import math
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import assume, example, given, settings, strategies as st
+from openpyxl import Workbook
 
 from bwbayes.errors import InputError
 from bwbayes.record import read_record
+from tests.record.conftest import quiet
 from tests.record.instruments import DISPLACEMENT, TIME, VOLTAGE
-
-pytestmark = pytest.mark.filterwarnings("ignore::bwbayes.errors.InputWarning")
+from tests.record.makers import INSTRUMENTS
 
 HEADERS = ("time_s,voltage_V,displacement_um", "t [s],U [V],x [um]", "Time,Drive,Pos\ns,V,um")
 Cells = list[tuple[float, float, float]]
@@ -43,6 +46,7 @@ def assert_holds(path: Path, table: Any, rows: Cells) -> None:
     np.testing.assert_allclose(record.displacement, displacement, rtol=1e-15)
 
 
+@quiet
 @settings(max_examples=25)
 @given(
     st.lists(
@@ -72,6 +76,7 @@ def test_a_table_of_a_text_is_read_as_if_it_stood_alone(
             read_record(path, table=wrong)
 
 
+@quiet
 @given(
     st.lists(st.integers(12, 40), min_size=2, max_size=4),
     st.sampled_from([*HEADERS[:2], ""]),
@@ -99,6 +104,7 @@ def test_a_block_below_an_empty_line_in_which_times_begin_again_is_a_table(
         read_record(path)
 
 
+@quiet
 @pytest.mark.parametrize("between", ["", "# paused", HEADERS[0], "\n\n"])
 def test_a_table_goes_on_after_a_pause(tmp_path: Path, between: str) -> None:
     """With the header once more, an empty line or a comment, and alone it has number 1."""
@@ -110,6 +116,7 @@ def test_a_table_goes_on_after_a_pause(tmp_path: Path, between: str) -> None:
         assert_holds(tmp_path / "a.csv", table, rows)
 
 
+@quiet
 def test_an_error_in_a_table_names_the_line_of_the_file(tmp_path: Path) -> None:
     written(tmp_path / "a.csv", [HEADERS[0]] * 2, ["one", "two"], tables([20, 20]))
     lines = (tmp_path / "a.csv").read_text().split("\n")
@@ -119,6 +126,7 @@ def test_an_error_in_a_table_names_the_line_of_the_file(tmp_path: Path) -> None:
         read_record(tmp_path / "a.csv", table="two")
 
 
+@quiet
 def test_a_sheet_is_chosen_by_number_or_name_among_those_with_numbers(tmp_path: Path) -> None:
     from openpyxl import Workbook  # noqa: PLC0415  # an extra
 
@@ -137,3 +145,65 @@ def test_a_sheet_is_chosen_by_number_or_name_among_those_with_numbers(tmp_path: 
         read_record(path)
     with pytest.raises(InputError, match="no table 'Note'; choose from 1 'up'"):
         read_record(path, table="Note")
+
+
+EPOCH = datetime(1899, 12, 30)  # cells have no zone
+FORMATS = {
+    "duration": "[h]:mm:ss.000",
+    "time of day": "hh:mm:ss.0",
+    "date": "yyyy-mm-dd hh:mm:ss",
+    "minutes": "[mm]:ss",
+}
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from([*FORMATS]),
+    st.sampled_from([1e-5, 2e-5, 1e-4, 4e-4, 5e-3, 0.25]),
+    st.floats(0, 0.9).map(lambda days: round(days, 5)),
+    st.booleans(),
+)
+@example("duration", 0.25, 0.99999, False)  # beyond a day
+@example("date", 1e-5, 0.0, True)
+def test_times_are_as_fine_as_their_numbers_however_they_are_shown(
+    folder: Path, shown: str, dt: float, start: float, by_python: bool
+) -> None:
+    """As 15 digits of days, or as openpyxl writes Python's times; both far below 1 ms."""
+    # Of a date 15 digits of days are 9 us.
+    assume(by_python or shown != "date" or dt > 2e-5)
+    book = Workbook()
+    book.active.append(["Time", "U [V]", "x [um]"])
+    whole_days = 46_084 if shown == "date" else 0
+    for i, (v, d) in enumerate(zip(VOLTAGE[:60], DISPLACEMENT[:60], strict=True)):
+        delta = timedelta(days=whole_days + start, seconds=i * dt)
+        days = float(f"{whole_days + start + i * dt / 86400:.15g}")
+        value = (EPOCH + delta if shown == "date" else delta) if by_python else days
+        book.active.append([value, v, d])
+        book.active.cell(i + 2, 1).number_format = FORMATS[shown]
+    path = folder / "times.xlsx"
+    book.save(path)
+    record = read_record(path)
+    assert record.interval == pytest.approx(dt, rel=1e-9)
+    np.testing.assert_allclose(record.voltage, VOLTAGE[:60], rtol=1e-12)
+    since = (datetime(1970, 1, 1) - EPOCH) / timedelta(seconds=1)
+    expected = (whole_days + start) * 86400 - (since if shown == "date" else 0)
+    assert math.isclose(record.start + record.time_offset, expected, rel_tol=0, abs_tol=2e-5)
+
+
+def test_a_workbook_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = INSTRUMENTS["pandas to Excel, with dates"](tmp_path).path
+    monkeypatch.setitem(__import__("sys").modules, "openpyxl", None)
+    with pytest.raises(InputError, match=r"a\.xlsx: .* openpyxl; pip install 'bwbayes\[xlsx\]'"):
+        read_record(path)
+
+
+def test_a_workbook_without_numbers_or_that_is_cut_off_is_refused_in_a_line(tmp_path: Path) -> None:
+    book = Workbook()
+    book.active.append(["nothing", "here"])
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(InputError, match="no sheet has columns of numbers"):
+        read_record(tmp_path / "a.xlsx")
+    content = INSTRUMENTS["pandas to Excel, with dates"](tmp_path).path.read_bytes()
+    (tmp_path / "a.xlsx").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="damaged or cut off"):
+        read_record(tmp_path / "a.xlsx")

@@ -1,4 +1,4 @@
-"""The numbers of a summary are those of the draws."""
+"""The numbers of a summary are those of the draws, and tables fit the screen that shows them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.errors import Renamed
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
+from bwbayes.report.report import Report, Table, as_text
 from bwbayes.report.result import Result, summary
 from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
@@ -60,9 +61,6 @@ def test_drives_are_validated_only_where_all_bands_passed(passed: bool | None) -
     assert validated == ("0 to 95 V" if passed else None)
 
 
-# What a run's files hold is what was computed, to the digits that matter
-
-
 def moved(one: Bands, offset: float, factor: float) -> Bands:
     """Return bands of a displacement in other proportions, one reading of which is missing."""
 
@@ -95,9 +93,6 @@ def test_bands_have_the_digits_of_their_range(tmp_path: Path, offset: float, fac
         np.testing.assert_allclose(table[name], column, rtol=0, atol=atol, err_msg=name)
 
 
-# Numbers as texts: with the digits that tell something, at any size
-
-
 @given(st.floats(1e-9, 1e5))
 def test_a_length_keeps_three_digits_at_any_size(um: float) -> None:
     text = length_text(um)
@@ -114,3 +109,31 @@ def test_an_earlier_name_is_told_the_new_one(kind: type, name: str) -> None:
     assert now in {*dir(kind), *getattr(kind, "__dataclass_fields__", ())}
     with pytest.raises(AttributeError, match=f"no attribute {name!r}; it is {now} now"):
         getattr(kind, name)
+
+
+TEXTS = st.text("abcdefg 0123456789.+-", min_size=1, max_size=60).map(str.strip).filter(bool)
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> Table:
+    columns = draw(st.lists(TEXTS, min_size=1, max_size=9))
+    row = st.lists(TEXTS, min_size=len(columns), max_size=len(columns))
+    rows = draw(st.lists(row, min_size=1, max_size=4))
+    return Table("name", "Caption", columns, rows, on="both")
+
+
+@given(tables(), st.integers(40, 130))
+def test_every_table_is_shown_whole_at_every_width(table: Table, width: int) -> None:
+    lines = as_text(Report(title="", blocks=[table]), width).splitlines()
+    assert max(map(len, lines)) <= width
+    # Of wrapped texts the letters are all there, once; those of the rows' names in every part.
+    shown, named = "".join(lines), 0
+    parts = max(shown.count("─") // max(line.count("─") for line in lines), 1)
+    for number, column in enumerate(zip(table.columns, *table.rows, strict=True)):
+        named += sum(str(text).count("a") for text in column) * (1 if number else parts)
+    assert shown.count("a") >= named
+
+
+def test_a_table_that_fits_is_one() -> None:
+    table = Table("n", "C", ["Name", "First", "Second"], [["a", "1 um", "2 um"]], on="both")
+    assert 1 == sum("─" in line for line in as_text(Report(title="", blocks=[table])).splitlines())
