@@ -22,12 +22,7 @@ from bwbayes.diagnosis.defects import DEFECTS, Defect
 from bwbayes.diagnosis.residual_analysis import ResidualAnalysis, Sighting
 from bwbayes.inference import map_estimate
 from bwbayes.inference.compiled.walk import walk
-from bwbayes.inference.noise import (
-    DISCREPANCY_SD,
-    DISCREPANCY_TIME,
-    SENSOR_SD,
-    DiscrepancyNoise,
-)
+from bwbayes.inference.noise import DISCREPANCY_SD, DISCREPANCY_TIME, SENSOR_SD, DiscrepancyNoise
 from bwbayes.inference.state_space import Noise
 from bwbayes.inference.study import Stated
 from bwbayes.model.inputs import Inputs
@@ -193,9 +188,7 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
 
 
 def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(
-    tmp_path_factory: pytest.TempPathFactory,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "results").mkdir()
     (tmp_path / "results/my").symlink_to(small.finished(tmp_path_factory))
@@ -268,10 +261,7 @@ def product(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, Any], t
     shutil.copytree(small.finished(tmp_path_factory), folder / "my")
     shutil.copytree(folder / "my", folder / "failed")
     numbers = json.loads((folder / "failed/summary.json").read_text())
-    numbers["validation"]["held-out"] |= {
-        "passed": False,
-        "message": "held-out: it does not hold",
-    }
+    numbers["validation"]["held-out"] |= {"passed": False, "message": "held-out: it does not hold"}
     (folder / "failed/summary.json").write_text(json.dumps(numbers))
     lines = [
         "--help",

@@ -138,8 +138,7 @@ CLAIMS: dict[str, Quoted] = {
         ["max moving, */largest t"], ["count moving, */coverage and t/*/*/0"]
     ),
     "Moving records, any operator, 95% bands cover, %": Quoted(
-        ["extent 100 moving operators, */coverage and t/95/0"],
-        ["min moving operators, */records"],
+        ["extent 100 moving operators, */coverage and t/95/0"], ["min moving operators, */records"]
     ),
     "... of any operator, standard errors off at most": Quoted(
         ["worst moving operators, */coverage and t/*/1"],
@@ -161,8 +160,7 @@ CLAIMS: dict[str, Quoted] = {
     "... the least covered of all plans, %": Quoted(["min 100 untried/worst/*"]),
     "... width of bands of fast drives, over that without": Quoted(["untried/wider"]),
     "Every 2nd, 5th and 20th sample: smallest p of the differences": Quoted(
-        ["min every k-th sample*/smallest p"],
-        ["min every k-th sample*/p of the family", *THINNED],
+        ["min every k-th sample*/smallest p"], ["min every k-th sample*/p of the family", *THINNED]
     ),
     "... means within one SD": Quoted(
         [f"sum every k-th sample*/within one sd/*/{place}" for place in (0, 1)], THINNED

@@ -171,10 +171,7 @@ def test_the_api_reference_has_every_module_and_every_public_name(tmp_path: Path
         ("give `overwrite=True`", "give `--overwrite`"),
         ('resume with `engine="numpy"`', "resume with `--engine numpy`"),
         ("`lead_in=2.5, estimate_offset=True`", "`--lead-in 2.5 --estimate-offset`"),
-        (
-            "`bwbayes.resume('results/a b', steps=40)`",
-            "`bwbayes resume results/a b --steps 40`",
-        ),
+        ("`bwbayes.resume('results/a b', steps=40)`", "`bwbayes resume results/a b --steps 40`"),
         ("`bwbayes.fit(RECORD, folder='a')`", "`bwbayes run RECORD --out a`"),
         # As they are: TOML, names, commands, what is no code at all, and what is not in backticks.
         ("`thresholds = 4`", "`thresholds = 4`"),

@@ -193,8 +193,7 @@ def test_predict_writes_the_bands_of_a_signal(bwbayes: Type, run: Path, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("volts", "note"),
-    [(50, ""), (500, "note: voltage -500 to 500 V exceeds the training range -")],
+    ("volts", "note"), [(50, ""), (500, "note: voltage -500 to 500 V exceeds the training range -")]
 )
 def test_predict_takes_a_voltage_alone(
     bwbayes: Type, run: Path, tmp_path: Path, volts: float, note: str

@@ -206,28 +206,12 @@ def test_numbers_table_and_picture_agree(
 @pytest.mark.parametrize(
     ("verb", "options", "line"),
     [
-        (
-            "compensate",
-            {"reference": "triangel"},
-            "nor a file; did you mean triangle?",
-        ),
+        ("compensate", {"reference": "triangel"}, "nor a file; did you mean triangle?"),
         ("compensate", {"reference": "nowhere.csv"}, "nowhere.csv: does not exist; check the path"),
-        (
-            "compensate",
-            {"reference": "sine", "amplitude": 1.0},
-            "sine: has no frequency; give it",
-        ),
+        ("compensate", {"reference": "sine", "amplitude": 1.0}, "sine: has no frequency; give it"),
         ("compensate", SINE | {"amplitude": "much"}, "sine: amplitude 'much'; must be a num"),
-        (
-            "compensate",
-            {"reference": None},
-            "NoneType is none; give one of sine, triangle",
-        ),
-        (
-            "compensate",
-            {"reference": [0.0, 1.0] * 10, "amplitude": 1.0},
-            "take no amplitude",
-        ),
+        ("compensate", {"reference": None}, "NoneType is none; give one of sine, triangle"),
+        ("compensate", {"reference": [0.0, 1.0] * 10, "amplitude": 1.0}, "take no amplitude"),
         ("compensate", {"reference": SLOW, "smoothed": 0.1}, "made already takes no smoothed"),
         ("compensate", {"reference": FAST, "slew": 500.0}, "it is faster than the amplifier's"),
         ("compensate", {"reference": [0.0, *[900.0] * 49]}, "on it is beyond the amplifier's"),

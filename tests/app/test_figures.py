@@ -182,10 +182,7 @@ def test_ranks_of_independent_draws_keep_inside_the_gray_band() -> None:
 
 
 @settings(deadline=None)
-@given(
-    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300),
-    st.integers(1, 50),
-)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), st.integers(1, 50))
 def test_thinned_series_keep_their_extremes(values: list[float], most: int) -> None:
     y = np.asarray(values)
     time = np.arange(y.size, dtype=np.float64)

@@ -43,9 +43,7 @@ def cut_short(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, int]
         return made, finish(made.path, workers=1, quiet=True)
 
 
-def test_run_without_convergence_speaks_of_no_interval(
-    cut_short: tuple[RunFolder, int],
-) -> None:
+def test_run_without_convergence_speaks_of_no_interval(cut_short: tuple[RunFolder, int]) -> None:
     made, status = cut_short
     assert 4 == status
     assert 25 == ChainFile.read(made.chain).steps("sampling")

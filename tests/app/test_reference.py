@@ -11,11 +11,7 @@ import pytest
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.config.keys import ANY, Key, keys
-from bwbayes.app.config.reference import (
-    PARTS,
-    config_reference,
-    parts_reference,
-)
+from bwbayes.app.config.reference import PARTS, config_reference, parts_reference
 from bwbayes.errors import InputError
 
 EVERY = {key.path: key for key in keys(Config)}

@@ -24,10 +24,7 @@ from tests.app import small
 
 def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run: Path) -> None:
     """Of each draw it is that of all readings; with the log prior it makes the log density."""
-    record, posterior = (
-        read_record(run / "records/record.h5"),
-        RunFolder(run).problem().posterior,
-    )
+    record, posterior = (read_record(run / "records/record.h5"), RunFolder(run).problem().posterior)
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
         assert 1 == tree.attrs["converged"] == tree["posterior"].attrs["converged"]
         for group, name in (("observed_data", "displacement"), ("constant_data", "voltage")):

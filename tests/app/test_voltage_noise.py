@@ -49,9 +49,7 @@ def problem(folder: Path) -> Problem:
     return resolve_config(parse(TEXT, "my.toml"), folder)
 
 
-def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(
-    problem: Problem,
-) -> None:
+def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(problem: Problem) -> None:
     record, measured = problem.record, noisy_record(1)
     np.testing.assert_array_equal(record.voltage, measured.voltage)
     assert record.sha256 == measured.sha256

@@ -12,13 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.calibration import replicates as module
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration, smooth_power
 from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import (
-    RANKED,
-    CalibrationSetup,
-    Replicate,
-    Sampled,
-    replicate,
-)
+from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Replicate, Sampled, replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.noise import WhiteNoise
@@ -161,9 +155,7 @@ def test_draws_beside_the_posterior_are_noticed(around: CalibrationSetup) -> Non
 
 
 @pytest.mark.slow
-def test_draws_that_are_too_narrow_are_noticed_by_more_replicates(
-    around: CalibrationSetup,
-) -> None:
+def test_draws_that_are_too_narrow_are_noticed_by_more_replicates(around: CalibrationSetup) -> None:
     """Draws a quarter as wide: truths lie sqrt((1 + 1/16) / 2) = 0.73 times as far off.
 
     Two hundred replicates find that in one of three parameters 99 times in 100, and pass as often

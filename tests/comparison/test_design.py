@@ -135,9 +135,7 @@ def ratios(
     return {name: means[name] / left[name] for name in candidates}, means
 
 
-def test_the_promise_is_kept_when_the_record_is_fitted(
-    known: tuple[Posterior, FloatArray],
-) -> None:
+def test_the_promise_is_kept_when_the_record_is_fitted(known: tuple[Posterior, FloatArray]) -> None:
     """Within 0.65 to 1.5 of two truths; what counts repeats once promises more to be left."""
     ratio, means = ratios(known, {"four": steady()}, 2)
     assert 0.65 < ratio["four"] < 1.5

@@ -135,9 +135,7 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
 
 
 @pytest.mark.slow
-def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(
-    tmp_path: Path,
-) -> None:
+def test_the_right_model_is_named_or_left_open_and_predicts_a_fresh_record(tmp_path: Path) -> None:
     """Right or tied in 19 of 20; within 10% of the best candidate's error in 18 of 20."""
     named, alone, near, ratios = [], [], [], []
     for number in range(RECORDS):

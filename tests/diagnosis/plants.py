@@ -152,12 +152,7 @@ def at_actuator(kind: str, fine: FloatArray, rng: np.random.Generator) -> FloatA
 
 
 def moved_by(
-    kind: str,
-    part: Plant,
-    voltage: FloatArray,
-    size: float,
-    rng: np.random.Generator,
-    warming: int,
+    kind: str, part: Plant, voltage: FloatArray, size: float, rng: np.random.Generator, warming: int
 ) -> FloatArray:
     """Return the displacement in front of the sensor, at the fine steps.
 

@@ -25,11 +25,7 @@ from tests.stand import play
 
 INTERVAL, ROWS = 0.02, np.arange(600)
 TIME = INTERVAL * ROWS
-NOISES = {
-    "white": [0.1],
-    "discrepancy": [0.1, 0.2, 0.2],
-    "smooth": [0.1, 0.2, 0.2, 0.6],
-}
+NOISES = {"white": [0.1], "discrepancy": [0.1, 0.2, 0.2], "smooth": [0.1, 0.2, 0.2, 0.6]}
 
 
 def drive(kind: str, rng: np.random.Generator) -> FloatArray:

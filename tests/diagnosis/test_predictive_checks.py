@@ -108,10 +108,7 @@ def rising(white: FloatArray, result: Innovations) -> FloatArray:
 
 @pytest.mark.parametrize(
     ("spoil", "part"),
-    [
-        (colored, "the power that white ones have"),
-        (rising, "SD where the voltage is rising"),
-    ],
+    [(colored, "the power that white ones have"), (rising, "SD where the voltage is rising")],
 )
 def test_each_departure_is_remarked_on(
     spoil: Callable[[FloatArray, Innovations], FloatArray], part: str

@@ -103,8 +103,7 @@ def test_good_records_of_all_drives_raise_no_alarm(records: range, most: int) ->
 
 
 @pytest.mark.parametrize(
-    ("records", "most"),
-    [(range(3), 0), pytest.param(range(1000, 1050), 2, marks=pytest.mark.slow)],
+    ("records", "most"), [(range(3), 0), pytest.param(range(1000, 1050), 2, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_is_wrong_is_named(kind: str, records: range, most: int) -> None:

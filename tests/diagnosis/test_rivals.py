@@ -9,12 +9,7 @@ import pytest
 from bwbayes.app.config.config import parse
 from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.problem.records import generator
-from bwbayes.app.running.predictions import (
-    Prediction,
-    RivalsOf,
-    predict_after,
-    predict_another,
-)
+from bwbayes.app.running.predictions import Prediction, RivalsOf, predict_after, predict_another
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.laplace import climb

@@ -273,10 +273,7 @@ def test_outliers_hardly_move_the_estimate(share: float) -> None:
 
 
 def test_two_tails_and_outliers_set_aside_are_refused() -> None:
-    with pytest.raises(
-        InputError,
-        match=r"two terms with heavy tails or noise .*, but one sensor",
-    ):
+    with pytest.raises(InputError, match=r"two terms with heavy tails or noise .*, but one sensor"):
         noise_model("student + discrepancy + student", 1.0)
     posterior = moving("discrepancy + student", "numpy")
     with pytest.raises(InputError, match=r"model\.outliers: noise has heavy tails"):

@@ -163,9 +163,7 @@ def test_from_rest_means_a_path_from_zero_volts() -> None:
     theta = usual.prior.theta(usual.prior.draw(np.random.default_rng(10), 5))
     theta[:, usual.prior.names.index("initial")] = 0.0
     settled = usual.altered(
-        voltage=whole,
-        displacement=reading,
-        training=(slice(approach.size, whole.size),),
+        voltage=whole, displacement=reading, training=(slice(approach.size, whole.size),)
     )
     at_rest = usual.altered(voltage=voltage, displacement=reading[approach.size :])
     np.testing.assert_allclose(

@@ -8,11 +8,7 @@ from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
-from bwbayes.inference.linearization import (
-    STEP,
-    gradient_and_hessian,
-    value_and_jacobian,
-)
+from bwbayes.inference.linearization import STEP, gradient_and_hessian, value_and_jacobian
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
 from tests.inference.linear import Linear, every_case

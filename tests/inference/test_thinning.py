@@ -79,11 +79,7 @@ def test_a_long_record_begins_until_its_voltage_has_been_nearly_everywhere(
     np.testing.assert_array_equal(after.values, before.values[: after.rows.size])
 
 
-@given(
-    periods=st.floats(1.0, 12.0),
-    decay=st.floats(0.0, 0.9),
-    stride=st.integers(2, 10),
-)
+@given(periods=st.floats(1.0, 12.0), decay=st.floats(0.0, 0.9), stride=st.integers(2, 10))
 def test_the_reversals_of_a_drive_stay(periods: float, decay: float, stride: int) -> None:
     """Whatever sample they are at: the operator remembers what it remembers of the whole record."""
     along = np.linspace(0.0, 1.0, 2000)

@@ -11,9 +11,7 @@ from bwbayes.record.voltage_path import estimate_path
 from tests.inference.problems import decaying_sine, short_posterior
 
 
-def test_newton_steps_are_what_fits_along_other_paths_move(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_newton_steps_are_what_fits_along_other_paths_move(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voltage_noise, "COPIES", 4)
     rng = np.random.default_rng(2)
     posterior = short_posterior(samples=1500, noise="white")

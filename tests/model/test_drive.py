@@ -94,8 +94,7 @@ def test_plateaus_belong_to_the_stretch_that_leads_to_them() -> None:
 
 
 @given(
-    steps=st.lists(st.integers(-2, 2), max_size=60),
-    longest=st.one_of(st.none(), st.integers(1, 9)),
+    steps=st.lists(st.integers(-2, 2), max_size=60), longest=st.one_of(st.none(), st.integers(1, 9))
 )
 @settings(deadline=None)
 def test_stretches_partition_the_record(steps: list[int], longest: int | None) -> None:

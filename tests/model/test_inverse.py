@@ -118,8 +118,7 @@ def test_the_inverse_of_every_operator_gives_the_displacement_again(
 paths = st.lists(
     st.tuples(
         st.one_of(
-            st.floats(-35.0, 35.0),
-            st.sampled_from([0.0, 1e-6, -1e-9, 20.0, 20.0 + 1e-7, 35.0]),
+            st.floats(-35.0, 35.0), st.sampled_from([0.0, 1e-6, -1e-9, 20.0, 20.0 + 1e-7, 35.0])
         ),
         st.sampled_from([1, 1, 2, 5, 12]),
     ),

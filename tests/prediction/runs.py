@@ -100,10 +100,7 @@ def weighted_draws(
 
 
 def _tried(
-    posterior: Posterior,
-    proposal: StudentMixture,
-    random: np.random.RandomState,
-    count: int,
+    posterior: Posterior, proposal: StudentMixture, random: np.random.RandomState, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Draw places (count, free) of a proposal; log density of the posterior over its (count,)."""
     places, proposed = proposal.evaluate(proposal.draw(random, count))

@@ -15,12 +15,7 @@ from bwbayes.sampling.sampler import ProgressCallback, init_chain, sample
 from tests.sampling.targets import gaussian
 
 PLAN = SamplingPlan(
-    ess=400,
-    walkers=12,
-    block=20,
-    min_pilot_steps=100,
-    max_pilot_steps=400,
-    max_steps=1000,
+    ess=400, walkers=12, block=20, min_pilot_steps=100, max_pilot_steps=400, max_steps=1000
 )
 LONG = replace(PLAN, max_steps=4_000)
 POSTERIOR, POINT = gaussian(3)

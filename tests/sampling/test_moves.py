@@ -15,12 +15,7 @@ from emcee.moves import DEMove, Move
 from hypothesis import given, settings, strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.sampling.moves import (
-    IndependenceMove,
-    SnookerMove,
-    WeightedMoves,
-    sampling_moves,
-)
+from bwbayes.sampling.moves import IndependenceMove, SnookerMove, WeightedMoves, sampling_moves
 from bwbayes.sampling.proposals import StudentMixture
 from tests.sampling.targets import ALARM, TARGETS, worst_score
 

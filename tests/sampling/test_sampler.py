@@ -14,14 +14,7 @@ from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult
 from bwbayes.sampling.plan import SamplingPlan
 from bwbayes.sampling.proposals import StudentMixture
 from bwbayes.sampling.sampler import FIRST_CHECK, _next_check, sample
-from tests.sampling.samplings import (
-    PLAN,
-    POSTERIOR,
-    PluggedExecutor,
-    Watched,
-    new_chain,
-    run,
-)
+from tests.sampling.samplings import PLAN, POSTERIOR, PluggedExecutor, Watched, new_chain, run
 
 
 @pytest.fixture(scope="module")
