@@ -15,7 +15,7 @@ from bwbayes.app.fit.calls import open_converged
 from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress, batch
+from bwbayes.app.running.progress import LastLine, Progress, ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import redraw
 from bwbayes.inference import map_estimate
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics
@@ -166,6 +166,35 @@ def test_of_many_calls_it_says_how_many_before_the_first_is_done(terminal: bool)
     for _ in batch(time.sleep, [(0.6,)], lambda _: "", console=console, **options):
         pass
     assert "models judged 0 of 1   ETA unknown" in screen.getvalue()
+
+
+def test_of_many_calls_it_says_what_is_being_done_before_the_first_is_done(tmp_path: Path) -> None:
+    """As the first call keeps it in a file; nothing of it is said of the second."""
+    screen, note = StringIO(), tmp_path / "note"
+
+    def work(number: int) -> int:
+        with StepProgress(LastLine(note), f"record {number} ...") as watch:
+            time.sleep(1.2)
+            watch("MAP estimate", 0.25)
+            time.sleep(1.2)
+        return number
+
+    done = batch(
+        work,
+        [(1,), (2,)],
+        lambda _: "",
+        console=Console(force_terminal=True, width=100, file=screen),
+        kind="record",
+        done=0,
+        short={},
+        workers=1,
+        executor="threads",
+        doing=note.read_text,
+    )
+    assert [1, 2] == list(done)
+    assert "record 0 of 2   record 1 ..." in screen.getvalue()
+    assert re.search(r"record 0 of 2   MAP estimate 25%   ETA 0:0[345]", screen.getvalue())
+    assert "record 2 ..." not in screen.getvalue()
 
 
 COMMANDS = {

@@ -15,6 +15,7 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
 from bwbayes.app.running.predictions import Prediction, predict_another
-from bwbayes.app.running.progress import StepProgress, batch
+from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
@@ -515,6 +516,7 @@ def resume(
             short={"not converged": 0, "refused": 0},
             workers=workers,
             executor=executor,
+            doing=partial(_doing, folder),
         ):
             if status == "refused":
                 refused[file.name] = reason
@@ -534,13 +536,14 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
     why it was refused.
     """
     origin, run = campaign.origin(), campaign.run(file.stem)
+    console = LastLine(campaign.progress(file.stem))
     with warnings.catch_warnings():
         # They are the run's remarks, and a hundred records of one kind say the same.
         warnings.simplefilter("ignore", InputWarning)
         try:
             digests = campaign.digests(file)
             folder, problem = _run_folder(file, campaign)
-            console, files = Console(quiet=True), origin.pictures
+            files = origin.pictures
             fit = resume_run(folder, console, workers=1, files=files, problem=problem)
             if not origin.pictures:
                 write_summary(folder.summary, fit.numbers)
@@ -556,6 +559,18 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
         # One record must not end the others, whatever is wrong with it.
         except Exception as error:
             return file, "refused", one_line(f"{type(error).__name__}: {error}")
+        finally:
+            with suppress(OSError):
+                console.path.unlink(missing_ok=True)
+
+
+def _doing(campaign: CampaignFolder) -> str:
+    """Say what the first of the records that are being fitted is at, as its run says it."""
+    for path in sorted(campaign.path.glob(campaign.progress("*").name)):
+        with suppress(OSError):
+            if line := path.read_text(encoding="utf-8"):
+                return f"{path.stem[1:]}: {line}"
+    return ""
 
 
 def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Problem]:

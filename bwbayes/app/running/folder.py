@@ -261,6 +261,10 @@ class CampaignFolder(Folder):
         """Return the folder of a record's run."""
         return self.path / "records" / name
 
+    def progress(self, name: str) -> Path:
+        """Return the file that says what a record's run is at, as long as it is fitted."""
+        return self.path / f".{name}.progress"
+
     @classmethod
     def create(cls, path: Path, config: str, origin: Origin, *, overwrite: bool) -> Self:
         """Make the folder of a new campaign, whole or not at all; or return one of the same begun.

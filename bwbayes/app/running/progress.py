@@ -12,7 +12,9 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import suppress
 from itertools import islice
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -24,6 +26,19 @@ from bwbayes.app.running.workers import open_executor, side_by_side
 from bwbayes.sampling.chain import Phase
 from bwbayes.sampling.diagnostics import LENGTH, ConvergenceDiagnostics
 from bwbayes.sampling.plan import SamplingPlan
+
+
+class LastLine(Console):
+    """A console of which a file has the last line, for another process to show."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(quiet=True)
+        self.path = path
+
+    def print(self, *objects: object, **_: object) -> None:
+        """Keep a line; a disk that is full stops nothing."""
+        with suppress(OSError):
+            self.path.write_text(" ".join(map(str, objects)), encoding="utf-8")
 
 
 class ProgressLine(Live):
@@ -38,6 +53,7 @@ class ProgressLine(Live):
         self.shown, self.step, self.announced = step, step, announced
         self.started_at = self.printed = self.shown_at = time.monotonic()
         redrawn = console.is_terminal and not console.quiet
+        self.every = 1.0 if isinstance(console, LastLine) else 10.0  # s
         super().__init__(
             console=console,
             transient=True,
@@ -57,7 +73,7 @@ class ProgressLine(Live):
         """Show a line; without a terminal only if it may be ``printed`` and the time has come."""
         now = time.monotonic()
         self.shown, self.shown_at = line, now
-        if not self.console.is_terminal and printed and now - self.printed >= 10.0:
+        if not self.console.is_terminal and printed and now - self.printed >= self.every:
             self.printed = now
             self.console.print(line, highlight=False, soft_wrap=True)
 
@@ -156,21 +172,30 @@ def batch[T](
     short: Mapping[str, int],
     workers: int | None,
     executor: str | Executor | None,
+    doing: Callable[[], str] = lambda: "",
 ) -> Iterator[T]:
     """Call a function with each of the arguments, and yield each result as soon as it is there.
 
     ``label`` says what a result is short of, if anything; ``done`` and ``short`` count those of
-    this ``kind`` that were there before. They go into processes, also with the compiled engine:
-    most of their time goes into Python.
+    this ``kind`` that were there before. Until the first result, ``doing`` says every second what
+    is being done. They go into processes, also with the compiled engine: most of their time goes
+    into Python.
     """
     if not arguments:
         return
     count, total = min(workers or os.cpu_count() or 1, len(arguments)), done + len(arguments)
     short = dict(short)
-    begin = f"{kind} {done} of {total}   ETA unknown"
-    with open_executor(count, executor=executor) as pool, ProgressLine(console, begin) as line:
+    begin, fresh = f"{kind} {done} of {total}", 0
+    unknown = f"{begin}   ETA unknown"
+    with open_executor(count, executor=executor) as pool, ProgressLine(console, unknown) as line:
+
+        def show() -> None:
+            if not fresh and (text := doing()):
+                line.show(f"{begin}   {text}")
+
         together = side_by_side(pool, workers, len(arguments))
-        for fresh, result in enumerate(_as_done(pool, together, call, arguments), start=1):
+        for result in _as_done(pool, together, call, arguments, show):
+            fresh += 1
             yield result
             if label(result):
                 short[label(result)] += 1
@@ -187,8 +212,9 @@ def _as_done[T](
     together: int,
     call: Callable[..., T],
     arguments: Iterable[tuple[object, ...]],
+    show: Callable[[], None],
 ) -> Iterator[T]:
-    """Yield each result as soon as it is there.
+    """Yield each result as soon as it is there; ``show`` is called each second without any.
 
     Only so many ``together`` are under way, so that whoever stops waits for those alone.
     """
@@ -198,5 +224,7 @@ def _as_done[T](
         running |= {executor.submit(call, *a) for a in islice(waiting, together - len(running))}
         if not running:
             return
-        done, running = wait(running, return_when=FIRST_COMPLETED)
+        done, running = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
         yield from (future.result() for future in done)
+        if not done:
+            show()
