@@ -6,6 +6,7 @@ from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate
+from bwbayes.inference.mode_finding import Mode, refine
 from bwbayes.inference.noise import noise_model
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.inference.thinning import (
@@ -163,6 +164,37 @@ def test_what_is_searched_in_a_thinned_record_is_found_on_the_whole(
     sds = np.sqrt(np.diag(slow.covariance))
     np.testing.assert_allclose(fast.mode / sds, slow.mode / sds, atol=0.02)
     np.testing.assert_allclose(np.sqrt(np.diag(fast.covariance)) / sds, 1.0, atol=0.02)
+
+
+def test_a_whole_record_is_climbed_from_near_its_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thinning moves the mode by hundreds of its sds, and the climb begins without that.
+
+    A start that is only as unsure as its readings, every eighth of nine parameters, is about
+    sqrt(8 * 9) sds away; three times that is beyond chance.
+    """
+    voltage, actuator = decaying_sine(8000, 30.0), Actuator("lag", "first", INTERVAL)
+    readings = ring_bender(actuator, "white", voltage, 1)
+    posterior = posterior_of(voltage, readings, actuator, "discrepancy")
+    clean = displacement(posterior, posterior.single_record, truth(posterior))[0]
+    readings = clean + np.random.default_rng(2).normal(0.0, 0.02, voltage.size)
+    whole = posterior_of(voltage, readings, actuator, "discrepancy")
+    starts, ends = dict[bool, FloatArray](), dict[bool, FloatArray]()
+
+    def noted(searched: Posterior, start: FloatArray, covariance: FloatArray) -> Mode:
+        mode = refine(searched, start, covariance)
+        starts[searched is whole], ends[searched is whole] = start, mode.coordinates
+        return mode
+
+    monkeypatch.setattr(map_estimate, "SAMPLES", 1000)
+    monkeypatch.setattr(map_estimate, "refine", noted)
+    point = map_estimate.fit(whole, np.random.default_rng(1))
+    sds = np.linalg.cholesky(point.covariance)
+    of_thinned, begun = (
+        float(np.linalg.norm(np.linalg.solve(sds, place - point.mode)))
+        for place in (ends[False], starts[True])
+    )
+    assert of_thinned > 100
+    assert begun < 3 * np.sqrt(8 * point.mode.size)
 
 
 def test_a_short_record_is_fitted_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
