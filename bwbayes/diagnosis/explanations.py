@@ -30,6 +30,8 @@ ADDITIONS: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.growing_noise,
 )
 CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
+    model.operator,
+    model.history,
     LONG_DELAY.explanations,
     *(defect.explanations for defect in SLOW),
     model.exponent,
@@ -37,7 +39,6 @@ CHANGES: tuple[Callable[[ResidualAnalysis], Iterator[Explanation]], ...] = (
     model.creep,
     model.dynamics,
     model.hold,
-    model.operator,
     model.smooth,
 )
 
@@ -69,7 +70,7 @@ def explain(
         return ()
     looked_at, rough = scene, scene.with_rough_noise()
     # With several records, the model of the actuator is a matter of all of them.
-    kinds = (*ADDITIONS, *(CHANGES if scene.alone else CHANGES[:1]))
+    kinds = (*ADDITIONS, *(CHANGES if scene.alone else (LONG_DELAY.explanations,)))
     if not scene.posterior.single_record.inputs.quantities.has_clock:
         kinds = tuple(kind for kind in kinds if kind not in TIMED)
     for number, kind in enumerate(kinds):

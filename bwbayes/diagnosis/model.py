@@ -26,10 +26,13 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import lognormal
 from bwbayes.model.distributions import Distribution
+from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
+from bwbayes.model.spec import ModelSpec
 
 # Prior of an exponent that is not 1: in nearly all published fits it lies below 5.
 EXPONENT = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
+DEMAGNETIZED = "demagnetized, and then driven straight from 0 V to the record's first voltage"
 EXPONENT_STARTS = ({"exponent": -1.0}, {"exponent": 1.0})
 
 
@@ -107,14 +110,38 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
         kind = f"operator {name}"
         if HYSTERESIS[name] is present or not scene.looks_for(kind):
             continue
-        spec = scene.study.spec.with_stages(name)
-        posterior = scene.rebuilt(scene.study.with_model(spec))
-        # One start finds the best mode of nearly all records, in half of the time of five.
-        places = map_estimate.local_minima(posterior, scene.generator, 1)
-        fit = scene.extended(posterior, places)
-        text = f"another operator, {name}"
-        fix = lines(scene.study.spec, spec)
-        yield scene.explained(kind, text, fix, fit, spec=spec, coordinates=fit.coordinates)
+        candidates = []
+        for spec in _histories(scene, scene.study.spec.with_stages(name)):
+            posterior = scene.rebuilt(scene.study.with_model(spec))
+            # One start finds the best mode of nearly all records, in half of the time of five.
+            places = map_estimate.local_minima(posterior, scene.generator, 1)
+            candidates.append((spec, scene.extended(posterior, places)))
+        spec, fit = max(candidates, key=lambda candidate: candidate[1].log_evidence)
+        text, fix = f"another operator, {name}", lines(scene.study.spec, spec)
+        if spec.history != scene.study.spec.history:
+            text = f"{text}, {DEMAGNETIZED}"
+        cost = float(np.log(len(candidates)))
+        yield scene.explained(kind, text, fix, fit, cost, spec=spec, coordinates=fit.coordinates)
+
+
+def history(scene: ResidualAnalysis) -> Iterator[Explanation]:
+    """Try a voltage that came straight from 0 V, where the operator's start cannot be that."""
+    for spec in _histories(scene, scene.study.spec)[1:]:
+        yield from scene.changed("history", f"hysteresis {DEMAGNETIZED}", history=spec.history)
+
+
+def _histories(scene: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
+    """Return a model with each of the histories before the record that its start does not hold.
+
+    An operator that remembers extrema goes other ways on the first curve, from zero volts, than
+    after a drive over all voltages. Half a period of such a misfit spoils the fit of all others.
+    """
+    record = scene.posterior.single_record
+    operator = HYSTERESIS[spec.operator.name]
+    known = record.from_rest or spec.history != "unknown"
+    if known or not issubclass(operator, RemembersExtrema):
+        return [spec]
+    return [spec, replace(spec, history="demagnetized")]
 
 
 def smooth(scene: ResidualAnalysis) -> Iterator[Explanation]:

@@ -271,7 +271,8 @@ class Study:
         at_rest = 0.0 if name == "initial" else column.declaration.at_rest
         if column.declaration.scope == "record" and at_rest is not None:
             names = [column.record] if column.record else [*self.records]
-            rested = [self.records[record].from_rest for record in names]
+            known = name == "initial" and self.spec.history == "demagnetized"
+            rested = [known or self.records[record].from_rest for record in names]
             if all(rested):
                 return Stated(fixed=at_rest)
             if any(rested):

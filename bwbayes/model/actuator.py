@@ -97,6 +97,9 @@ class Actuator:
         that is simulated.
     stages
         Further stages between command and reading, in the order of the signal.
+    demagnetized
+        The voltage came to a record's first one straight from 0 V, where the actuator was
+        demagnetized; dynamics and creep may still be moving.
 
     Raises
     ------
@@ -114,6 +117,7 @@ class Actuator:
     creep: Creep | None = None
     span: Span | None = None
     stages: tuple[Stage, ...] = ()
+    demagnetized: bool = False
 
     def __post_init__(self) -> None:
         build_part("dynamics", self.dynamics, DYNAMICS, {}, Filter)
@@ -395,7 +399,7 @@ class Actuator:
 
         ``span`` of earlier drives; by default that of :meth:`range_of` the path.
         """
-        span = span or self.range_of(path)
+        span, from_rest = span or self.range_of(path), from_rest or self.demagnetized
         if path.ndim == 2:
             return tuple(
                 self.begin(values, path_of_model, from_rest=from_rest, span=span)

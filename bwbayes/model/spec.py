@@ -71,6 +71,9 @@ class ModelSpec:
         way, those of the package before others in the same slot.
     hold
         Course of the voltage between samples; ``"auto"`` takes it from the record.
+    history
+        What the hysteresis has been through before a record: ``"unknown"``, any drive over the
+        voltages of the record, or ``"demagnetized"``, a voltage straight from 0 V.
     noise
         The model of the residual.
 
@@ -85,6 +88,7 @@ class ModelSpec:
         StageSpec("dynamics", "lag"),
     )
     hold: Hold | str = "auto"
+    history: str = "unknown"
     noise: str = "discrepancy"
 
     def __post_init__(self) -> None:
@@ -122,7 +126,7 @@ class ModelSpec:
             stages.append(_creep(keys["creep"], keys["creep_growth"]))
         elif keys["creep_growth"]:
             raise InputError("model.creep_growth: there is no creep; give creep = true with it")
-        return cls(tuple(stages), keys["hold"], keys["noise"])
+        return cls(tuple(stages), keys["hold"], keys["history"], keys["noise"])
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -134,6 +138,7 @@ class ModelSpec:
             "creep_growth": False,
             "dynamics": "".join(self._in("dynamics")) or "none",
             "hold": self.hold,
+            "history": self.history,
             "noise": self.noise,
             "stages": self._in("input", "output"),
             **dict(option for stage in self.stages for option in stage.options),
@@ -231,6 +236,7 @@ class ModelSpec:
             Creep(tuple(times), keys["creep_growth"], extent.span) if times else None,
             extent.span,
             tuple(build_part("model.stages", name, STAGES, {}, Stage) for name in keys["stages"]),
+            self.history == "demagnetized",
         )
 
     def __str__(self) -> str:
@@ -242,6 +248,8 @@ class ModelSpec:
         if keys["creep"]:
             parts.append(f"creep{' that grows with the voltage' * keys['creep_growth']}")
         parts += keys["stages"]
+        if self.history == "demagnetized":
+            parts.append("demagnetized before the record")
         return f"{', '.join(parts)}, dynamics {keys['dynamics']}, {self.hold} hold"
 
 

@@ -185,7 +185,9 @@ def estimate_initial_states(
     hold, inputs = start.hold or record.hold, record.inputs
     (low, high), voltage = training.span, inputs.voltage
     span = Span(min(float(np.min(voltage)), low), max(float(np.max(voltage)), high))
-    actuator = replace(training.actuator, interval=record.interval, hold=hold, span=span)
+    actuator = replace(
+        training.actuator, interval=record.interval, hold=hold, span=span, demagnetized=False
+    )
     memory = training.noise.correlation_time(training.table.noise(theta))
     window = start.window(record, float(np.median(memory)))
     estimate_offset = start.estimate_offset and window is not None

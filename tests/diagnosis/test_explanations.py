@@ -1,6 +1,7 @@
 """Explanations are weighed by their exact evidence where it is known; plants get their cause."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +30,7 @@ from bwbayes.model.declaration import normal
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, drawn, hysteresis, lagged, plant
 from tests.prediction.runs import problem_of
-from tests.stand import Stand
+from tests.stand import Stand, play
 
 
 def scene(
@@ -311,6 +312,40 @@ def test_creep_that_began_before_the_record_errs_by_the_sensor_alone(tmp_path: P
     fitted = climb(posterior, pointfit.fit(posterior, rng).optima)
     assert fitted.rmse == pytest.approx(0.01, rel=0.05)
     assert fitted.error([slice(0, 500)]) == pytest.approx(0.01, rel=0.1)
+
+
+@pytest.mark.parametrize("loaded", [True, False])
+def test_plays_that_a_first_load_has_moved_are_told_from_plays_that_ran(
+    tmp_path: Path, *, loaded: bool
+) -> None:
+    """Ramp 0 V to 50 V and record, or record after two periods over all voltages."""
+    rng = np.random.default_rng([7, loaded])
+    time = np.arange(2000) / 200
+    voltage = 50 + 45 * np.exp(-0.12 * time) * np.sin(2 * np.pi * time)
+    before = np.linspace(0, 50, 200)
+    if not loaded:
+        before = np.concatenate([before, 50 + 50 * np.sin(4 * np.pi * np.arange(400) / 400)])
+    driven = np.concatenate([before, voltage])
+    moved = 0.09 * driven + sum(0.008 * play(driven, width) for width in np.linspace(4, 56, 14))
+    readings = moved[before.size :] + 0.01 * rng.normal(size=time.size)
+    write_record(Record(voltage, readings, interval=1 / 200), tmp_path / "record.h5")
+    text = """
+        [record]
+        file = "record.h5"
+        [model]
+        hysteresis = "prandtl-ishlinskii"
+        dynamics = "none"
+        noise = "discrepancy"
+        """
+    problem = problem_of(text, tmp_path)
+    point = pointfit.fit(problem.posterior, rng)
+    analysis = ResidualAnalysis.of(problem.posterior, point.optima, rng, problem.study)
+    (history,) = model.history(analysis)
+    assert (history.nats > 100) if loaded else (history.nats < 0)
+    # The fix, once it is taken, is the whole cure.
+    assert history.spec is not None
+    cured = replace(analysis, study=problem.study.with_model(history.spec))
+    assert not [*model.history(cured)]
 
 
 def test_ties_are_both_named_and_one_that_removes_readings_must_lead() -> None:

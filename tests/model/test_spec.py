@@ -19,6 +19,7 @@ def specs(draw: st.DrawFn) -> ModelSpec:
     names = draw(st.lists(st.sampled_from(FURTHER), unique=True))
     spec = ModelSpec(
         hold=draw(st.sampled_from(["auto", "first", "zero"])),
+        history=draw(st.sampled_from(["unknown", "demagnetized"])),
         noise=draw(st.sampled_from([*NOISES])),
     ).with_stages(*names, draw(st.sampled_from([*DYNAMICS])), draw(st.sampled_from([*HYSTERESIS])))
     if draw(st.booleans()):

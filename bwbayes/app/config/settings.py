@@ -218,6 +218,10 @@ class ModelConfig(ActuatorConfig):
     """How the voltage goes between samples: in straight lines (first), held (zero), or held if it
     is a command (auto).
     """
+    history: Literal["unknown", "demagnetized"] = key("unknown", example='"demagnetized"')
+    """What the hysteresis has been through before the record: any drive over the record's voltages
+    (unknown), or a voltage straight from 0 V after demagnetization; dynamics may still be moving.
+    """
     search: Duration = key("60s", example='"none"', called="improve")
     """Longest time of the search for stages, as in 60s or 2min; none: no search."""
     noise: str = key("auto", example='"smooth"')

@@ -158,7 +158,11 @@ class Problem:
             if missing := self.config.records[name].missing:
                 fact += f" ({' and '.join(f'{value:g}' for value in missing)} um taken as missing)"
             facts[f"record{which}"] = fact
-            facts[f"start{which}"] = _start(record, self.config.records[name].from_rest)
+            facts[f"start{which}"] = _start(
+                record,
+                from_rest=self.config.records[name].from_rest,
+                demagnetized=self.config.model.history == "demagnetized",
+            )
             facts[f"fitted{which}"] = ", ".join(
                 f"{record.time[w.start]:g} to {record.time[w.stop - 1]:g} s"
                 for w in self.posterior.for_record(name).single_record.training
@@ -334,10 +338,15 @@ def _problem(config: Config, study: Study, validations: Mapping[str, Validation]
     return Problem(explicit, stated, study.posterior, plan, validations, study.defaults)
 
 
-def _start(record: Record, from_rest: bool) -> str:
+def _start(record: Record, *, from_rest: bool, demagnetized: bool) -> str:
     """Say what is taken of a record's start, and what declaring it from rest would change."""
     if from_rest:
         return f"{record.beginning}, demagnetized and at rest, as from_rest declares"
+    if demagnetized:
+        return (
+            f"{record.beginning}; the hysteresis was demagnetized before, as history declares; how "
+            "the dynamics move then is estimated"
+        )
     unknown = "; the hysteresis's state and how the dynamics move then are estimated"
     hint_from_rest = "; if it was demagnetized and nothing moved, from_rest = true makes them known"
     return f"{record.beginning}{unknown}{hint_from_rest * record.starts_at_zero}"

@@ -142,6 +142,7 @@ def _of_own(
     if type(operator).step is not Operator.step and not isinstance(operator, RemembersExtrema):
         step = operator.step(column)
     if isinstance(operator, OneState) and isinstance(step, OneStateStep):
+        from_rest = from_rest or actuator.demagnetized
         memory = operator.begin_apart(column, step, first[:, 0], from_rest=from_rest)
     else:
         memory = actuator.begin(column, first, from_rest=from_rest, span=span)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Ranges
 from bwbayes.model.operator import Span
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
@@ -225,6 +226,22 @@ def test_the_start_goes_from_the_ascending_to_the_descending_branch(
     else:
         assert (lowest == -1).all()
         assert (highest == 1).all()
+
+
+@every_case
+@given(voltage=paths)
+def test_a_demagnetized_actuator_came_straight_from_zero_volts(
+    case: Case, voltage: FloatArray
+) -> None:
+    """Whatever ``initial`` is: as a record whose first sample is at zero volts goes on."""
+    span = Span(-200.0, 200.0)
+    actuator = Actuator("none", hysteresis=case.operator, span=span, demagnetized=True)
+    column = {**case.column, "offset": np.zeros(len(INITIALS))}
+    theta = np.column_stack([column[name] for name in actuator.parameters])
+    before = replace(actuator, demagnetized=False)
+    longer = np.concatenate([[0.0], voltage])
+    expected = before.displacement(theta, longer, from_rest=True)[:, 1:]
+    assert_close(expected, actuator.displacement(theta, voltage))
 
 
 def test_springs_that_hold_back_more_than_all_are_refused() -> None:
