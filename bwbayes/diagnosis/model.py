@@ -139,7 +139,7 @@ def _histories(scene: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
     record = scene.posterior.single_record
     operator = HYSTERESIS[spec.operator.name]
     known = record.from_rest or spec.history != "unknown"
-    if known or not issubclass(operator, RemembersExtrema):
+    if known or not (isinstance(operator, type) and issubclass(operator, RemembersExtrema)):
         return [spec]
     return [spec, replace(spec, history="demagnetized")]
 
