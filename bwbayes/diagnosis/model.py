@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import scipy
@@ -108,21 +107,30 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
     present = type(scene.posterior.single_record.actuator.hysteresis)
     # Try a compiled operator of each family, and plays of any weights, for loops without a formula.
     for name in ("bouc-wen", "bouc-wen-asymmetric", "prandtl-ishlinskii", "plays", "duhem"):
-        kind = f"operator {name}"
-        if HYSTERESIS[name] is present or not scene.looks_for(kind):
+        if HYSTERESIS[name] is present:
             continue
         for spec in _histories(scene, scene.study.spec.with_stages(name)):
+            kind, text = f"operator {name}", f"another operator, {name}"
+            is_other = spec.history != scene.study.spec.history
+            if is_other:
+                kind, text = f"{kind}, demagnetized", f"{text}, {DEMAGNETIZED}"
+            if not scene.looks_for(kind):
+                continue
             posterior = scene.rebuilt(scene.study.with_model(spec))
             # One start finds the best mode of nearly all records, in half of the time of five.
             places = map_estimate.local_minima(posterior, scene.generator, 1)
             fit = scene.extended(posterior, places)
-            text, fix = f"another operator, {name}", lines(scene.study.spec, spec)
-            facts: dict[str, Any] = {"spec": spec, "coordinates": fit.coordinates}
-            if spec.history != scene.study.spec.history:
-                # Only named: a next record's own history is told by its lead-in alone, which a
-                # spectrum of plays that is nearly right is too sure of.
-                kind, text, facts = f"{kind}, demagnetized", f"{text}, {DEMAGNETIZED}", {}
-            yield scene.explained(kind, text, fix, fit, **facts)
+            # Another history is only named: a next record's own is told by its lead-in alone, which
+            # a spectrum of plays that is nearly right is too sure of.
+            stated = None if is_other else spec
+            yield scene.explained(
+                kind,
+                text,
+                lines(scene.study.spec, spec),
+                fit,
+                spec=stated,
+                coordinates=fit.coordinates,
+            )
 
 
 def history(scene: ResidualAnalysis) -> Iterator[Explanation]:
