@@ -126,6 +126,8 @@ def test_samples_are_uniform_whose_clock_ticks_too_slowly(
     st.booleans(),
 )
 @example(20_000, 44_100.0, 5, "g", 0.0, False)
+@example(127, 152_000.0, 3, "g", 0.0, True)  # the stated rate, not a rounder interval
+@example(100, 20_800.0, 3, "g", 0.0, True)  # 39 samples are 1.875 ms, a tie of three digits
 @example(100, 1 / 3, 3, "g", 0.2, True)  # late times are rounded to the second
 @settings(max_examples=60, deadline=None)
 def test_times_of_a_fixed_number_of_digits_are_uniform(

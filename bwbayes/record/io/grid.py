@@ -213,7 +213,8 @@ def _stated_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArra
     if not rate or half is None or "interval_s" in table.notes:
         return None
     half = column.scaled(half, "time")
-    is_on_it = np.abs(elapsed - positions / rate) <= half + half[0]
+    # A time halfway between two digits is rounded by just half a unit, and by the last bits.
+    is_on_it = np.abs(elapsed - positions / rate) <= 1.000001 * (half + half[0])
     return 1 / rate if is_on_it.all() else None
 
 
@@ -239,6 +240,8 @@ def _printed_interval(table: ColumnTable, elapsed: FloatArray, positions: IntArr
     slopes = _slopes_between(elapsed - half, elapsed + half, positions)
     if slopes is None:
         return None
+    if (stated := _stated_interval(table, elapsed, positions)) is not None:
+        return stated
     low, high = slopes
     unsure = (high - low) / 2 * steps
     return _exact_interval(table, (low + high) / 2, unsure, unsure / 2, steps, or_rate=True)
