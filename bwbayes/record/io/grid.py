@@ -95,9 +95,10 @@ def time_grid(table: ColumnTable, stamps: FloatArray) -> tuple[ColumnTable, Grid
     offset = start if abs(start) > 1e6 else 0.0
     steps, samples = np.diff(elapsed), np.arange(elapsed.size)
     interval = float(elapsed[-1]) / steps.size
-    # No clock resolves a billionth of its interval: such a time repeats the one before.
-    for sample in np.flatnonzero((steps > 0) & (steps < 1e-9 * interval)):
-        elapsed[sample + 1] = elapsed[sample]
+    # A step below the last bit of the latest time repeats the time before.
+    resolution = float(np.abs(elapsed).max() * np.finfo(np.float64).eps)
+    for row in np.flatnonzero((steps > 0) & (steps < resolution)):
+        elapsed[row + 1] = elapsed[row]
     steps = np.diff(elapsed)
     sample = int(np.argmax(steps < 0))
     times = stamps[sample : sample + 2] - offset
