@@ -32,8 +32,10 @@ from bwbayes.model.spec import ModelSpec
 
 # Prior of an exponent that is not 1: in nearly all published fits it lies below 5.
 EXPONENT = Distribution("lognorm", {"s": 1.0, "loc": 1.0, "scale": 0.7})
-DEMAGNETIZED = "demagnetized, and then driven straight from 0 V to the record's first voltage"
 EXPONENT_STARTS = ({"exponent": -1.0}, {"exponent": 1.0})
+
+# A history that an operator's unknown start does not hold.
+DEMAGNETIZED = "demagnetized, and then driven straight from 0 V to the record's first voltage"
 
 
 def nonlinearity(scene: ResidualAnalysis) -> Iterator[Explanation]:
@@ -122,13 +124,12 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
             fit = scene.extended(posterior, places)
             # Another history is only named: a next record's own is told by its lead-in alone, which
             # a spectrum of plays that is nearly right is too sure of.
-            stated = None if is_other else spec
             yield scene.explained(
                 kind,
                 text,
                 lines(scene.study.spec, spec),
                 fit,
-                spec=stated,
+                spec=None if is_other else spec,
                 coordinates=fit.coordinates,
             )
 
@@ -140,10 +141,10 @@ def history(scene: ResidualAnalysis) -> Iterator[Explanation]:
 
 
 def _histories(scene: ResidualAnalysis, spec: ModelSpec) -> list[ModelSpec]:
-    """Return a model with each of the histories before the record that its start does not hold.
+    """Return a model as it is, and with the history that its unknown start does not hold, if any.
 
-    An operator that remembers extrema goes other ways on the first curve, from zero volts, than
-    after a drive over all voltages. Half a period of such a misfit spoils the fit of all others.
+    On a first curve from zero volts, an operator that remembers extrema moves otherwise than after
+    a drive over all voltages. The misfit of that half period spoils the fit of all others.
     """
     record = scene.posterior.single_record
     operator = HYSTERESIS[spec.operator.name]

@@ -80,7 +80,7 @@ class ModelSpec:
     Raises
     ------
     InputError
-        A stage that is there twice, or two operators or dynamics.
+        A stage that is there twice, or two operators or dynamics; an unknown history.
     """
 
     stages: tuple[StageSpec, ...] = (
@@ -97,6 +97,10 @@ class ModelSpec:
         for place in places:
             if places.count(place) > 1:
                 raise InputError(f"model: {place!r} is there twice; leave one out")
+        if self.history not in ("unknown", "demagnetized"):
+            raise InputError(
+                f"history: {self.history!r} is unknown; write one of unknown, demagnetized"
+            )
 
         def position(stage: StageSpec) -> tuple[int, int]:
             return slots.index(stage.slot), (*names, stage.name).index(stage.name)

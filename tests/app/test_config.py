@@ -189,7 +189,14 @@ def test_the_runs_that_come_with_the_package_can_be_read(path: Path) -> None:
 
 # Models in a line are what a config would say of them, and what cannot be read is one line
 
-BASE = ModelConfig(nonlinearity=["cubic"], creep=True, dynamics="none", hold="first", passive=False)
+BASE = ModelConfig(
+    nonlinearity=["cubic"],
+    creep=True,
+    dynamics="none",
+    hold="first",
+    history="demagnetized",
+    passive=False,
+)
 
 
 def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
@@ -201,7 +208,7 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
         "linear + creep + lag + white",
     ]
     first, second, third = models.values()
-    assert first == ModelConfig(dynamics="none", hold="first", stages=[])
+    assert first == ModelConfig(dynamics="none", hold="first", history="demagnetized", stages=[])
     assert (second.hysteresis, second.thresholds) == ("maxwell-slip", 4)
     assert second.nonlinearity == ["quadratic", "cubic"]
     assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")

@@ -2,9 +2,11 @@
 
 import json
 
+import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.app.config.settings import ModelConfig
+from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES
 from bwbayes.model.nonlinearity import TERMS
 from bwbayes.model.registry import DYNAMICS, HYSTERESIS, STAGES
@@ -42,6 +44,11 @@ def test_a_spec_is_what_a_config_says(spec: ModelSpec, other: ModelSpec) -> None
     assert (spec == other) == (not spec.changes_to(other))
     config = ModelConfig.model_validate(other.keys).with_spec(spec)
     assert ModelConfig.model_validate(config.model_dump()).spec == spec
+
+
+def test_an_unknown_history_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^history: 'swept' is unknown; write one of unknown, "):
+        ModelSpec(history="swept")
 
 
 @given(specs(), st.sampled_from(FURTHER))

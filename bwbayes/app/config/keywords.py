@@ -184,4 +184,6 @@ def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
     core = StageSpec.of("hysteresis", operator, stated), StageSpec("dynamics", base.dynamics)
     spec = ModelSpec(core).with_stages(*(word for word in words if word in stages))
     noise = " + ".join(word for word in words if word in NOISES)
-    return dict.fromkeys(OPTIONS) | spec.keys | {"hold": base.hold, "noise": noise or base.noise}
+    # The course of the voltage and what was before are of the record, not of a model.
+    kept = {"hold": base.hold, "history": base.history}
+    return dict.fromkeys(OPTIONS) | spec.keys | kept | {"noise": noise or base.noise}
