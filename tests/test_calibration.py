@@ -8,8 +8,8 @@ false alarm once in 100 times. A sharper test looks at all parameters of a repli
 a tenth too small.
 
 These are planted on the stored draws, as twins. The other defects are planted in the likelihood or
-the prior, in the default suite, with as few replicates as show them, and fewer free parameters,
-because these defects are large: the twins without a defect are the sound replicates.
+the prior, with as few replicates as show them, and fewer free parameters, because these defects are
+large: the twins without a defect are the sound replicates. The default suite has one of each.
 
 Bands are held to three standard errors from the spread between the replicates. One of the nine
 comparisons, which depend on each other, is off by chance in one calibration of 28. The
@@ -161,7 +161,10 @@ def forgotten_prior() -> CalibrationSetup:
     return replace(forgetful, source=common.posterior)
 
 
-@pytest.mark.parametrize("defect", [wrong_correlation, swapped_sign, forgotten_prior])
+@pytest.mark.parametrize(
+    "defect",
+    [swapped_sign, forgotten_prior, pytest.param(wrong_correlation, marks=pytest.mark.slow)],
+)
 def test_defect_of_likelihood_or_prior_is_found(defect: Callable[[], CalibrationSetup]) -> None:
     outcome = judged(made(replace(defect(), held_out={}), FEW))
     assert not outcome.passed

@@ -4,14 +4,17 @@ import csv
 import json
 import shutil
 import tomllib
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import bwbayes as bw
+from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import Campaign, Row, config_text, resume, start
@@ -26,6 +29,7 @@ from tests.app import small
 from tests.app.conftest import Type
 from tests.app.specimens import CONFIG, record, specimens
 from tests.app.steps import Steps
+from tests.forks import FORKS
 
 COUNT = 3
 FILES = ("campaign.json", "campaign.csv", "campaign.html", "figures/parameters.png")
@@ -55,9 +59,16 @@ def ended(folder: CampaignFolder, **options: Any) -> Campaign:
 
 @pytest.fixture(scope="module")
 def whole(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the campaign made in one piece; for reading."""
+    """Return the campaign made by its command in one piece, in this process; for reading."""
     path = tmp_path_factory.mktemp("whole") / "batch"
-    ended(begun(given, path))
+    command = "campaign", "records", "--config", "small.toml", "--no-pictures", "--workers", "1"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(given)
+        small.without_explanations(patch)
+        done = CliRunner().invoke(cli, [*command, "--out", str(path)], standalone_mode=False)
+    assert 2 == done.return_value, done.output
+    assert "REFUSED: broken: broken.csv:2:" in done.stderr
+    assert "6 records: 3 refused, 3 passed" in done.stdout
     return path
 
 
@@ -93,6 +104,7 @@ def test_every_record_has_a_row_and_a_run_of_its_own(whole: Path) -> None:
             assert number == summary["records"][name]["parameters"]["d"][key]
 
 
+@pytest.mark.usefixtures("_without_explanations")
 def test_a_records_run_is_what_the_run_command_makes(
     given: Path, whole: Path, tmp_path: Path
 ) -> None:
@@ -110,19 +122,6 @@ def test_a_records_run_is_what_the_run_command_makes(
     write_summary(tmp_path / "alone.json", summary(alone.result))
     for key, value in json.loads((tmp_path / "alone.json").read_text()).items():
         assert value == own[key], key
-
-
-def test_the_command_says_which_records_were_refused_and_ends_with_2(
-    bwbayes: Type, given: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """In two processes it ends in the same bytes as here in one."""
-    monkeypatch.chdir(given)
-    options = "--config", "small.toml", "--no-pictures", "--workers", "2"
-    said = bwbayes("campaign", "records", *options, "--out", tmp_path / "batch")
-    assert 2 == said.status, said.err
-    assert "REFUSED: broken: broken.csv:2:" in said.err
-    assert "6 records: 3 refused, 3 passed" in said.out
-    assert_same_end(whole, tmp_path / "batch")
 
 
 def test_columns_and_units_of_all_records_are_said_once(bwbayes: Type, tmp_path: Path) -> None:
@@ -165,9 +164,14 @@ def test_a_campaign_tells_what_share_of_its_combining_is_done(
     steps.require("results", "draws", "population", "figures")
 
 
+def unexplained() -> None:
+    small.without_explanations(pytest.MonkeyPatch())
+
+
 def test_a_finished_campaign_fits_nothing_again(
     given: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A run that is done again in another process ends in the same bytes."""
     shutil.copytree(whole, tmp_path / "batch")
     asked: list[list[str]] = []
 
@@ -183,7 +187,8 @@ def test_a_finished_campaign_fits_nothing_again(
     mark, file = folder.run("s002") / "ended.json", given / "records/s002.csv"
     mark.write_bytes(mark.read_bytes()[:30])
     assert not folder.is_done(file)
-    ended(folder)
+    with ProcessPoolExecutor(1, FORKS, initializer=unexplained) as pool:
+        ended(folder, executor=pool)
     assert [["broken"], ["broken", "s002"]] == asked
     assert folder.is_done(file)
     assert_same_end(whole, folder.path)

@@ -38,7 +38,7 @@ from tests.diagnosis.plants import plant
 from tests.stand import Stand, autoregressive, play
 from tests.test_sampling_rates import records
 
-SLOW_EVENTS = ("transient", "moving gain")
+SLOW_EVENTS = ("drift", "transient", "mains", "moving gain")
 
 
 def config_of(kind: str, folder: Path) -> Config:
@@ -95,7 +95,7 @@ def test_nothing_is_added_to_a_right_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    ["drift", "step", "mains", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)],
+    ["step", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_EVENTS)],
 )
 def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_of_the_next(
     kind: str, tmp_path: Path

@@ -21,9 +21,8 @@ def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
     with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
         small.without_explanations(patch)
         warnings.simplefilter("ignore")
-        return bw.fit(
-            record, dynamics="none", noise="white", search="none", ess=200, progress=False
-        )
+        keys = {"dynamics": "none", "noise": "white", "search": "none", "ess": 200, "walkers": 20}
+        return bw.fit(record, progress=False, **keys)
 
 
 def test_an_exact_record_gives_its_parameters() -> None:
