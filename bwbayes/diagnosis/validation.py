@@ -13,7 +13,8 @@ evidence (:mod:`bwbayes.diagnosis.explanations`), on others the shape that expla
 explanation is an effect that does not come from the actuator, such as a transient, a drift or
 outliers: the parameters may have followed it. It has not passed either if a better model is known:
 held-out readings have the drive of the fitted ones, and there a discrepancy takes up the model's
-error; along another drive the error has another size.
+error; along another drive the error has another size. For the same reason it has not passed if a
+search for stages added some and left a model error all the same.
 
 Every product of a run carries the run's :class:`ValidationSummary`: it goes first
 on every page, into every file of numbers, and decides the exit status of every command.
@@ -32,7 +33,7 @@ from bwbayes.diagnosis.causes import LEAD_IN_ALARM, UNEXPLAINED, cause
 from bwbayes.diagnosis.defects import DEFECTS
 from bwbayes.diagnosis.departures import StandardizedResiduals
 from bwbayes.diagnosis.explanations import better_models, followed_causes, likely_causes
-from bwbayes.diagnosis.finding import Finding, join_findings
+from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding, join_findings
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import ExitStatus, InputError
 from bwbayes.inference.posterior import Posterior
@@ -224,6 +225,7 @@ def validate_bands(
     *,
     explanations: Sequence[Explanation] = (),
     beyond: Sequence[Finding] = (),
+    unexplained: float | None = None,
 ) -> BandValidation | None:
     """Validate bands on the readings after ``scored_from``; return None without any.
 
@@ -239,6 +241,9 @@ def validate_bands(
         Explanations that may describe a fitted record better, the best first.
     beyond
         Respects in which the record's drive goes beyond the fitted one.
+    unexplained
+        The model error, in sds of the sensor's noise, that a search for stages left without finding
+        the mechanism: nobody knows how large it is on another drive.
     """
     if not bands.scored(bands.measured).any():
         return None
@@ -282,6 +287,12 @@ def validate_bands(
         remedy = '; stages = "auto" adds it' if parts else ", which no key of [model] adds"
         doubts.insert(
             0, f"a better model is known ({better.kind}, {rounded(better.nats)} nats){remedy}"
+        )
+    elif unexplained is not None and bands.training:
+        doubts.insert(
+            0,
+            "the search for stages did not find the mechanism: the model error is still "
+            f"{unexplained:g} times the sensor's noise; {TELLING_DRIVE}",
         )
     if standard.idle and not bands.training:
         doubts.append(standard.idle)

@@ -16,7 +16,7 @@ from hypothesis import given, strategies as st
 from rich.console import Console
 
 import bwbayes as bw
-from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.config import Config, dump, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
 from bwbayes.app.problem.problem import resolve_config
@@ -61,6 +61,19 @@ def test_a_quadratic_gain_is_added(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_search_that_adds_many_stages_and_leaves_an_error_has_not_found_the_mechanism(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here one stage counts as many: the plant's own discrepancy remains beside a quadratic one."""
+    monkeypatch.setattr(explaining, "MAX_STAGES", 1)
+    chosen = search_stages(resolve_config(config_of("quadratic", tmp_path), tmp_path)).problem
+    unexplained = chosen.config.model.unexplained
+    assert unexplained is not None
+    assert unexplained > explaining.MAX_DISCREPANCY
+    assert parse(dump(chosen.config), "again").model.unexplained == unexplained
+    assert len(chosen.config.records["record"].remarks or []) == 1
+
+
 def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -> None:
     record = plant("quadratic", (8, 1), 8.0)
     with warnings.catch_warnings(record=True) as caught:

@@ -430,6 +430,20 @@ def test_no_fit_passes_while_a_better_model_is_known(
     assert said is None or (verdict.cause is not None and verdict.cause.fix == explanation.fix)
 
 
+def test_no_fit_passes_after_a_search_that_did_not_find_the_mechanism() -> None:
+    record = made(np.random.default_rng(1), length=30)
+    background = ValidationContext(record.memory, 0.0, FITTED)
+    fitted, held_out = (
+        validate_bands(bands_of(record, training=training), background, unexplained=0.93)
+        for training in (True, False)
+    )
+    assert fitted is not None
+    assert held_out is not None
+    assert held_out.passed
+    assert fitted.passed is None
+    assert "the model error is still 0.93 times the sensor's noise" in fitted.line
+
+
 def test_one_of_several_that_tie_can_be_added_where_it_is_a_stage() -> None:
     record = made(np.random.default_rng(1), length=30)
     late = Explanation("delay", "late by 4 ms", "move the column", nats=21.0)

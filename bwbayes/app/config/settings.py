@@ -224,6 +224,9 @@ class ModelConfig(ActuatorConfig):
     """
     search: Duration = key("60s", example='"none"', called="improve")
     """Longest time of the search for stages, as in 60s or 2min; none: no search."""
+    unexplained: float | None = key(None, unit="SDs of the sensor's noise", example="0.9")
+    """The model error left by a search that did not find the mechanism; such a run is inconclusive.
+    """
     noise: str = key("auto", example='"smooth"')
     """The model of the residual; auto: the one that the records have evidence for."""
     per_record: Texts = key([], example='["sensor_sd"]')

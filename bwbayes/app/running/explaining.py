@@ -177,7 +177,9 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     stage that leads; then it leaves out again what was added and is not needed any more. No stage
     is added with which the error on readings that were held out grows by a tenth, whatever its
     evidence. Several records have none added: an explanation is one of a single record. Time is CPU
-    time, so that a busy machine finds the same.
+    time, so that a busy machine finds the same. A search that adds three stages and leaves a
+    model error all the same has not found the mechanism: the config says so (``unexplained``), and
+    the run is inconclusive. With fewer, the error may be a disturbance, and that is a remark.
     """
     begin, seconds = time.process_time(), problem.config.model.search_seconds
     point = _fit_point(problem, partial(watch, "MAP estimate"))
@@ -218,16 +220,20 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
             steps.append(f"not added: {refused.text} ({refused.worth})")
     if is_over:
         steps.append(f"the search for stages ended after {seconds:g} s, before it was complete")
-    remarks = [*notes.values()]
+    remarks, unexplained = [*notes.values()], None
     discrepancy = _relative_discrepancy(problem, point)
-    if len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
+    if len(notes) >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
+        unexplained = float(f"{discrepancy:.2g}")
+    elif len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
         remarks.append(
             "the search for stages may not have found the mechanism: the model error is still "
             f"{discrepancy:.2g} times the sensor's noise, with {len(notes)} added; a drive unlike "
             f"the training record's may be missed. Fix: {TELLING_DRIVE}."
         )
     spec = problem.study.spec
-    problem = problem.with_model(spec, remarks=remarks, stages=spec.keys["stages"])
+    problem = problem.with_model(
+        spec, remarks=remarks, stages=spec.keys["stages"], unexplained=unexplained
+    )
     return ChosenModel(problem, point, tuple(steps), None if is_over else {name: explanations})
 
 

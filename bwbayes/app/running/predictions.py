@@ -500,7 +500,13 @@ def validate_predictions(
     for predicted in bands:
         explained = explanations.get(records[predicted.name], ()) if predicted.training else ()
         beyond = problem.extrapolations.get(predicted.name, ())
-        verdict = validate_bands(predicted, background, explanations=explained, beyond=beyond)
+        verdict = validate_bands(
+            predicted,
+            background,
+            explanations=explained,
+            beyond=beyond,
+            unexplained=problem.config.model.unexplained,
+        )
         if verdict is not None:
             validation[predicted.name] = verdict
     return validation
