@@ -52,7 +52,7 @@ SHORTER = {
 DEFAULTS = {
     "bwbayes.app.running.explaining.explain": lambda *_, **__: (),
     "bwbayes.report.figures.plots_of": lambda _: NO_PLOTS,
-    "bwbayes.report.figures.pictures.draw_kind": lambda *_: Figure(),
+    "bwbayes.report.figures.draw_kind": lambda *_: Figure(),
     "bwbayes.report.outputs.picture_of": lambda *_: picture_of(Figure),
     "bwbayes.app.fit.calls.USUAL_MODELS": "linear; bouc-wen",
 }

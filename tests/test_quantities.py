@@ -14,7 +14,7 @@ import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.designed import RivalDesign, RivalScore
+from bwbayes.comparison.design import RivalDesign, RivalScore
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.study import every_declaration
 from bwbayes.model.declaration import Context, Ranges

@@ -5,24 +5,33 @@ The C file needs no library but ``math.h`` and allocates nothing. It holds the v
 time. Where a voltage is held between samples, forward returns the displacement just before its
 voltage acts and inverse the voltage for the next sample: forward of inverse is one sample late. A
 value that is not a number holds the last voltage and sets ``held`` of the state.
+
+:func:`c_functions` prints Python functions of numbers as C, so that a controller's code is written
+once. They are made of assignments, ``if``, loops, arithmetic, functions of ``math.h``, and
+functions of the same kind. Python's own unparser writes their expressions; what C spells otherwise
+is replaced in the syntax tree first.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
-from collections.abc import Callable, Mapping
+import textwrap
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import wrap
+from types import FunctionType, MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from bwbayes.arrays import FloatArray
-from bwbayes.control.codegen import c_functions, to_ascii, to_c_number
 from bwbayes.control.sampled import (
     SampledModel,
     SampledStage,
@@ -42,6 +51,254 @@ from bwbayes.report.outputs import refuse_existing, write_summary
 from bwbayes.report.report import Facts, Product, Report
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
+
+# Arguments of functions that are arrays to be written to.
+WRITTEN = ("after", "settled", "filtered")
+
+
+def c_functions(
+    functions: Sequence[Callable[..., Any]],
+    shapes: Mapping[str, tuple[int, ...]],
+    prefix: str,
+    bindings: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
+) -> str:
+    """Return functions and those that they call as static functions of C, callees first.
+
+    They are of numbers and of arrays, with ``shapes`` by the names of arguments; those in
+    ``WRITTEN`` are written to. C returns the first number that a function returns, and writes the
+    others through pointers. ``bindings`` are functions that arguments stand for: C has these by
+    their names. All names begin with ``prefix``.
+
+    Raises InputError: an expression or statement that has no counterpart here.
+    """
+    printed: dict[FunctionType, str] = {}
+    for function in functions:
+        assert inspect.isfunction(function)
+        _Printer(function, shapes, prefix, bindings, printed)
+    return "\n".join(printed.values())
+
+
+def to_ascii(text: str) -> str:
+    """Return a text with Greek letters by their names and exponents as plain digits."""
+    signs = {"−": "-", "′": "'", "≥": ">=", "≤": "<=", "``": "", "Σ": "sum of", "²": "^2"}
+    for sign, plain in {**signs, "ⁿ": "^n"}.items():
+        text = text.replace(sign, plain)
+    for letter in set(text):
+        if "GREEK" in unicodedata.name(letter, ""):
+            text = text.replace(letter, unicodedata.name(letter).rsplit(" ", 1)[1].lower())
+    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+
+
+def to_c_number(value: float) -> str:
+    """Return a number as C writes it, to the last bit."""
+    return repr(float(value)).replace("inf", "HUGE_VAL")
+
+
+class _Printer(ast.NodeTransformer):
+    """Prints one function into ``printed``, after those that it calls."""
+
+    def __init__(
+        self,
+        function: FunctionType,
+        shapes: Mapping[str, tuple[int, ...]],
+        prefix: str,
+        bindings: Mapping[str, Callable[..., Any]],
+        printed: dict[FunctionType, str],
+    ) -> None:
+        self.function, self.shapes, self.prefix = function, shapes, prefix
+        self.bindings, self.printed = bindings, printed
+        self.tables: dict[str, Sequence[float]] = {}
+        self.variables = set(function.__code__.co_varnames)
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+        assert isinstance(tree, ast.FunctionDef)
+        body = [f"    {line}" for line in self.block(tree.body)]
+        declared = list(self.declarations(tree))
+        used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        unused = {argument.arg for argument in tree.args.args} - used - {*bindings}
+        body = [*(f"    (void){name};" for name in sorted(unused)), *body]
+        lines = [self.head(tree), "{", *declared, *[""] * bool(declared), *body, "}", ""]
+        comment = (
+            to_ascii(inspect.getdoc(function) or "").replace("\n", "\n * ").replace(" * \n", " *\n")
+        )
+        deeper = "            "
+        wrapped = [textwrap.fill(line, 100, subsequent_indent=deeper) for line in lines]
+        printed[function] = "\n".join([f"/* {comment} */", *wrapped])
+
+    def head(self, tree: ast.FunctionDef) -> str:
+        """Return the function's name, arguments, and pointers for further results."""
+        returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
+        results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
+        names = [argument.arg for argument in tree.args.args]
+        kinds = dict.fromkeys(self.shapes, "const double *") | dict.fromkeys(WRITTEN, "double *")
+        arguments = [f"{kinds.get(n, 'double ')}{n}" for n in names if n not in self.bindings]
+        arguments += [f"double *result_{number}" for number in range(1, results)]
+        return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"
+
+    def declarations(self, tree: ast.FunctionDef) -> Iterator[str]:
+        """Yield the lines that declare tables, numbers and counters of loops."""
+        for name, row in self.tables.items():
+            numbers = ", ".join(map(to_c_number, row))
+            yield f"    static const double {name}[] = {{ {numbers} }};"
+        nodes = list(ast.walk(tree))
+        counters = [ast.unparse(node.target) for node in nodes if isinstance(node, ast.For)]
+        stored = [n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)]
+        declared = {*counters, *(argument.arg for argument in tree.args.args)}
+        numbers_of = [name for name in dict.fromkeys(stored) if name not in declared]
+        for kind, names in (("double", numbers_of), ("int", list(dict.fromkeys(counters)))):
+            if names:
+                yield f"    {kind} {', '.join(names)};"
+
+    def block(self, statements: Sequence[ast.stmt]) -> list[str]:
+        """Return the lines of statements."""
+        return [line for statement in statements for line in self.statement(statement)]
+
+    def braced(self, head: str, statements: Sequence[ast.stmt]) -> list[str]:
+        """Return the lines of a block in braces."""
+        return [f"{head} {{", *(f"    {line}" for line in self.block(statements)), "}"]
+
+    def statement(self, node: ast.stmt) -> Iterator[str]:
+        """Yield the lines of a statement."""
+        match node:
+            case ast.Expr(value=ast.Constant(value=str())):  # a docstring
+                pass
+            case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
+                texts = [self.text(target) for target in targets]
+                for number, value in enumerate(values):
+                    if {ast.unparse(inner) for inner in ast.walk(value)} & set(texts[:number]):
+                        raise self.refused(node)  # in C one comes after the other
+                    yield f"{texts[number]} = {self.text(value)};"
+            case ast.Assign(targets=[ast.Tuple(elts=[target, *others])], value=ast.Call() as call):
+                pointers = [f"&{self.text(other)}" for other in others]
+                yield f"{self.text(target)} = {self.call(call, pointers)};"
+            case ast.Assign(targets=[target], value=value):
+                yield f"{self.text(target)} = {self.text(value)};"
+            case ast.AugAssign(target=target, op=op, value=value):
+                yield f"{self.text(target)} = {self.text(ast.BinOp(target, op, value))};"
+            case ast.Return(value=ast.expr() as value):
+                first, *others = value.elts if isinstance(value, ast.Tuple) else [value]
+                yield from (f"*result_{n} = {self.text(x)};" for n, x in enumerate(others, 1))
+                yield f"return {self.text(first)};"
+            case ast.If(test=test, body=body, orelse=orelse):
+                lines = self.braced(f"if ({self.text(test)})", body)
+                yield from [*lines[:-1], *self.braced("} else", orelse)] if orelse else lines
+            case ast.While(test=test, body=body):
+                yield from self.braced(f"while ({self.text(test)})", body)
+            case ast.For(target=target, iter=ast.Call(func=ast.Name(id="range"), args=bounds)):
+                implied = [] if bounds[1:] else ["0"]
+                start, stop, step = (implied + self.whole(*bounds) + ["1"])[:3]
+                compared, change = (">", "--") if step == "-1" else ("<", "++")
+                name = ast.unparse(target)
+                head = f"for ({name} = {start}; {name} {compared} {stop}; {name}{change})"
+                yield from self.braced(head, node.body)
+            case _:
+                raise self.refused(node)
+
+    def text(self, node: ast.expr) -> str:
+        """Return an expression."""
+        return ast.unparse(self.visit(node))
+
+    def whole(self, *nodes: ast.expr) -> list[str]:
+        """Return expressions that are whole numbers."""
+        texts = [self.text(node).removesuffix(".0") for node in nodes]
+        return [text if re.fullmatch(r"-?\w+", text) else f"(int)({text})" for text in texts]
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        """Return a number."""
+        if not isinstance(node.value, int | float):
+            raise self.refused(node)
+        return ast.Name(to_c_number(node.value))
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Return a variable, or the value of a module's constant."""
+        if node.id in self.variables:
+            return node
+        return ast.Name(to_c_number(self.function.__globals__[node.id]))
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        """Return an element of an array, or of a module's table."""
+        name = ast.unparse(node.value)
+        if name not in self.variables:
+            self.tables[name] = self.function.__globals__[name]
+        if isinstance(node.slice, ast.Tuple):
+            row, column = self.whole(*node.slice.elts)
+            return ast.Name(f"{name}[{self.shapes[name][1]} * {row} + {column}]")
+        return ast.Name(f"{name}[{self.whole(node.slice)[0]}]")
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
+        """Return a number with its sign, or a condition that is denied."""
+        operand = self.visit(node.operand)
+        if isinstance(node.op, ast.Not):
+            return ast.Name(f"!({ast.unparse(operand)})")
+        return ast.UnaryOp(node.op, operand)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        """Return an operation; a power is a function of C."""
+        if isinstance(node.op, ast.Pow):
+            return ast.Name(f"pow({self.text(node.left)}, {self.text(node.right)})")
+        allowed = ast.Add | ast.Sub | ast.Mult | ast.Div | ast.BitAnd | ast.BitOr
+        if not isinstance(node.op, allowed):
+            raise self.refused(node)
+        return ast.BinOp(self.visit(node.left), node.op, self.visit(node.right))
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
+        """Return conditions together."""
+        sign = " && " if isinstance(node.op, ast.And) else " || "
+        return ast.Name(f"({sign.join(f'({self.text(value)})' for value in node.values)})")
+
+    def visit_Compare(self, node: ast.Compare) -> ast.expr:
+        """Return a comparison of two numbers."""
+        if len(node.ops) > 1 or isinstance(node.ops[0], ast.Is | ast.IsNot | ast.In | ast.NotIn):
+            raise self.refused(node)
+        return ast.Compare(self.visit(node.left), node.ops, [self.visit(node.comparators[0])])
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        """Return a call, or the number that stands for a function of arrays."""
+        match node:
+            case ast.Call(func=ast.Name(id="anywhere"), args=[condition]):
+                return self.visit(condition)  # type: ignore[no-any-return]
+            case ast.Call(func=ast.Name(id="look_up"), args=[table, index]):
+                return ast.Name(f"{self.text(table)}[{self.whole(index)[0]}]")
+            case ast.Call(func=ast.Name(id="len"), args=[ast.Name(id=array)]):
+                return ast.Name(to_c_number(self.shapes[array][0]))
+            case ast.Call(func=ast.Name(id="select"), args=choice):
+                test, yes, no = map(self.text, choice)
+                return ast.Name(f"({test} ? {yes} : {no})")
+        return ast.Name(self.call(node, []))
+
+    def call(self, node: ast.Call, pointers: Sequence[str]) -> str:
+        """Return a call of a function of math.h, or of one that is printed before this one."""
+        texts = [self.text(x) for x in node.args if ast.unparse(x) not in self.bindings]
+        arguments = ", ".join([*texts, *pointers])
+        match node.func:
+            case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
+                # Functions with another name in math.h.
+                others = {
+                    "abs": "fabs",
+                    "minimum": "fmin",
+                    "maximum": "fmax",
+                    "power": "pow",
+                    "arctanh": "atanh",
+                }
+                return f"{others.get(name, name)}({arguments})"
+            case ast.Name(id=name):
+                function = self.bindings.get(name, self.function.__globals__.get(name))
+                if inspect.isfunction(function):
+                    if function not in self.printed:
+                        _Printer(function, self.shapes, self.prefix, self.bindings, self.printed)
+                    return f"{self.prefix}{name}({arguments})"
+        raise self.refused(node)
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        """Refuse all other expressions."""
+        raise self.refused(node)
+
+    def refused(self, node: ast.AST) -> InputError:
+        """Return the error that names what cannot be printed."""
+        return InputError(
+            f"{self.function.__qualname__}: `{ast.unparse(node)}` has no counterpart in C here; "
+            "write it with arithmetic, if, for, while and NumPy's functions of a number"
+        )
+
 
 FILES = ("model.json", "actuator.c")
 

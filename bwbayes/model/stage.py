@@ -9,7 +9,7 @@ It is one class in one file. It declares its parameters, and says what it does w
 ``settle`` at the first one, if it has a memory, ``move`` at each of the next, and ``undo``, which
 is ``move`` the other way round, for commands. Each is written once: NumPy moves all models at once
 with it, compiled it moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
-(:mod:`bwbayes.control.codegen`); so it is made of what :mod:`bwbayes.model.elementwise` says.
+(:mod:`bwbayes.control.exported`); so it is made of what :mod:`bwbayes.model.elementwise` says.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ past, or that are integrated, have no such step.
 
 A step's ``move`` is written once, for numbers and for arrays: with rows of arrays (models,) NumPy
 moves all models of a closed loop at once, compiled with numbers it moves one model after the other
-(:mod:`bwbayes.model.compiled`), and printed it is C (:mod:`bwbayes.control.codegen`). So it is made
-of what :mod:`bwbayes.model.elementwise` says.
+(:mod:`bwbayes.model.compiled`), and printed it is C (:mod:`bwbayes.control.exported`). So it is
+made of what :mod:`bwbayes.model.elementwise` says.
 """
 
 from __future__ import annotations

@@ -20,8 +20,10 @@ from bwbayes.report.report import (
     Table,
     TableColumn,
     Text,
+    circumstances,
+    symbol,
+    unit_text,
 )
-from bwbayes.report.words import circumstances, symbol, unit_text
 
 # Names and units of the ranked quantities besides parameters.
 EXTRA_WORDS = {

@@ -1,23 +1,34 @@
-"""Report of a run: the answer, its validation, and the details.
+"""Report of a run: the answer, its validation, the details, and the tables of all these.
 
-Failures come first. Without convergence the report contains no parameters or displacement.
+Failures come first. Without convergence the report contains no parameters or displacement. The CSV
+of a table holds what ``summary.json`` holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
-from bwbayes.inference.parameters import JointPrior
-from bwbayes.prediction.bands import Bands
-from bwbayes.report import tables
+from bwbayes.diagnosis.conflict import effective
+from bwbayes.diagnosis.identifiability import InformationGain
+from bwbayes.diagnosis.predictive_checks import STATISTICS
+from bwbayes.diagnosis.validation import BandValidation
+from bwbayes.inference.parameters import JointPrior, Parameter
+from bwbayes.prediction.bands import LEVELS, Bands
+from bwbayes.prediction.budget import TYPES, Budget
+from bwbayes.prediction.loops import MEASURES, Estimate, Loops
+from bwbayes.prediction.scores import Scores
+from bwbayes.prediction.steps import STEP_MEASURES, StepResponse
 from bwbayes.report.calibration import outcome
-from bwbayes.report.figures.pictures import Pictures, pictures as all_pictures
+from bwbayes.report.figures import Pictures, pictures as all_pictures
 from bwbayes.report.figures.style import title
 from bwbayes.report.report import (
+    UNKNOWN,
     Banner,
     Block,
     Facts,
@@ -25,13 +36,22 @@ from bwbayes.report.report import (
     Report,
     Section,
     SideBySide,
+    Table,
+    TableColumn,
+    Target,
     Text,
+    circumstances,
+    coverage_text,
+    digits,
+    error_text,
+    length_text,
+    mark,
     remarks_banner,
     standing_banner,
+    symbol,
+    unit_text,
 )
 from bwbayes.report.result import Result
-from bwbayes.report.tables import priors_table
-from bwbayes.report.words import circumstances, coverage_text, error_text, length_text, mark
 
 
 def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
@@ -54,12 +74,12 @@ def run_report(result: Result, numbers: Mapping[str, Any]) -> Report:
             "displacement, 95 times in 100. The parameter band covers the model output only, not "
             "the actuator."
         )
-        parameters: list[Block] = [tables.parameters_table(result), Text(note, note=True)]
+        parameters: list[Block] = [parameters_table(result), Text(note, note=True)]
         loop = [[pictures["loop"]]] if "loop" in pictures else []
         results: list[Block] = [*_results(result)] if result.standing.headline else []
         blocks = [*results, SideBySide([parameters, *loop]), *_evidence(result, pictures)]
     else:
-        sampling: list[Block] = [tables.sampling_table(result), *pictures.values()]
+        sampling: list[Block] = [sampling_table(result), *pictures.values()]
         blocks = [Section("Sampling", sampling, folded=False)]
     accepted = ", ".join(
         f"{n} {n_accepted / tried:.0%}" for n, (tried, n_accepted) in result.moves.items()
@@ -206,15 +226,15 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
     if result.scores:
         titles = {bands.name: title(bands) for bands in ordered if bands.name in result.scores}
         scores = {name: result.scores[name] for name in titles}
-        records = tables.flat_records({name: result.validation_numbers[name] for name in titles})
+        records = flat_records({name: result.validation_numbers[name] for name in titles})
         validation = [
-            tables.scores_table(scores, result.validation, titles, records),
-            *tables.rivals_table(ordered),
-            *tables.correction_texts(ordered),
+            scores_table(scores, result.validation, titles, records),
+            *rivals_table(ordered),
+            *correction_texts(ordered),
             Section(
                 "Other scores",
                 [
-                    tables.other_scores_table(scores, titles, records),
+                    other_scores_table(scores, titles, records),
                     Glossary([*SCORE_TERMS.items()]),
                 ],
             ),
@@ -223,16 +243,16 @@ def _evidence(result: Result, pictures: Pictures) -> list[Block]:
         Section("Readings against the bands", [*shown[:1], *validation, *shown[1:]], folded=False)
     ]
     if result.loops is not None:
-        measured = tables.loops_table(result.loops)
+        measured = loops_table(result.loops)
         rows = [row[0] for row in measured.rows]
         terms = [pair for pair in LOOP_TERMS.items() if any(r.startswith(pair[0]) for r in rows)]
         loops: list[Block] = [measured, pictures["loops"], Glossary(terms)]
         blocks.append(Section("Loops", loops, folded=False))
     if result.uncertainty_budgets:
-        budget: list[Block] = [tables.budget_table(result.uncertainty_budgets)]
+        budget: list[Block] = [budget_table(result.uncertainty_budgets)]
         blocks.append(Section("Uncertainty budget", budget, folded=False))
     if result.step_responses:
-        steps: list[Block] = [tables.steps_table(result.step_responses), pictures["steps"]]
+        steps: list[Block] = [steps_table(result.step_responses), pictures["steps"]]
         blocks.append(Section("Step responses", steps, folded=False))
     return blocks
 
@@ -242,7 +262,7 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
     yield Section("Priors and fixed values", [replace(priors, on="page")])
     if result.information_gain is not None:
         remarks = [Text(str(finding)) for finding in result.information_gain.findings]
-        table = tables.learned_table(result, result.information_gain)
+        table = learned_table(result, result.information_gain)
         yield Section("Information gained from the data", [table, *remarks])
     if result.posterior_checks:
         note = (
@@ -250,13 +270,13 @@ def _details(result: Result, numbers: Mapping[str, Any], pictures: Pictures) -> 
             "anew with their own noise; p: the part of these that is larger. Extreme: among "
             "the outermost 1%."
         )
-        checks = tables.replicated_tables(result)
+        checks = replicated_tables(result)
         yield Section("Posterior predictive checks", [*checks, Text(note, note=True)])
     if result.outcome.converged:
         yield Section("Posterior", [pictures["corner"]])
         chains = [pictures[name] for name in ("trace", "ranks")]
-        yield Section("Sampling", [tables.sampling_table(result), *chains])
-    yield Section("Moves", [tables.moves_table(result)])
+        yield Section("Sampling", [sampling_table(result), *chains])
+    yield Section("Moves", [moves_table(result)])
     yield Section("Run details", [Facts([*result.facts.items(), *circumstances(numbers)])])
 
 
@@ -287,3 +307,384 @@ LOOP_TERMS = {
     "Area": "−∮ x du over one cycle, positive where the displacement lags; times the actuator's "
     "force per volt (N/V) the energy lost in a cycle, in µJ.",
 }
+
+
+# A parameter in words, with its symbol; and the columns of names, without them on a screen.
+WORDS = Markup("{words}")
+NAME = (
+    TableColumn("Parameter", on="page", text=WORDS),
+    TableColumn("Parameter", on="screen", text="{name}"),
+)
+
+
+def parameters_table(result: Result) -> Table:
+    """Return a table with the estimate of each free parameter."""
+    estimates = result.estimates
+    is_simulated = any("truth" in estimate for estimate in estimates.values())
+    columns = (
+        *NAME,
+        TableColumn("Mean ± SD", on="page", text="{mean} ± {sd}"),
+        TableColumn("Mean", on="screen", text="{mean}"),
+        TableColumn("SD", on="screen", text="{sd}"),
+        TableColumn("95% interval", text="{lower_95} to {upper_95}"),
+        TableColumn("Unit", text="{unit}"),
+        TableColumn("Truth", on="page" if is_simulated else "nowhere", text="{truth:.6g}"),
+        TableColumn("ESS", on="screen", text="{ess:.0f}"),
+        TableColumn("R-hat", on="screen", text="{rhat:.3f}"),
+    )
+    rows = []
+    for parameter in result.free:
+        row = parameter_row(parameter, estimates[parameter.name])
+        rows.append(row | {"ess": min(row["ess_bulk"], row["ess_tail"])})
+    records = [{"parameter": p.name, **estimates[p.name]} for p in result.free]
+    return Table.of("parameters", "Parameters", rows, columns, records=records, on="both")
+
+
+def sampling_table(result: Result) -> Table:
+    """Return a table of each free parameter's diagnostics, and of its estimates if converged."""
+    check = result.outcome.check
+    estimates = result.estimates if result.outcome.converged else {}
+    agreement = "R\N{COMBINING CIRCUMFLEX ACCENT}"
+    note = (
+        "ESS: effective number of draws, in the bulk and in the tails; "
+        f"{agreement}: agreement of the ensembles, 1 when they agree"
+    )
+    columns = {"ESS bulk": "{ess_bulk:.0f}", "ESS tail": "{ess_tail:.0f}", agreement: "{rhat:.4f}"}
+    if estimates:
+        columns |= {"MCSE": "{mcse_mean:.2g}", "Median": "{median}", "Unit": "{unit}"}
+        note += "; MCSE: Monte Carlo standard error of the mean"
+    rows = []
+    for i, parameter in enumerate(result.free):
+        row = parameter_row(parameter, estimates.get(parameter.name, {}))
+        sizes = {"ess_bulk": check.ess_bulk[i], "ess_tail": check.ess_tail[i]}
+        rows.append(row | sizes | {"rhat": check.rhat[i]})
+    columns = {"Parameter": WORDS, **columns}
+    return Table.of("sampling", "Sampling of each parameter", rows, columns, note=f"{note}.")
+
+
+def moves_table(result: Result) -> Table:
+    """Return a table with the numbers of proposals and acceptances for each kind of move."""
+    rows = [
+        {"name": name, "proposed": proposed, "share": accepted / proposed}
+        for name, (proposed, accepted) in result.moves.items()
+    ]
+    columns = {"Move": "{name}", "Proposed to a walker": "{proposed}", "Accepted": "{share:.1%}"}
+    note = "No mixture proposed these draws, so there is no Pareto k."
+    if (pareto_k := result.outcome.check.pareto_k) is not None:
+        note = f"Pareto k of the mixture at the draws: {pareto_k:.2f}; below 0.7 it covers them."
+    return Table.of("moves", "Moves", rows, columns, note=note)
+
+
+def learned_table(result: Result, learned: InformationGain) -> Table:
+    """Return a table of each parameter's contraction, and of the dependence on its prior."""
+    rows = []
+    for parameter in result.free:
+        about = learned.parameters[parameter.name]
+        decides = "the prior" if about.prior_decides else "the readings"
+        rows.append(parameter_row(parameter, vars(about)) | {"decides": decides})
+    return Table.of(
+        "taught",
+        "Information gained from the data",
+        rows,
+        {
+            "Parameter": WORDS,
+            "Contraction": "{contraction:.2f}",
+            "Prior sensitivity": "{prior:.2f}",
+            "Likelihood sensitivity": "{likelihood:.2f}",
+            "Dominated by": "{decides}",
+        },
+        note="Contraction: 1 - (posterior SD / prior SD)², in the prior's normal scores; near 1 "
+        "the data dominate, near 0 the prior. Sensitivity of the posterior to a small "
+        "change in the weight of the prior, and of the readings; above 0.05 it is not small.",
+    )
+
+
+def replicated_tables(result: Result) -> list[Table]:
+    """Return a table for each fitted record, with its statistics among those of replicated ones."""
+    columns = {
+        "Number": "{words}",
+        "Observed": "{observed:.4g}",
+        "95% of replicated": "{lower:.4g} to {upper:.4g}",
+        "Unit": "{unit}",
+        "p": "{p:.3f}",
+        "Extreme": "{extreme}",
+    }
+    tables = []
+    for name, checked in result.posterior_checks.items():
+        rows = []
+        for kind, statistic in checked.statistics.items():
+            words, unit = STATISTICS[kind]
+            row = {"words": words, "unit": unit_text(unit), **vars(statistic)}
+            rows.append(row | {"extreme": "extreme" if statistic.extreme else ""})
+        of = f" of {name}" if len(result.posterior_checks) > 1 else ""
+        caption = f"Posterior predictive checks{of}"
+        tables.append(Table.of(f"replicated-{name}", caption, rows, columns))
+    return tables
+
+
+def scores_table(
+    scores: Mapping[str, Scores],
+    validation: Mapping[str, BandValidation],
+    titles: Mapping[str, str],
+    records: Sequence[Mapping[str, object]] = (),
+) -> Table:
+    """Return a table of the bands' scores on readings: a row for each of the bands.
+
+    Scores, validation and titles are by the bands' names, in their order; the titles are for the
+    page. ``records`` are the rows of the CSV.
+    """
+    rows = []
+    for name, judged in scores.items():
+        covers = [coverage_text(judged, "sensor", level).removesuffix("%") for level in LEVELS]
+        shares = (judged.coverage["sensor"] or {}).values()
+        row = {
+            "title": titles[name],
+            "name": name,
+            "status": mark(validation[name].status) if name in validation else UNKNOWN,
+            "nrmse": judged.nrmse,
+            "error": error_text(judged),
+            "largest": length_text(judged.max_error_um),
+            "width": length_text(judged.width_um[95]),
+            "covers": ", ".join(covers),
+            "shares": "/".join(f"{100 * share:.1f}" for share in shares),
+        }
+        rows.append(row)
+    levels = [str(level) for level in LEVELS]
+    bands = f"Coverage of the {', '.join(levels)}% sensor bands"
+    columns = (
+        TableColumn("Record", on="page", text="{title}"),
+        TableColumn("Record", on="screen", text="{name}"),
+        TableColumn("Validation", text=Markup("{status}")),
+        TableColumn("NRMSE", on="page", text="{error}"),
+        TableColumn("NRMSE", on="screen", text="{nrmse:.2%}"),
+        TableColumn("Max error", text="{largest}"),
+        TableColumn("Width 95%", text="{width}"),
+        TableColumn(bands, on="page", text="{covers}%"),
+        TableColumn(f"Coverage {'/'.join(levels)}%", on="screen", text="{shares}"),
+    )
+    note = (
+        "NRMSE: root mean square of measured minus mean, over the range of the measured "
+        "displacement. ±: one standard error from a block bootstrap, because neighboring samples "
+        "err together."
+    )
+    return Table.of(
+        "validation", "Band validation", rows, columns, records=records, note=note, on="both"
+    )
+
+
+def rivals_table(predictions: Iterable[Bands]) -> list[Table]:
+    """Return a table of the bands that rivals widen, with and without them, if there are any."""
+    rows = []
+    for bands in predictions:
+        if not bands.model_error_sd:
+            continue
+        both, shares = (bands, bands.without_rivals), ["–", "–"]
+        if (scored := bands.scored(bands.measured)).any():
+            assert bands.measured is not None
+            inside = [each.covers("sensor", 95, bands.measured)[scored] for each in both]
+            shares = [f"{np.mean(covered):.1%}" for covered in inside]
+        wide, narrow = both[0].width(), both[1].width()
+        widths = [length_text(wide), length_text(narrow), f"{wide / narrow:.2g}"]
+        rows.append((bands.name, *widths, *shares))
+    columns = ("Record", "Width 95%", "Without rivals", "Times", "Coverage", "Without rivals")
+    note = (
+        "The model's error follows the drive, and these drives are unlike the training record's: "
+        "there the sensor band has in it how much other models of the training record differ."
+    )
+    table = Table("rivals", "Bands with and without rivals", columns, rows, note=note, on="both")
+    return [table] * bool(rows)
+
+
+def correction_texts(predictions: Iterable[Bands]) -> list[Text]:
+    """Return a line for each of the bands that failed: the width it needs, if that is known."""
+    corrected = [(bands.name, bands.correction) for bands in predictions]
+    return [Text(f"{name}: {c}", on="both") for name, c in corrected if c is not None]
+
+
+def other_scores_table(
+    scores: Mapping[str, Scores], titles: Mapping[str, str], records: Sequence[Mapping[str, object]]
+) -> Table:
+    """Return a table of the other scores: a column for each of the bands, rows of known scores."""
+    judged = scores.values()
+    rows = [["CRPS", *(length_text(score.crps_um) for score in judged)]]
+    for level in sorted(LEVELS, reverse=True):
+        covers = [coverage_text(score, "displacement", level) for score in judged]
+        if any(covers):
+            title = f"{level}% displacement band covers displacement"
+            rows.append([title, *(text or UNKNOWN for text in covers)])
+        sensor = f"{level}% sensor band:"
+        rows += [
+            [f"{sensor} worst second", *(f"{100 * s.worst_second[level]:.1f}%" for s in judged)],
+            [f"{sensor} mean width", *(length_text(s.width_um[level]) for s in judged)],
+            [
+                f"{sensor} interval score",
+                *(length_text(s.interval_score_um[level]) for s in judged),
+            ],
+        ]
+    columns = ["Quantity", *(titles[name] for name in scores)]
+    return Table("scores", "Other scores", columns, rows, records=records)
+
+
+def budget_table(budgets: Sequence[Budget], on: Target = "page") -> Table:
+    """Return a table of the sources' shares in the variance of some quantities, by columns."""
+    rows = [
+        [
+            source,
+            kind,
+            *(f"{100 * b.shares[source]:.1f}%" if source in b.shares else "0" for b in budgets),
+        ]
+        for source, kind in TYPES.items()
+        if any(source in budget.shares for budget in budgets)
+    ]
+    for words, value in (("Mean", "mean"), ("Standard uncertainty", "sd")):
+        values = [f"{digits(getattr(b, value), b.sd)} {unit_text(b.unit)}" for b in budgets]
+        rows.append([words, "", *values])
+    intervals = [f"{digits(b.lower, b.sd)} to {digits(b.upper, b.sd)}" for b in budgets]
+    rows.append(["95% interval", "", *intervals])
+    records = [
+        {"quantity": b.name, "source": s, "share": v} for b in budgets for s, v in b.shares.items()
+    ]
+    note = (
+        "Shares of the variance, which add up. A: from the readings; B: from what else is known. "
+        "Voltages are as the monitor reads them, a displacement is beyond the sensor's zero."
+    )
+    columns = ["Source", "Type", *(budget.name for budget in budgets)]
+    return Table("budget", "Uncertainty budget", columns, rows, records=records, note=note, on=on)
+
+
+def loops_table(loops: Loops) -> Table:
+    """Return a table of the measures of the loops."""
+    estimates = {
+        f"{name} loop, {loop.voltage[0]:.4g} to {loop.voltage[-1]:.4g} V": loop.estimates
+        for name, loop in (("Major", loops.major), ("Minor", loops.minor))
+    }
+    note = (
+        "Of the model driven slowly from turn to turn until the loop closes, without dynamics, "
+        "creep and offset; from the posterior of the parameters alone, without the model's "
+        "discrepancy."
+    )
+    if not (loops.major.closed and loops.minor.closed):
+        note += (
+            " Some of the models' loops had not closed after a thousand cycles and are taken as "
+            "they were."
+        )
+    records = flat_records({"major": loops.major.numbers, "minor": loops.minor.numbers})
+    return _measured("loops", "Measured loops", MEASURES, estimates, records, note)
+
+
+def steps_table(steps: Mapping[str, StepResponse]) -> Table:
+    """Return a table of the measures of the steps."""
+    estimates = {
+        f"{name}: {response.step.height:.4g} V for {response.step.held:.4g} s": response.estimates
+        for name, response in steps.items()
+    }
+    note = (
+        "To an ideal step from zero, demagnetized and at rest, from the posterior of the "
+        "parameters alone. The rise goes from 10 to 90% of where the displacement settles without "
+        "creep; overshoot is what goes beyond that. Creep is the growth from 0.1 s to the end of "
+        "the step, of the displacement at 0.1 s, a decade of time."
+    )
+    records = flat_records({name: response.numbers for name, response in steps.items()})
+    return _measured("steps", "Measured step responses", STEP_MEASURES, estimates, records, note)
+
+
+def _measured(
+    name: str,
+    caption: str,
+    measures: Mapping[str, tuple[str, str]],
+    estimates: Mapping[str, Mapping[str, Estimate | None]],
+    records: Sequence[Mapping[str, object]],
+    note: str,
+) -> Table:
+    """Return a table with mean ± SD and interval of each measure that any loop or step has."""
+    columns: list[str | TableColumn] = ["Quantity"]
+    for group in estimates:
+        columns += [TableColumn("Mean ± SD", group, on="page"), TableColumn("95% interval", group)]
+    rows = []
+    for measure, (words, unit) in measures.items():
+        if all(estimated[measure] is None for estimated in estimates.values()):
+            continue
+        row = [words]
+        for estimated in estimates.values():
+            if (estimate := estimated[measure]) is None:
+                row += [UNKNOWN, UNKNOWN]
+                continue
+            values = estimate.mean, estimate.sd, estimate.lower, estimate.upper
+            mean, sd, lower, upper = (digits(value, estimate.sd) for value in values)
+            row += [f"{mean} ± {sd}", f"{lower} to {upper}"]
+        rows.append([*row, unit_text(unit)])
+    return Table(name, caption, [*columns, "Unit"], rows, records=records, note=note, on="both")
+
+
+def flat_records(numbers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return nested numbers as rows, a column for each key of ``numbers``."""
+    import pandas as pd  # noqa: PLC0415  # slow to load
+
+    columns = {
+        name: pd.json_normalize(dict(nested), sep=" ").iloc[0] for name, nested in numbers.items()
+    }
+    frame = pd.DataFrame(columns).rename_axis("quantity").reset_index()
+    return [{str(key): value for key, value in row.items()} for row in frame.to_dict("records")]
+
+
+def parameter_row(parameter: Parameter, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a parameter's entries for tables: its names, its unit, and the known estimates."""
+    row = dict(numbers)
+    for key in {"mean", "sd", "median", "lower_95", "upper_95"} & numbers.keys():
+        row[key] = digits(numbers[key], numbers["sd"])
+    words = Markup("{}, {}").format(parameter.description, symbol(parameter))
+    return row | {"name": parameter.name, "words": words, "unit": unit_text(parameter.unit)}
+
+
+def priors_table(prior: JointPrior, point: Mapping[str, float] | None = None) -> Table:
+    """Return a table of each parameter's stated and effective prior, or its fixed value.
+
+    The effective prior is the stated one after the physical constraints: median and 95% interval
+    under the joint prior. On the screen it stands below the stated one if it differs. ``point`` has
+    the parameters of a point fit, if there is one.
+    """
+    in_effect = dict(
+        zip(prior.free_names, effective(prior, np.random.default_rng(0)).T, strict=True)
+    )
+    rows = []
+    for parameter in prior.parameters:
+        row = parameter_row(parameter, {}) | {"effect": "", "point": ""}
+        if parameter.prior is None:
+            row["stated"] = row["short"] = f"fixed at {parameter.fixed:.6g}"
+        else:
+            low, median, high = at = in_effect[parameter.name]
+            row["effect"] = f"{median:.3g} ({low:.2g} to {high:.2g})"
+            edges = {"at least": parameter.lower, "at most": parameter.upper}
+            cuts = (f", {words} {x:.6g}" for words, x in edges.items() if math.isfinite(x))
+            row["stated"] = "".join([str(parameter.prior), *cuts])
+            # A smaller move of a quantile cannot be distinguished from the draws' own error.
+            moved = np.abs(parameter.prior.frozen.cdf(at) - [0.025, 0.5, 0.975]).max()
+            effect = f"\n  effective: {row['effect']}" if moved > 0.03 else ""
+            row["short"] = f"{parameter.prior}{effect}"
+        if point and parameter.name in point:
+            row["point"] = f"{point[parameter.name]:.5g}"
+        rows.append(row)
+    bounds = [
+        parameter.declared.stated_bounds
+        for parameter in prior.parameters
+        if parameter.declared.stated_bounds
+    ]
+    cut = Markup("bounds of the parameters have cut it")
+    if bounds:
+        cut = Markup(
+            'model\'s own constraints (<span id="constraints">{}</span>) have cut the joint prior'
+        ).format("; ".join(bounds))
+    columns = (
+        *NAME,
+        TableColumn("Prior or value", on="page", text="{stated}"),
+        TableColumn("Prior", on="screen", text="{short}"),
+        TableColumn("Effective", on="page", text="{effect}"),
+        TableColumn("MAP estimate", on="both" if point else "nowhere", text="{point}"),
+        TableColumn("Unit", text="{unit}"),
+    )
+    note = Markup(
+        "Effective: median, with the 2.5% and 97.5% quantiles, of each prior once the {}. The "
+        "scales of default priors come from the training data's ranges of voltage and displacement "
+        "and from the drive's times."
+    ).format(cut)
+    return Table.of("priors", "Priors and fixed values", rows, columns, note=note, on="both")

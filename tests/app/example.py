@@ -12,8 +12,7 @@ from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
-from bwbayes.report.figures import draw_styled, plots_of
-from bwbayes.report.figures.pictures import pictures
+from bwbayes.report.figures import draw_styled, pictures, plots_of
 from bwbayes.report.outputs import render
 from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report

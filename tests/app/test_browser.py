@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from bwbayes.app.jobs.campaign import STATUSES, Campaign, Row
 from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import CampaignFolder
-from bwbayes.comparison.designed import Design, DesignScore
+from bwbayes.comparison.design import Design, DesignScore
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.model.limits import Limits
 from bwbayes.report.outputs import render

@@ -21,7 +21,7 @@ from bwbayes.diagnosis.rivals import Rival
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.record import Record, read_record
 from bwbayes.report.outputs import write_bands
-from bwbayes.report.words import digits
+from bwbayes.report.report import digits
 from tests.app import small
 
 

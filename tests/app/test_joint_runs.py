@@ -18,7 +18,7 @@ from bwbayes.app.running.run import resume
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError
 from bwbayes.record import Record, write_record
-from bwbayes.report.figures.pictures import pictures
+from bwbayes.report.figures import pictures
 from tests.app import small
 
 # A loop and a step at another rate than its readings', on one stand.

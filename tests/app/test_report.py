@@ -16,10 +16,9 @@ from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import Parameter
 from bwbayes.model.distributions import Distribution
 from bwbayes.report.figures import interactive
-from bwbayes.report.report import as_text
+from bwbayes.report.report import as_text, digits, symbol
 from bwbayes.report.result import Result, summary
 from bwbayes.report.run import run_report
-from bwbayes.report.words import digits, symbol
 from tests.app import example
 
 PICTURES = {

@@ -23,7 +23,7 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.report.report import Report, as_text
 from bwbayes.report.result import Result
-from bwbayes.report.tables import priors_table
+from bwbayes.report.run import priors_table
 from bwbayes.sampling.storage import ChainFile
 from tests.app import example
 from tests.app.mutations import QUICK, good_arrays, stored

@@ -11,8 +11,14 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.calibration import replicates as module
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration, smooth_power
-from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Replicate, Sampled, replicate
+from bwbayes.calibration.replicates import (
+    RANKED,
+    CalibrationSetup,
+    OtherRecord,
+    Replicate,
+    Sampled,
+    replicate,
+)
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.noise import WhiteNoise

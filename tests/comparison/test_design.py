@@ -12,8 +12,7 @@ import pytest
 from scipy import stats
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.design import rank_by_rivals, rank_designs
-from bwbayes.comparison.designed import DesignScore, RivalScore
+from bwbayes.comparison.design import DesignScore, RivalScore, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.rivals import Rival
 from bwbayes.errors import InputError

@@ -9,7 +9,7 @@ from scipy import stats
 
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.comparison.leave_future_out import BLOCKS, FUTURE, Part, leave_future_out, log_ratios
+from bwbayes.comparison.evidence import BLOCKS, FUTURE, Part, leave_future_out, log_ratios
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.plan import SamplingPlan
 from tests.inference.linear import CASES, WINDOWS, Linear, every_case

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.candidates import Candidate
-from bwbayes.comparison.evidence import Evidence
-from bwbayes.comparison.leave_future_out import FUTURE, Part
-from bwbayes.comparison.recommendation import difference, recommend
+from bwbayes.comparison.comparison import Candidate, difference, recommend
+from bwbayes.comparison.evidence import FUTURE, Evidence, Part
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.report.report import Table, as_text
 

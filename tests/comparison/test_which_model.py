@@ -26,7 +26,7 @@ from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import begin
 from bwbayes.arrays import FloatArray
-from bwbayes.comparison.compared import Comparison
+from bwbayes.comparison.comparison import Comparison
 from bwbayes.record import Record
 from tests.app import small
 from tests.measured import keep

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from bwbayes.control.codegen import c_functions, to_ascii
+from bwbayes.control.exported import c_functions, to_ascii
 from bwbayes.errors import InputError
 from bwbayes.model.elementwise import anywhere, look_up, select
 from tests.control.compiled import STRICT

@@ -10,8 +10,15 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.population import normal as normal_module, population as module
 from bwbayes.population.normal import Hyperprior, NormalLikelihoods, left_out, spreads
-from bwbayes.population.population import PopulationParameter, next_specimen, population
-from bwbayes.population.specimen import Specimen, likelihoods, shared, specimen_of
+from bwbayes.population.population import (
+    PopulationParameter,
+    Specimen,
+    likelihoods,
+    next_specimen,
+    population,
+    shared,
+    specimen_of,
+)
 from tests.inference.problems import short_posterior
 from tests.measured import keep
 

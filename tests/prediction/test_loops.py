@@ -11,7 +11,7 @@ from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.prandtl_ishlinskii import Plays
 from bwbayes.prediction.loops import TracedLoop, initial_curve, measure_loops, measures, steady_loop
-from bwbayes.report.tables import loops_table
+from bwbayes.report.run import loops_table
 from tests.model.operators.slow import by_plays
 from tests.model.operators.test_every_operator import posterior
 

@@ -14,9 +14,8 @@ from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.errors import Renamed
 from bwbayes.prediction.bands import Bands
 from bwbayes.report.outputs import write_bands
-from bwbayes.report.report import Report, Table, as_text
+from bwbayes.report.report import Report, Table, as_text, length_text
 from bwbayes.report.result import Result, summary
-from bwbayes.report.words import length_text
 from bwbayes.sampling.diagnostics import check
 from tests.app import example
 from tests.app.example import bands

@@ -130,7 +130,7 @@ def run(
             from bwbayes.app.problem.problem import resolve_config
             from bwbayes.app.running.folder import RunFolder
             from bwbayes.report.report import Report, remarks_banner
-            from bwbayes.report.tables import priors_table
+            from bwbayes.report.run import priors_table
 
         chosen, is_proposal = _config_or_proposal(config, record, reading, "run", quiet=quiet)
         chosen = chosen.renamed(path_text(config.stem), seed)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.fit.fitted import Run
     from bwbayes.app.jobs.campaign import Campaign
-    from bwbayes.comparison.compared import Comparison
+    from bwbayes.comparison.comparison import Comparison
     from bwbayes.record import Record
 
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from bwbayes.app.running.figure_worker import FigureWorker
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
-    from bwbayes.comparison.compared import Comparison
+    from bwbayes.comparison.comparison import Comparison
     from bwbayes.diagnosis.consistency import Consistency
     from bwbayes.diagnosis.drive_lock import DriveLock
     from bwbayes.diagnosis.identifiability import InformationGain

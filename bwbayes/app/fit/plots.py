@@ -14,8 +14,7 @@ from bwbayes.app.fit.fitted import Run
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
-from bwbayes.report.figures import draw_styled
-from bwbayes.report.figures.pictures import PICTURES, draw_kind, pictures
+from bwbayes.report.figures import PICTURES, draw_kind, draw_styled, pictures
 from bwbayes.report.figures.products import draw_tracking
 from bwbayes.report.figures.series import record_pictures
 from bwbayes.report.report import Figure

@@ -34,8 +34,14 @@ from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import redraw
 from bwbayes.app.running.workers import one_thread
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
-from bwbayes.calibration.records import OtherRecord
-from bwbayes.calibration.replicates import RANKED, CalibrationSetup, Entry, Sampled, replicate
+from bwbayes.calibration.replicates import (
+    RANKED,
+    CalibrationSetup,
+    Entry,
+    OtherRecord,
+    Sampled,
+    replicate,
+)
 from bwbayes.errors import InputError
 from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.instruments import EXACT

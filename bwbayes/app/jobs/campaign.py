@@ -43,10 +43,11 @@ from bwbayes.population.population import (
     FEWEST,
     Population,
     PopulationParameter,
+    Specimen,
     next_specimen,
     population,
+    specimen_of,
 )
-from bwbayes.population.specimen import Specimen, specimen_of
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming
@@ -54,6 +55,7 @@ from bwbayes.record.io.formats import SUFFIXES
 from bwbayes.report.figures import draw_styled
 from bwbayes.report.outputs import save, write_summary
 from bwbayes.report.report import (
+    STATUS_KINDS,
     Banner,
     Block,
     Figure,
@@ -65,8 +67,11 @@ from bwbayes.report.report import (
     Table,
     TableColumn,
     Text,
+    digits,
+    label_with_unit,
+    mark,
+    unit_text,
 )
-from bwbayes.report.words import STATUS_KINDS, digits, label_with_unit, mark, unit_text
 from bwbayes.shown import brief
 from bwbayes.watching import WatchSteps, unwatched, watched
 

@@ -27,11 +27,13 @@ from bwbayes.report.report import (
     Report,
     Table,
     Text,
+    coverage_text,
+    digits,
+    error_text,
     standing_banner,
+    unit_text,
 )
-from bwbayes.report.run import drives_like
-from bwbayes.report.tables import budget_table
-from bwbayes.report.words import coverage_text, digits, error_text, unit_text
+from bwbayes.report.run import budget_table, drives_like
 from bwbayes.watching import WatchSteps, unwatched
 
 

@@ -20,7 +20,7 @@ from bwbayes.app.running.remarks import lines
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
-from bwbayes.report.tables import priors_table
+from bwbayes.report.run import priors_table
 from bwbayes.watching import WatchSteps, unwatched
 
 

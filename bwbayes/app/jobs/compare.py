@@ -32,11 +32,8 @@ from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.progress import ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import begin, resume
 from bwbayes.app.running.workers import one_thread, open_executor
-from bwbayes.comparison.candidates import Candidate
-from bwbayes.comparison.compared import Comparison
-from bwbayes.comparison.evidence import evidence, screening_evidence
-from bwbayes.comparison.leave_future_out import bands_part, leave_future_out
-from bwbayes.comparison.recommendation import recommend
+from bwbayes.comparison.comparison import Candidate, Comparison, recommend
+from bwbayes.comparison.evidence import bands_part, evidence, leave_future_out, screening_evidence
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.no_hysteresis import NoHysteresis

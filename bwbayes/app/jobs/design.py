@@ -24,8 +24,7 @@ from bwbayes.app.jobs.fit_methods import fitted_voltages
 from bwbayes.app.problem.column_options import column_options_from
 from bwbayes.app.problem.records import generator, sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
-from bwbayes.comparison.design import rank_by_rivals, rank_designs
-from bwbayes.comparison.designed import Design, DesignScore, RivalDesign
+from bwbayes.comparison.design import Design, DesignScore, RivalDesign, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.extrapolation import PART
 from bwbayes.errors import InputError
 from bwbayes.model.limits import Limits

@@ -109,8 +109,11 @@ def _load() -> None:
 
 def _works(result: Result) -> dict[str, Callable[[], Any]]:
     """Return what draws each picture of a result and, once its bands are known, the plots."""
-    from bwbayes.report.figures import picture_of, plots_of  # noqa: PLC0415
-    from bwbayes.report.figures.pictures import pictures  # noqa: PLC0415
+    from bwbayes.report.figures import (  # noqa: PLC0415
+        picture_of,
+        pictures,
+        plots_of,
+    )
 
     works: dict[str, Callable[[], Any]] = {}
     if result.predictions:

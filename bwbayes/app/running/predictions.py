@@ -59,7 +59,7 @@ from bwbayes.report.report import (
     remarks_banner,
     standing_banner,
 )
-from bwbayes.report.tables import correction_texts, rivals_table, scores_table
+from bwbayes.report.run import correction_texts, rivals_table, scores_table
 from bwbayes.watching import Watch, part, unwatched
 
 type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]

@@ -22,7 +22,7 @@ from bwbayes.calibration.evaluation import LIMIT, Calibration
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.report.calibration import EXTRA_WORDS
 from bwbayes.report.figures import style
-from bwbayes.report.words import label_with_unit
+from bwbayes.report.report import label_with_unit
 
 COLOR_OF = {"uncompensated": style.COLORS[3], "compensated": style.Color.MEAN}
 

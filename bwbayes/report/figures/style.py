@@ -15,7 +15,7 @@ import numpy as np
 from bwbayes.arrays import ArrayLike, FloatArray, IntArray
 from bwbayes.inference.parameters import Parameter
 from bwbayes.prediction.bands import Bands, Kind, title_of
-from bwbayes.report.words import label_with_unit
+from bwbayes.report.report import label_with_unit
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
