@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.study import every_declaration
-from bwbayes.model.declaration import Context, Declaration, Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
 from bwbayes.model.operators.bouc_wen import BoucWen
 
 BOUC_WEN = BoucWen()

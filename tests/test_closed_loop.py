@@ -12,7 +12,7 @@ import bwbayes as bw
 from bwbayes.app.problem.records import generator
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.record.teststand import PROCESS_SD, PROCESS_TIME
 from tests.control import cases
 from tests.measured import keep

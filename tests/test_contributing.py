@@ -25,9 +25,8 @@ from bwbayes.inference.compiled.walk import walk
 from bwbayes.inference.noise import DISCREPANCY_SD, DISCREPANCY_TIME, SENSOR_SD, DiscrepancyNoise
 from bwbayes.inference.state_space import Noise
 from bwbayes.inference.study import Stated
-from bwbayes.model.inputs import Inputs
+from bwbayes.model.inputs import Inputs, Span
 from bwbayes.model.inverse import inverse
-from bwbayes.model.operator import Span
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.record.io import formats
 from bwbayes.record.io.series import Source, array_source

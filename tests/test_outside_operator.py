@@ -22,21 +22,19 @@ from bwbayes.app.config.config import Config, parse
 from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, select
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
 from bwbayes.inference.noise import NOISES, noise_model
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
-from bwbayes.model.elementwise import select
+from bwbayes.model.inputs import Limits, Span
 from bwbayes.model.inverse import inverse
-from bwbayes.model.limits import Limits
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import OneStateStep, Operator
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.registry import HYSTERESIS, build_part
-from bwbayes.model.step import OneStateStep
 from tests.app import small
 from tests.control.compiled import Compiled
 from tests.programs import needs
@@ -299,4 +297,4 @@ def test_a_noise_or_filter_from_outside_is_checked_too() -> None:
         noise_model("bwbayes.inference.noise:WhiteNoise", 1.0)
     )
     with pytest.raises(InputError, match="has no option interval"):
-        noise_model("bwbayes.model.filters:Lag", 1.0)
+        noise_model("bwbayes.model.linear:Lag", 1.0)

@@ -17,9 +17,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.comparison.design import RivalDesign, RivalScore
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.study import every_declaration
-from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.limits import Limits
+from bwbayes.model.declaration import Context, Distribution, Ranges
+from bwbayes.model.inputs import Limits
 from bwbayes.quantities import DEFAULT, Quantities
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.io.columns import conversion

@@ -14,8 +14,7 @@ import pytest
 from bwbayes.app.commands import cli
 from bwbayes.app.config.settings import SamplingConfig
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Context, Distribution, Ranges
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.prediction import prediction
 from bwbayes.record.teststand import VirtualTestStand

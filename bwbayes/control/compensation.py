@@ -35,9 +35,8 @@ from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus, InputError, suggestion
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.inputs import HOLD_NAMES, Hold, Limits
 from bwbayes.model.inverse import inverse
-from bwbayes.model.limits import Limits
-from bwbayes.model.linear import HOLD_NAMES, Hold
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
 from bwbayes.prediction.initial_state import (
     InitialConditions,

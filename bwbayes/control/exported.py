@@ -44,7 +44,7 @@ from bwbayes.control.sampled import (
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.limits import Limits
+from bwbayes.model.inputs import Limits
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.quantities import DEFAULT
 from bwbayes.report.outputs import refuse_existing, write_summary

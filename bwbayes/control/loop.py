@@ -33,7 +33,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel
 from bwbayes.errors import InputError
 from bwbayes.inference.state_space import Noise, root
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.record.teststand import Amplifier, LaserSensor
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched

@@ -25,15 +25,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import scipy
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, anywhere, select
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.elementwise import anywhere, select
+from bwbayes.model.inputs import Span
 from bwbayes.model.linear import Taps
-from bwbayes.model.operator import Span
+from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.stage import Stage, Timing
-from bwbayes.model.step import HysteresisStep
 from bwbayes.prediction.loops import steady_loop
 from bwbayes.shown import brief
 

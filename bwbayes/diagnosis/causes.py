@@ -22,7 +22,7 @@ from bwbayes.diagnosis.finding import Finding, join_findings
 from bwbayes.diagnosis.model import tail_nats
 from bwbayes.diagnosis.series_patterns import Line, scatter, strongest_line
 from bwbayes.inference.noise import DiscrepancyNoise
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.record.io.grid import clock
 

@@ -16,7 +16,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 
 # Number of draws that represent a prior, or a Gaussian posterior.
 DRAWS = 4000

@@ -16,7 +16,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.inference.defaults import rounding_sd
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import rounded

@@ -21,7 +21,7 @@ from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.defaults import rounding_sd
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import root
-from bwbayes.model.reversals import monotone_stretches, rate, time_between_turns, turning_points
+from bwbayes.model.inputs import monotone_stretches, rate, time_between_turns, turning_points
 
 # Probability of a false alarm for a residual that does not follow the drive; and the smallest
 # relevant correlation, or part of its variance beyond the sensor's noise.

@@ -19,8 +19,7 @@ import scipy
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import TELLING_DRIVE, Finding
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.reversals import RETURN, fastest, time_between_turns, turning_points
+from bwbayes.model.inputs import RETURN, Inputs, fastest, time_between_turns, turning_points
 from bwbayes.shown import rounded
 
 # Part of the time between turning points over which a speed is averaged: a sine's peak speed is

@@ -31,7 +31,7 @@ from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.model.reversals import monotone_stretches, turning_points
+from bwbayes.model.inputs import monotone_stretches, turning_points
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, part, unwatched, watched
 

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 from bwbayes.shown import brief
 
 # Probability of a false alarm of each of the tests, of which there are about ten.

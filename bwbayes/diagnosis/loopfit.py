@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
-from bwbayes.model.reversals import turning_points
+from bwbayes.model.inputs import turning_points
 from bwbayes.record.record import Record
 
 # Half widths of the plays, as fractions of half the voltage's range; the state at the start of

@@ -24,8 +24,7 @@ from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.outliers import LIMIT, MOST
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.study import Stated
-from bwbayes.model.declaration import lognormal
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution, lognormal
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.model.spec import ModelSpec

@@ -19,7 +19,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import batches
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.thinning import beginning
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
 

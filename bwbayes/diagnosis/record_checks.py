@@ -28,7 +28,7 @@ from bwbayes.diagnosis.series_patterns import (
     spikes,
 )
 from bwbayes.inference.defaults import rounding_sd
-from bwbayes.model.reversals import turning_points
+from bwbayes.model.inputs import turning_points
 from bwbayes.record.record import Record
 
 # Kinds of findings about what a drive cannot show, which are no fault of the readings.

@@ -30,7 +30,7 @@ from bwbayes.inference.thinning import (
     thin_windows,
     with_residuals_of,
 )
-from bwbayes.model.reversals import rate, time_between_turns
+from bwbayes.model.inputs import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import rounded

@@ -20,8 +20,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Ranges
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.reversals import time_between_turns
+from bwbayes.model.inputs import Inputs, time_between_turns
 
 
 def ranges_of(

@@ -24,8 +24,7 @@ from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import Inputs, rate
 from bwbayes.shown import brief
 
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.state_space import Noise
-from bwbayes.model.declaration import Context, Declaration, lognormal, round_to_scale
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Context, Declaration, Distribution, lognormal, round_to_scale
 from bwbayes.model.registry import build_part
 
 

@@ -24,7 +24,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 
 # Standard deviations from what its neighbors predict at which a reading is an outlier.
 LIMIT = 6.0

@@ -20,8 +20,7 @@ import scipy
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.distributions import Distribution, Scored
+from bwbayes.model.declaration import Declaration, Distribution, Scored, Values
 from bwbayes.shown import brief
 
 # The version of the map from parameters to coordinates: a chain of another one means other draws.

@@ -27,8 +27,7 @@ from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Inputs, Span
 from bwbayes.shown import brief
 
 

@@ -29,9 +29,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.creep import Creep, creep_times
-from bwbayes.model.operator import Span
-from bwbayes.model.reversals import time_between_turns
+from bwbayes.model.inputs import Span, time_between_turns
+from bwbayes.model.linear import Creep, creep_times
 
 # Steps to the mode.
 ROUNDS = 4

@@ -27,9 +27,8 @@ from bwbayes.inference.parameter_table import Column, ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import OFFSET
-from bwbayes.model.declaration import Context, Declaration, Ranges
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Span
+from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
+from bwbayes.model.inputs import Span
 from bwbayes.model.registry import PARTS
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.quantities import Quantities

@@ -17,7 +17,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Dataset, Posterior
-from bwbayes.model.reversals import monotone_stretches
+from bwbayes.model.inputs import monotone_stretches
 
 # How much a displacement may change, root mean square, in parts of its range: a tenth of the error
 # of a Bouc-Wen model.

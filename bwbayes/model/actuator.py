@@ -22,13 +22,11 @@ import numpy as np
 
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.creep import Creep
 from bwbayes.model.declaration import Declaration, Values, check, normal
-from bwbayes.model.filters import Filter
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.linear import Hold, Sections
+from bwbayes.model.inputs import Hold, Inputs, Span
+from bwbayes.model.linear import Creep, Filter, Sections
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.registry import DYNAMICS, build_part
 from bwbayes.model.stage import (

@@ -28,11 +28,10 @@ from numba.extending import (
     unbox,
 )
 
-from bwbayes.model import elementwise
-from bwbayes.model.elementwise import anywhere, gone, look_up, select
+from bwbayes.arrays import anywhere, gone, look_up, select
+from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.stage import Stage
-from bwbayes.model.step import HysteresisStep
 
 # A function of each sample allocates nothing: counting references would take longer than all of the
 # arithmetic. It becomes a part of its caller's loop, or there would be no vectors.
@@ -120,7 +119,7 @@ def compiled[Function: Callable[..., Any]](function: Function) -> Function:
 def _functions(function: Callable[..., Any]) -> list[Callable[..., Any]]:
     """Return a function and all of Python's that it calls, but those that numba knows already."""
     functions, names = [function], set(function.__code__.co_names)
-    for name in sorted(names - set(elementwise.__all__)):
+    for name in sorted(names - {"anywhere", "gone", "look_up", "select"}):
         helper = function.__globals__.get(name)
         if inspect.isfunction(helper):
             functions += [f for f in _functions(helper) if f not in functions]

@@ -5,22 +5,237 @@ where it may lie, what is known of it beforehand. A part (a hysteresis operator,
 lists its own; nobody else keeps names, units, bounds or default priors.
 
 A default prior may know what a :class:`Context` holds: the ranges of a record, and what the config
-states of other parameters.
+states of other parameters. It is a :class:`Distribution` of scipy's, by the name engineers use:
+``normal``, ``lognormal``, ``uniform``, ``halfnormal`` and ``beta`` take the arguments one would
+write on paper; any other continuous distribution of ``scipy.stats`` goes by scipy's name, with
+scipy's shape arguments and ``loc`` and ``scale``. scipy's frozen distributions check and broadcast
+their arguments at every call, which costs more than the likelihood of a short record: those that
+priors mostly are have closed forms here.
 """
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError
-from bwbayes.model.distributions import Distribution
 from bwbayes.shown import brief
+
+FAMILIAR = {
+    "normal": ("mean", "sd"),
+    "lognormal": ("median", "sigma"),
+    "uniform": ("lower", "upper"),
+    "halfnormal": ("scale",),
+    "beta": ("a", "b"),
+}
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Normal, x = c + s z, or lognormal, x = c exp(s z), of a standard normal z."""
+
+    center: float
+    scale: float
+    logarithmic: bool
+
+    def score(self, x: FloatArray) -> FloatArray:
+        """Return z of values x."""
+        if not self.logarithmic:
+            return (x - self.center) / self.scale
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(np.maximum(x, 0.0) / self.center) / self.scale)
+
+    def value(self, score: FloatArray) -> FloatArray:
+        """Return x of scores z."""
+        if not self.logarithmic:
+            return self.center + self.scale * score
+        return np.asarray(self.center * np.exp(self.scale * score))
+
+
+@dataclass(frozen=True)
+class Tails:
+    """Any distribution, by F, 1 − F and their inverses: z = Φ⁻¹(F(x)), exact in both tails."""
+
+    cdf: Callable[[FloatArray], FloatArray]
+    sf: Callable[[FloatArray], FloatArray]
+    ppf: Callable[[FloatArray], FloatArray]
+    isf: Callable[[FloatArray], FloatArray]
+
+    def score(self, x: FloatArray) -> FloatArray:
+        """Return z of values x."""
+        below, above = self.cdf(x), self.sf(x)
+        return np.where(below < above, scipy.special.ndtri(below), -scipy.special.ndtri(above))
+
+    def value(self, score: FloatArray) -> FloatArray:
+        """Return x of scores z."""
+        ndtr = scipy.special.ndtr
+        return np.where(score < 0, self.ppf(ndtr(score)), self.isf(ndtr(-score)))
+
+
+def _mass(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the probability between two normal scores, from the tail in which they lie."""
+    ndtr = scipy.special.ndtr
+    between = np.where(low < 0, ndtr(high) - ndtr(low), ndtr(-low) - ndtr(-high))
+    return np.maximum(between, 0.0)
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A continuous distribution: its name and its arguments.
+
+    ``normal(mean, sd)``; ``lognormal(median, sigma)`` with sigma the sd of the logarithm;
+    ``uniform(lower, upper)``; ``halfnormal(scale)``; ``beta(a, b)`` on 0 to 1 or, with ``lower``
+    and ``upper``, between those; or a name and arguments of ``scipy.stats``.
+
+    Raises
+    ------
+    InputError
+        Unknown name, wrong arguments, or arguments outside the distribution's domain.
+
+    Examples
+    --------
+    >>> print(Distribution("lognormal", {"median": 0.7, "sigma": 0.5}))
+    lognormal(median = 0.7, sigma = 0.5)
+    """
+
+    name: str
+    arguments: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, value in self.arguments.items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise InputError(f"{self.name}: {key} is {value!r}; give a number")
+            if not np.isfinite(value):
+                raise InputError(f"{self.name}: {key} is {value}; give a finite number")
+        if self.name in FAMILIAR:
+            optional = ("lower", "upper") if self.name == "beta" else ()
+            names = (*FAMILIAR[self.name], *optional)
+            missing = [key for key in FAMILIAR[self.name] if key not in self.arguments]
+            unknown = [key for key in self.arguments if key not in names]
+            if missing or unknown:
+                wrong = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
+                raise InputError(f"{self.name}: {wrong}; it takes {', '.join(names)}")
+            lower, upper = self.arguments.get("lower", 0.0), self.arguments.get("upper", 1.0)
+            if not lower < upper:
+                raise InputError(
+                    f"{self.name}: lower {lower:g} is not below upper {upper:g}; swap them"
+                )
+        with np.errstate(invalid="ignore"):
+            low, high = self.form.value(np.array([-1.0, 1.0])).tolist()
+        if not -math.inf < low < high < math.inf:
+            raise InputError(f"{self}: no proper distribution; check its arguments")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Distribution, (self.name, self.arguments)  # without what is worked out from them
+
+    def __str__(self) -> str:
+        inside = ", ".join(f"{key} = {value:.6g}" for key, value in self.arguments.items())
+        return f"{self.name}({inside})"
+
+    def to_normal(self, x: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """Return the normal scores z of values x, with the distribution cut at both bounds.
+
+        z = Φ⁻¹((F(x) − F(lower)) / (F(upper) − F(lower))), from whichever tail is nearer, so that
+        it keeps its precision in both. All arrays are (models,) or scalar.
+        """
+        low, score, high = (self.form.score(values) for values in (lower, x, upper))
+        below, above = _mass(low, score), _mass(score, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near = np.minimum(below, above) / (below + above)
+        score = scipy.special.ndtri(np.clip(near, 0, 1))
+        return np.asarray(np.where(below <= above, 1, -1) * score)
+
+    def from_normal(
+        self, z: FloatArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return values x of normal scores z, and the probability between the bounds.
+
+        The inverse of :meth:`to_normal`; where the bounds leave nothing, x is the lower one.
+        """
+        scalar = np.ndim(lower) == np.ndim(upper) == 0
+        if scalar and self.support == (float(lower), float(upper)):  # the bounds cut nothing
+            return self.form.value(z), np.ones_like(z)
+        low, high = self.form.score(lower), self.form.score(upper)
+        mass, ndtr = _mass(low, high), scipy.special.ndtr
+        below, above = ndtr(low) + ndtr(z) * mass, ndtr(-high) + ndtr(-z) * mass
+        # The smaller probability is the one that keeps its precision.
+        score = scipy.special.ndtri(np.minimum(below, above))
+        x = self.form.value(np.where(below < above, score, -score))
+        return np.minimum(np.maximum(x, lower), np.maximum(lower, upper)), mass
+
+    @cached_property
+    def form(self) -> Scored | Tails:
+        """The map to a standard normal, in closed form if there is one."""
+        get = self.arguments.__getitem__
+        match self.name:
+            case "normal":
+                return Scored(get("mean"), get("sd"), logarithmic=False)
+            case "lognormal":
+                return Scored(get("median"), get("sigma"), logarithmic=True)
+            case "uniform":
+                lower, upper = get("lower"), get("upper")
+                width = upper - lower
+                return Tails(
+                    lambda x: np.clip((x - lower) / width, 0.0, 1.0),
+                    lambda x: np.clip((upper - x) / width, 0.0, 1.0),
+                    lambda p: lower + p * width,
+                    lambda p: upper - p * width,
+                )
+            case "halfnormal":
+                scale = math.sqrt(2) * get("scale")
+                return Tails(
+                    lambda x: scipy.special.erf(np.maximum(x, 0.0) / scale),
+                    lambda x: scipy.special.erfc(np.maximum(x, 0.0) / scale),
+                    lambda p: scale * scipy.special.erfinv(p),
+                    lambda p: scale * scipy.special.erfcinv(p),
+                )
+        return Tails(self.frozen.cdf, self.frozen.sf, self.frozen.ppf, self.frozen.isf)
+
+    @cached_property
+    def support(self) -> tuple[float, float]:
+        """The least and the largest value."""
+        low, high = self.form.value(np.array([-np.inf, np.inf]))
+        return float(low), float(high)
+
+    @cached_property
+    def frozen(self) -> Any:
+        """The frozen distribution of scipy."""
+        arguments = dict(self.arguments)
+        lower, upper = arguments.get("lower", 0.0), arguments.get("upper", 1.0)
+        match self.name:
+            case "normal":
+                return scipy.stats.norm(arguments["mean"], arguments["sd"])
+            case "lognormal":
+                return scipy.stats.lognorm(arguments["sigma"], scale=arguments["median"])
+            case "uniform":
+                return scipy.stats.uniform(lower, upper - lower)
+            case "halfnormal":
+                # The same as scipy's halfnorm, which loses its precision near zero.
+                return scipy.stats.chi(1, scale=arguments["scale"])
+            case "beta":
+                return scipy.stats.beta(arguments["a"], arguments["b"], lower, upper - lower)
+        family = getattr(scipy.stats, self.name, None)
+        if not isinstance(family, scipy.stats.rv_continuous):
+            scipys = vars(scipy.stats).items()
+            names = [n for n, f in scipys if isinstance(f, scipy.stats.rv_continuous)] + [*FAMILIAR]
+            near = difflib.get_close_matches(self.name, names, n=1)
+            familiar = f"use one of {', '.join(FAMILIAR)}"
+            hint = f"did you mean {near[0]}? Else {familiar}" if near else familiar
+            raise InputError(f"{self.name}: unknown distribution; {hint}")
+        try:
+            return family(**arguments)
+        except TypeError:
+            takes = ", ".join(filter(None, [family.shapes, "loc", "scale"]))
+            raise InputError(f"{self.name}: wrong arguments; scipy's takes {takes}") from None
+
 
 Values = Mapping[str, FloatArray]
 """Columns (models,) of parameters by name."""

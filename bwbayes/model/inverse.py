@@ -33,11 +33,8 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Values
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.limits import Limits
+from bwbayes.model.inputs import UNIT, Inputs, Limits, monotone_stretches
 from bwbayes.model.linear import Recursion
-from bwbayes.model.operator import UNIT
-from bwbayes.model.reversals import monotone_stretches
 from bwbayes.model.stage import undo_stages
 
 Curve = Callable[[FloatArray], FloatArray]

@@ -1,20 +1,30 @@
-"""Linear dynamics between the drive w = d u − h and the displacement x, exact at any step.
+"""Linear dynamics and creep between the drive w = d u − h and the displacement x, exact at any step.
 
 Equation (7) of the paper divided by its stiffness, (m/k) x″ + (b/k) x′ + x = w, and as the smaller
 alternative one first-order lag, τ x′ + x = w. Both become a recursion on the samples that is exact
 for a drive that is held (zero-order, what a DAC does) or goes in straight lines between samples
-(first-order, for a measured voltage). No step is too long and no pole too fast.
+(first-order, for a measured voltage), and that knows what free responses its unknown start can add.
+No step is too long and no pole too fast.
 
 The coefficients are divided differences of the exponential, exp[0, z₁, z₂] and exp[0, 0, z₁, z₂]
 with z = pole x interval: written so, equal and nearly equal poles are not special.
+
+A piezo actuator's creep is nearly linear in the drive and in the logarithm of the time: after a
+step it grows by about a percent of it per decade. A sum of first-order lags with log-spaced times
+does just that, one lag per decade here, each with a strength of its own; equal strengths c give
+c log₁₀(t) between the shortest and the longest of the times. The lags stand beside the dynamics,
+not behind them: their times are so much longer that the order does not show.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, Literal, NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -22,33 +32,13 @@ from numpy.typing import NDArray
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
-
-Hold = Literal["first", "zero"]
-
-# Names of a command's hold outside of the package.
-HOLD_NAMES: Mapping[Hold, str] = {"zero": "zoh", "first": "foh"}
+from bwbayes.model.declaration import Context, Declaration, Distribution, Values, lognormal, normal
+from bwbayes.model.inputs import UNIT, Hold, Span
 
 ComplexArray = NDArray[np.complex128]
 
 # 20 terms of a series in |z| < 1 with factorials below: the rest is under 1e-19.
 SERIES_TERMS = 20
-
-
-def parse_hold(name: str) -> Hold:
-    """Return the hold called "zoh" (zero-order) or "foh" (first-order).
-
-    Raises
-    ------
-    InputError
-        Another name.
-    """
-    for hold, short in HOLD_NAMES.items():
-        if name in (hold, short):
-            return hold
-    raise InputError(
-        f"hold: {name!r} is unknown; give zoh (held until the next sample, as a DAC does) or foh "
-        "(straight lines between samples)"
-    )
 
 
 @dataclass(frozen=True)
@@ -302,3 +292,215 @@ def _z_phi_2(z: NDArray[Any]) -> NDArray[Any]:
         series = series + term
     outside = np.where(near, 1, z)
     return np.where(near, series, np.expm1(outside) / outside - 1)
+
+
+# A part of T: drives are mostly slow for the actuator. The prior is wide, because the lag does not
+# follow the drive.
+LAG, LAG_SIGMA = 0.005, 2.3
+
+
+class Filter(ABC):
+    """Linear dynamics, exact for a drive that is held or goes straight between samples."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Declaration, ...]:
+        """Its parameters."""
+
+    def unknowns(self, hold: Hold) -> int:
+        """Return how many numbers say in which state it is at a record's first sample."""
+        values = {parameter.name: np.ones(1) for parameter in self.parameters}
+        return self.recursion(values, 1, 1.0, hold).unknowns
+
+    @abstractmethod
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:
+        """Return the recursion of a number of ``models`` with these columns (models,)."""
+
+
+@dataclass(frozen=True)
+class NoDynamics(Filter):
+    """No dynamics, x = w: the displacement follows the drive at once, or with the hold."""
+
+    parameters: tuple[Declaration, ...] = ()
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # nothing to tell it
+        """Return x = w; see :func:`~bwbayes.model.linear.no_dynamics`."""
+        return no_dynamics(models, hold)
+
+
+@dataclass(frozen=True)
+class Lag(Filter):
+    """One first-order lag, τ x′ + x = w."""
+
+    parameters: tuple[Declaration, ...] = (
+        Declaration(
+            "lag",
+            "s",
+            r"\tau_\mathrm{lag}",
+            "time constant of the first-order lag",
+            lambda context: lognormal(LAG * context.ranges.time, LAG_SIGMA),
+            floor=0.0,
+            limit_at_floor=True,
+            aliases=("tau", "time_constant"),
+        ),
+    )
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the column has them
+        """Return that of :func:`~bwbayes.model.linear.first_order_lag`."""
+        return first_order_lag(column["lag"], interval, hold)
+
+
+def _damping(context: Context) -> Distribution | None:
+    """Return the prior of the damping that gives such a lag, if the stiffness is known."""
+    stiffness = context.value("stiffness")
+    if stiffness is None:
+        return None
+    return lognormal(LAG * context.ranges.time * stiffness, LAG_SIGMA)
+
+
+@dataclass(frozen=True)
+class SecondOrder(Filter):
+    """Equation (7) of the paper, (m/k) x″ + (b/k) x′ + x = w."""
+
+    parameters: tuple[Declaration, ...] = tuple(
+        Declaration(
+            name,
+            unit,
+            label,
+            description,
+            default,
+            floor=0.0,
+            limit_at_floor=name == "damping",
+            aliases=(label,),
+            without_default="a record shows mass and stiffness only through the damping",
+        )
+        for name, unit, label, description, default in (
+            ("mass", "kg", "m", "effective mass", lambda _: None),
+            ("damping", "N s/m", "b", "effective damping", _damping),
+            ("stiffness", "N/m", "k", "mechanical stiffness", lambda _: None),
+        )
+    )
+
+    def recursion(self, column: Values, models: int, interval: float, hold: Hold) -> Recursion:  # noqa: ARG002  # the columns have them
+        """Return that of :func:`~bwbayes.model.linear.second_order`."""
+        return second_order(column["mass"], column["damping"], column["stiffness"], interval, hold)
+
+
+# Times that a model may have.
+MOST_TIMES = 8
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Creep: slow lags beside the dynamics, one for each of the given times.
+
+    Creep adds to the output of the dynamics, driven by w in um,
+
+        x_creep = Σ cᵢ Lᵢ,   Tᵢ Lᵢ′ + Lᵢ = w (1 + κ |u| / U),
+
+    with strengths cᵢ and κ without unit, times Tᵢ in s, and U the largest voltage.
+
+    Parameters
+    ----------
+    times
+        Tᵢ, s, rising.
+    growing
+        Whether the creep grows with the voltage by κ.
+    reference
+        The range of the voltage that κ is for: that of the record that is fitted.
+
+    Raises
+    ------
+    InputError
+        Times that are not positive and rising, none or too many.
+    """
+
+    times: tuple[float, ...]
+    growing: bool = False
+    reference: Span = UNIT
+
+    def __post_init__(self) -> None:
+        rising = all(earlier < later for earlier, later in pairwise((0.0, *self.times)))
+        if not rising or not 0 < len(self.times) <= MOST_TIMES or not math.isfinite(self.times[-1]):
+            raise InputError(
+                f"creep: {list(self.times)} are not valid times; give up to {MOST_TIMES} positive "
+                "ones in s that rise, or true"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the strengths."""
+        return tuple(f"creep_{number}" for number in range(1, len(self.times) + 1))
+
+    @property
+    def parameters(self) -> tuple[Declaration, ...]:
+        """The strengths cᵢ, and κ if the creep grows with the voltage."""
+        strengths = tuple(
+            Declaration(
+                name,
+                "-",
+                rf"c_{number}",
+                f"creep with a time of {time:g} s, as a part of the drive",
+                lambda _: self.strength,
+            )
+            for number, (name, time) in enumerate(zip(self.names, self.times, strict=True), 1)
+        )
+        if not self.growing:
+            return strengths
+        growth = Declaration(
+            "creep_growth",
+            "-",
+            r"\kappa",
+            "growth of the creep from no voltage to the largest, as a part of it",
+            lambda _: Distribution("halfnormal", {"scale": 1.0}),
+            floor=0.0,
+            limit_at_floor=True,
+        )
+        return (*strengths, growth)
+
+    @property
+    def strength(self) -> Distribution:
+        """The default prior of each strength, by how many decades of time a lag stands for."""
+        decades = 1.0
+        if len(self.times) > 1:
+            decades = math.log10(self.times[-1] / self.times[0]) / (len(self.times) - 1)
+        # Published are 0.5 to 3% a decade. A normal prior, of which one in twenty-five is below
+        # zero: strengths are linear in the displacement, and so their posterior is nearly normal.
+        return normal(0.0175 * decades, 0.01 * decades)
+
+    def reach(self, column: Values) -> FloatArray:
+        """Return how much of a drive each lag may have kept from before a record, (models, lags).
+
+        √(cᵢ² + c²) with a published strength c. Were it cᵢ alone, a strength next to zero would
+        stand for a known start: the posterior would have a narrow ridge there, and the start be
+        taken for a measurement of the strengths.
+        """
+        strengths = np.stack([column[name] for name in self.names], axis=1)
+        return np.hypot(strengths, self.strength.arguments["mean"])
+
+    def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
+        """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""
+        if not self.growing:
+            return drive.copy()
+        size = self.size(voltage)
+        crept: FloatArray = drive * (1 + column["creep_growth"][:, np.newaxis] * size)
+        return crept
+
+    def size(self, voltage: FloatArray) -> FloatArray:
+        """Return |u| / U (samples,), with U the largest voltage of the reference."""
+        largest = max(abs(self.reference.low), abs(self.reference.high))
+        return np.abs(voltage) / largest if largest > 0 else np.zeros_like(voltage)
+
+    def recursions(self, models: int, interval: float, hold: Hold) -> tuple[Recursion, ...]:
+        """Return the lags Lᵢ, the same for all of a number of models."""
+        return tuple(first_order_lag(np.full(models, time), interval, hold) for time in self.times)
+
+
+def creep_times(interval: float, duration: float) -> Sequence[float]:
+    """Return powers of ten in s, from ten samples to three lengths of a record.
+
+    At least one: that next to the record's length.
+    """
+    first = math.ceil(math.log10(10 * interval))
+    last = max(math.floor(math.log10(3 * duration)), first)
+    return [10.0**power for power in range(max(first, last - MOST_TIMES + 1), last + 1)]

@@ -16,9 +16,8 @@ from numpy.polynomial import Polynomial
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.declaration import Context, Declaration, Values, normal
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import UNIT, Span
+from bwbayes.model.declaration import Context, Declaration, Distribution, Values, normal
+from bwbayes.model.inputs import UNIT, Span
 
 
 class Term(NamedTuple):

@@ -4,52 +4,148 @@ An operator is rate-independent: only the path of the voltage counts, not its pa
 batch of models at once, whose parameters come as columns by name, and for a record in pieces, with
 its memory carried from one piece to the next. The history before a record is one number for each
 model, ``initial``: a state that an earlier drive within a ``span`` of voltages could have left.
+
+A simulation gives all models one voltage that is known beforehand. In a closed loop each has its
+own, and the next one hangs on what the last one did. There a :class:`HysteresisStep` says what the
+displacement would be if the voltage went straight from where it stands to somewhere else, and how
+steep it is. That takes a bounded time, whatever was before; operators whose memory grows with the
+voltage's past, or that are integrated, have no such step.
+
+A step's ``move`` is written once, for numbers and for arrays: with rows of arrays (models,) NumPy
+moves all models of a closed loop at once, compiled with numbers it moves one model after the other
+(:mod:`bwbayes.model.compiled`), and printed it is C (:mod:`bwbayes.control.exported`). So it is
+made of what :mod:`bwbayes.arrays` says.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, check
-from bwbayes.model.step import HysteresisStep
+from bwbayes.model.inputs import PIECE, Span, monotone_stretches
+from bwbayes.shown import brief
 
 
-class Span(NamedTuple):
-    """The least and the largest voltage that earlier drives may have had, V."""
+class StepResult(NamedTuple):
+    """The state at a voltage: w (models,), um, dw/du (models,), and the memory."""
 
-    low: float
-    high: float
-
-    @property
-    def middle(self) -> float:
-        """Its middle, V."""
-        return (self.low + self.high) / 2
-
-    @property
-    def half(self) -> float:
-        """Half of its width, V."""
-        return (self.high - self.low) / 2
+    w: FloatArray
+    slope: FloatArray
+    memory: FloatArray
 
 
-UNIT = Span(-1.0, 1.0)
+class HysteresisStep(ABC):
+    """A hysteresis operator w = Γ[u] that goes from one voltage (models,) straight to the next.
 
+    Voltages are in V, displacements in um, slopes in um/V, all (models,). The memory is an array
+    (models, any).
 
-def narrower(span: Span, further: tuple[float, ...] = (0.8, 1.0, 1.25)) -> tuple[Span, ...]:
-    """Return ranges about a span's middle, evenly from next to nothing to all of it.
-
-    ``further`` is how far up they go, as parts of how far down.
+    Parameters
+    ----------
+    parameters
+        Numbers of the models for ``move``, (models, any); ``ROW`` names them.
     """
-    low, center, half = span.low, span.middle, span.half
-    # Fewer ranges leave steps that show; more take longer.
-    ends = [(k / 16, min(up * k / 16, 1.0)) for k in range(1, 17) for up in further]
-    return tuple(
-        dict.fromkeys(Span(max(center - down * half, low), center + up * half) for down, up in ends)
-    )
+
+    __repr__ = brief
+
+    ROW: ClassVar = ""
+
+    parameters: FloatArray
+
+    def __init__(self, parameters: FloatArray) -> None:
+        self.parameters = parameters
+
+    @staticmethod
+    @abstractmethod
+    def move(parameters: Any, memory: Any, voltage: Any, after: Any) -> tuple[Any, Any]:
+        """Return w and dw/du once the voltage has gone there, and write the memory ``after`` it.
+
+        Step of one model, whose parameters and memory are rows, or of all, (any, models).
+        """
+
+    @abstractmethod
+    def demagnetized(self) -> FloatArray:
+        """Return the memory of a demagnetized actuator at zero volts."""
+
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return the memory (models, any) of what the operator itself remembers: the same."""
+        return np.asarray(memory)
+
+    @abstractmethod
+    def slopes(self, limits: Span) -> tuple[FloatArray, FloatArray]:
+        """Return bounds of dw/du that hold on every path from the demagnetized state.
+
+        The path keeps within limits, V.
+        """
+
+    @abstractmethod
+    def coefficients(self) -> dict[str, tuple[Any, str]]:
+        """Return what the equation of the first model has: numbers by name, and their units."""
+
+    def apply(self, memory: FloatArray, voltage: FloatArray) -> StepResult:
+        """Return what is once the voltage has gone there; the memory that is given stays."""
+        after = np.empty_like(memory)
+        return StepResult(*self.move(self.parameters.T, memory.T, voltage, after.T), after)
+
+
+class OneStateStep(HysteresisStep):
+    """A step that remembers the voltage, one displacement h, and maybe more that follows from both.
+
+    Its memory is (models, ``remembers``), zeros where it follows.
+    """
+
+    remembers: ClassVar[int] = 2
+
+    def demagnetized(self) -> FloatArray:
+        """Return zero volts and h = 0."""
+        return np.zeros((len(self.parameters), self.remembers))
+
+    def remembered(self, memory: Any) -> FloatArray:
+        """Return voltage and h."""
+        return self._at(memory.voltage, memory.state)
+
+    def _at(self, voltage: float | FloatArray, state: FloatArray) -> FloatArray:
+        memory = self.demagnetized()
+        memory[:, 0], memory[:, 1] = voltage, state
+        return memory
+
+    def trace(self, voltage: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return w (models, samples) along a path (samples,), V, and h (models,) at its end.
+
+        ``state`` (models,), um, is h at its first sample.
+        """
+        w = np.empty((state.size, voltage.size))
+        w[:, 0] = self.apply(self._at(voltage[0], state), np.full(state.size, voltage[0])).w
+        if np.ptp(voltage) == 0:
+            w[:] = w[:, :1]
+            return w, state
+        for first, last, _ in monotone_stretches(voltage, max(PIECE // max(state.size, 1), 1)):
+            ahead = slice(first + 1, last + 1)
+            w[:, ahead], states = self.along(voltage[first], state, voltage[ahead])
+            state = states[:, -1].copy()
+        return w, state
+
+    def along(
+        self, start: float, state: FloatArray, voltage: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return w and h (models, samples) along voltages (samples,) that go one way.
+
+        From a voltage ``start``, where h is ``state`` (models,); each goes there straight.
+        """
+        return self.gone_along(self._at(start, state).T, voltage)
+
+    def gone_along(self, memory: FloatArray, voltage: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return w and h from a memory (any, models) straight to each of the voltages."""
+        after = np.empty((*memory.shape, voltage.size))
+        w, _ = self.move(
+            self.parameters.T[:, :, np.newaxis], memory[:, :, np.newaxis], voltage, after
+        )
+        return w, after[1]
 
 
 class Operator(ABC):

@@ -13,8 +13,7 @@ from functools import partial
 from typing import Any
 
 from bwbayes.errors import InputError, suggestion
-from bwbayes.model.creep import Creep
-from bwbayes.model.filters import Filter, Lag, NoDynamics, SecondOrder
+from bwbayes.model.linear import Creep, Filter, Lag, NoDynamics, SecondOrder
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike

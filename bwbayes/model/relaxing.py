@@ -21,10 +21,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.elementwise import anywhere, select
-from bwbayes.model.operator import Span
-from bwbayes.model.step import OneStateStep
+from bwbayes.arrays import FloatArray, anywhere, select
+from bwbayes.model.inputs import Span
+from bwbayes.model.operator import OneStateStep
 
 # Stands for a rate of exactly zero: (1 - exp(-c v)) / c is v to machine precision at this c.
 TINY = 1e-100

@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep, creep_times
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold, Span
+from bwbayes.model.linear import Creep, creep_times
 from bwbayes.model.nonlinearity import TERMS, PolynomialNonlinearity
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator
 from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS, STAGES, build_part
 from bwbayes.model.stage import Side, Stage
 

@@ -9,7 +9,7 @@ It is one class in one file. It declares its parameters, and says what it does w
 ``settle`` at the first one, if it has a memory, ``move`` at each of the next, and ``undo``, which
 is ``move`` the other way round, for commands. Each is written once: NumPy moves all models at once
 with it, compiled it moves one after the other (:mod:`bwbayes.model.compiled`), and printed it is C
-(:mod:`bwbayes.control.exported`); so it is made of what :mod:`bwbayes.model.elementwise` says.
+(:mod:`bwbayes.control.exported`); so it is made of what :mod:`bwbayes.arrays` says.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.linear import ComplexArray, Hold
+from bwbayes.model.inputs import Hold, Inputs
+from bwbayes.model.linear import ComplexArray
 from bwbayes.shown import brief
 
 Side = Literal["input", "output"]

@@ -18,7 +18,7 @@ import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.model.operator import narrower
+from bwbayes.model.inputs import narrower
 from bwbayes.watching import Watch, part, parts, unwatched, watched
 
 # Draws that are asked about each of many histories.

@@ -21,9 +21,7 @@ from bwbayes.inference.importance import resample
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.linear import Hold
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Hold, Inputs, Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
 from bwbayes.prediction.histories import Histories, choose_histories, uniform

@@ -27,8 +27,7 @@ import scipy
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.errors import InputError, InputWarning, suggestion
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Context, Distribution, Ranges
 from bwbayes.model.linear import first_order_lag
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.backlash_like import BacklashLike

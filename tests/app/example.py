@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import Parameter
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import KINDS, Bands
 from bwbayes.prediction.scores import Scores
 from bwbayes.report.figures import draw_styled, pictures, plots_of

@@ -17,7 +17,7 @@ from bwbayes.app.jobs.check import check
 from bwbayes.app.running.folder import CampaignFolder
 from bwbayes.comparison.design import Design, DesignScore
 from bwbayes.diagnosis.validation import ValidationSummary
-from bwbayes.model.limits import Limits
+from bwbayes.model.inputs import Limits
 from bwbayes.report.outputs import render
 from tests.app import example, small
 from tests.programs import needs

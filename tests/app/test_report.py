@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference.parameters import Parameter
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.report.figures import interactive
 from bwbayes.report.report import as_text, digits, symbol
 from bwbayes.report.result import Result, summary

@@ -15,7 +15,7 @@ from bwbayes.app.fit.fitted import STAGES, open_finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.record import read_record
 from bwbayes.sampling import sampler
 from bwbayes.sampling.storage import ChainFile

@@ -12,7 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
+from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen

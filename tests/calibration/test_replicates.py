@@ -23,7 +23,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.noise import WhiteNoise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record.record import Record

@@ -20,7 +20,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Study, TrainingRecord
-from bwbayes.model.limits import Limits
+from bwbayes.model.inputs import Limits
 from bwbayes.model.spec import ModelSpec
 from tests.inference.linear import Linear
 from tests.inference.problems import decaying_sine, short_posterior

@@ -19,7 +19,7 @@ from bwbayes.app.problem.records import generator
 from bwbayes.comparison.evidence import Evidence, bridge, evidence, log_prior_mass
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws, log_densities
 from bwbayes.sampling.plan import SamplingPlan

@@ -6,10 +6,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.loop import LoopNoise
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold, Span
+from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Span
 from bwbayes.model.operators.backlash_like import BacklashLike
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric

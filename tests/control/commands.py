@@ -20,7 +20,7 @@ from bwbayes.control.compensation import Compensation, compensate
 from bwbayes.control.references import Reference
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.inference.noise import noise_model
-from bwbayes.model.limits import Limits
+from bwbayes.model.inputs import Limits
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.record import Record

@@ -15,7 +15,7 @@ import pytest
 from bwbayes.app.jobs.control import export
 from bwbayes.app.problem.problem import Problem
 from bwbayes.control.references import Reference, build_reference
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold
 from tests.control.commands import (
     about,
     compensated,

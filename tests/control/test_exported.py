@@ -12,8 +12,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.sampled import SampledModel
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.limits import Limits
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold, Limits
 from bwbayes.model.registry import HYSTERESIS
 from tests.control import cases
 from tests.control.compiled import Compiled

@@ -9,7 +9,7 @@ from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise, WhiteNoise
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.record.teststand import Amplifier
 from tests.control import cases
 from tests.control.cases import noise_of

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from bwbayes.arrays import anywhere, look_up, select
 from bwbayes.control.exported import c_functions, to_ascii
 from bwbayes.errors import InputError
-from bwbayes.model.elementwise import anywhere, look_up, select
 from tests.control.compiled import STRICT
 from tests.programs import needs
 

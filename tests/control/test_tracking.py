@@ -9,7 +9,7 @@ from bwbayes.control.references import TRACKED, tracking_signals
 from bwbayes.control.tracking import Tracking, track
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from tests.control import cases
 
 # As the ring bender's posterior has them; d and α go together, so that the loop keeps its size.

@@ -13,8 +13,7 @@ from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.control.compensation import compensate
 from bwbayes.control.references import Reference, build_reference
 from bwbayes.errors import InputError
-from bwbayes.model.limits import Limits
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Limits, Span
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import VirtualTestStand

@@ -11,8 +11,7 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.conflict import conflicts
 from bwbayes.inference.parameters import JointPrior
-from bwbayes.model.declaration import Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution, Ranges
 from tests.declared import context, declared, joint, parameter
 from tests.inference.problems import joint_prior
 

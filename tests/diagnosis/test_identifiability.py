@@ -18,7 +18,7 @@ from bwbayes.diagnosis.identifiability import (
 )
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform, signal
 from tests.inference.linear import Linear

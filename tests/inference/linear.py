@@ -17,7 +17,7 @@ from scipy import linalg, stats
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.record.teststand import RingBender
 from tests.inference.problems import (
     INTERVAL,

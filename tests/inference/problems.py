@@ -11,10 +11,8 @@ from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Context, Declaration, Ranges
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.inputs import Inputs
-from bwbayes.model.linear import Hold
+from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
+from bwbayes.model.inputs import Hold, Inputs
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES, context, declared, joint, parameter

@@ -9,8 +9,7 @@ from hypothesis import given, settings, strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.defaults import join_ranges, ranges_of, rounding_sd
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution, Ranges
 from bwbayes.model.inputs import Inputs
 from bwbayes.record.teststand import RingBender
 from tests.declared import NAMES as EVERY, context, declared, joint, parameter

@@ -29,8 +29,7 @@ from bwbayes.inference.noise import (
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import LOG_TWO_PI, Noise, root
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.declaration import Declaration
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Declaration, Distribution
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
 from tests.inference.test_likelihood import responses
 

@@ -17,7 +17,7 @@ from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold
 from tests.inference.problems import (
     INTERVAL,
     decaying_sine,

@@ -21,7 +21,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
 from bwbayes.inference.state_space import Noise
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.reversals import rate
+from bwbayes.model.inputs import rate
 from bwbayes.prediction.discrepancy_state import filter_discrepancy
 from tests.inference.problems import (
     INTERVAL,

@@ -9,11 +9,10 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.likelihood import Likelihood
-from bwbayes.model.creep import Creep, creep_times
 from bwbayes.model.declaration import Values
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold, Span
+from bwbayes.model.linear import Creep, creep_times
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Span
 from tests.inference.test_likelihood import assert_dense, moving, responses
 
 REFERENCE = Span(-90.0, 80.0)

@@ -10,8 +10,7 @@ from scipy.special import logsumexp
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
-from bwbayes.model.declaration import Ranges
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution, Ranges
 from bwbayes.model.operators.bouc_wen import ceiling
 from tests.declared import declared, joint
 from tests.inference.problems import joint_prior, single

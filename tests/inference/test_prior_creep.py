@@ -16,7 +16,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
+from bwbayes.model.linear import Creep
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record

@@ -14,9 +14,8 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator, State
 from bwbayes.model.declaration import check
-from bwbayes.model.linear import Hold
+from bwbayes.model.inputs import Hold, Span
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Span
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.model.registry import DYNAMICS
 from bwbayes.record.teststand import RingBender

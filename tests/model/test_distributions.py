@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from scipy import stats
 
 from bwbayes.errors import InputError
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 
 FAMILIAR: list[tuple[Distribution, Any]] = [
     (Distribution("normal", {"mean": 1.0, "sd": 2.0}), stats.norm(1, 2)),

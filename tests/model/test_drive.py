@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings, strategies as st
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.reversals import (
+from bwbayes.model.inputs import (
     RETURN,
     fastest,
     monotone_stretches,

@@ -10,12 +10,10 @@ from hypothesis import example, given, settings, strategies as st
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
+from bwbayes.model.inputs import Hold, Limits, Span
 from bwbayes.model.inverse import inverse
-from bwbayes.model.limits import Limits
-from bwbayes.model.linear import Hold
+from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Span
 from bwbayes.model.registry import HYSTERESIS, build_part
 from bwbayes.record.teststand import RingBender
 from tests.control import cases

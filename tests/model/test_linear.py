@@ -6,7 +6,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.linalg import expm
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.linear import Hold, Recursion, first_order_lag, second_order
+from bwbayes.model.inputs import Hold
+from bwbayes.model.linear import Recursion, first_order_lag, second_order
 
 INTERVAL = 1e-3
 HOLDS: tuple[Hold, ...] = ("first", "zero")

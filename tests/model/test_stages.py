@@ -23,15 +23,12 @@ from bwbayes.inference.likelihood import Likelihood
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.readings import Readings
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
-from bwbayes.model.declaration import Context, Declaration
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.inputs import Inputs
+from bwbayes.model.declaration import Context, Declaration, Distribution
+from bwbayes.model.inputs import Hold, Inputs, Limits, Span
 from bwbayes.model.inverse import inverse
-from bwbayes.model.limits import Limits
-from bwbayes.model.linear import Hold
+from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.operator import Operator
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.prandtl_ishlinskii import Plays

@@ -11,7 +11,7 @@ from scipy import stats
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import forecast, predict_record, predict_windows

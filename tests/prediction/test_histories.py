@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import choose_histories
 from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states

@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.importance import MIN_EFFECTIVE, resample
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
+from bwbayes.model.linear import Creep
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.initial_state import InitialConditions

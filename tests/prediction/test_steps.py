@@ -7,9 +7,9 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.creep import Creep
+from bwbayes.model.inputs import Span
+from bwbayes.model.linear import Creep
 from bwbayes.model.nonlinearity import PolynomialNonlinearity
-from bwbayes.model.operator import Span
 from bwbayes.prediction.loops import Estimate
 from bwbayes.prediction.prediction import forecast
 from bwbayes.prediction.steps import Step, measure_step, measure_steps, step_of

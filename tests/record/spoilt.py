@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
-from bwbayes.model.reversals import turning_points
+from bwbayes.model.inputs import turning_points
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal

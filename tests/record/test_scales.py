@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bwbayes.errors import InputError
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.instruments import EXACT, Instruments, Scales

@@ -16,7 +16,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DISCREPANCY_SD, SENSOR_SD
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.declaration import Declaration, lognormal
-from bwbayes.model.filters import Lag
+from bwbayes.model.linear import Lag
 from bwbayes.model.stages.lags import AmplifierLag, SensorLag
 from bwbayes.sampling import proposals
 from bwbayes.sampling.curvature import LONGEST, QuadraticMap, SkewMap, TotalRatioMap, fit_maps

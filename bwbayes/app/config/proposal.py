@@ -26,8 +26,8 @@ from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
 from bwbayes.errors import InputWarning, path_text
+from bwbayes.model.inputs import rate
 from bwbayes.model.registry import DYNAMICS
-from bwbayes.model.reversals import rate
 from bwbayes.quantities import DISPLACEMENT
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming

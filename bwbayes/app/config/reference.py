@@ -20,8 +20,7 @@ from bwbayes.app.config.keys import ANY, Key, keys, synonyms
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
 from bwbayes.model import registry
-from bwbayes.model.declaration import Context, Declaration
-from bwbayes.model.distributions import FAMILIAR
+from bwbayes.model.declaration import FAMILIAR, Context, Declaration
 from bwbayes.model.registry import build_part
 from bwbayes.record.teststand import RING_BENDER
 from bwbayes.record.waveforms import signal_names

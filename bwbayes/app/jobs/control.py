@@ -31,7 +31,7 @@ from bwbayes.control.tracking import Tracking, track as tracked
 from bwbayes.diagnosis import extrapolation
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.linear import Hold, parse_hold
+from bwbayes.model.inputs import Hold, parse_hold
 from bwbayes.prediction.prediction import thin_draws
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference

@@ -27,8 +27,7 @@ from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Design, DesignScore, RivalDesign, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.extrapolation import PART
 from bwbayes.errors import InputError
-from bwbayes.model.limits import Limits
-from bwbayes.model.reversals import fastest, time_between_turns, turning_points
+from bwbayes.model.inputs import Limits, fastest, time_between_turns, turning_points
 from bwbayes.record import Record, read_record
 from bwbayes.record.waveforms import (
     Carrier,

@@ -23,8 +23,7 @@ from rich.console import Console
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
-from bwbayes.model.limits import Limits
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Limits, Span
 from bwbayes.report.report import Shown
 
 

@@ -19,7 +19,7 @@ from bwbayes.inference.study import (
     extent_of,
 )
 from bwbayes.model.actuator import Actuator
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
 from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import Quantities

@@ -44,7 +44,7 @@ from bwbayes.inference.outliers import outliers
 from bwbayes.inference.parameters import Parameter
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import Stated, Study, require_known
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Distribution
 from bwbayes.model.spec import ModelSpec
 from bwbayes.quantities import Quantities
 from bwbayes.record import Record

@@ -14,7 +14,7 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.compiled.caching import compile_cached
-from bwbayes.model.creep import MOST_TIMES
+from bwbayes.model.linear import MOST_TIMES
 
 
 def inner(**options: Any) -> Any:

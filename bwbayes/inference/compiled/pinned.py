@@ -14,12 +14,12 @@ from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.compiled.caching import compile_cached
 from bwbayes.model.compiled import compiled
 from bwbayes.model.declaration import Values
+from bwbayes.model.inputs import monotone_stretches
 from bwbayes.model.operators import walls as formulas
 from bwbayes.model.operators.pinned import LONGEST, Pinned
 from bwbayes.model.operators.rosenbrock import STAGES
 from bwbayes.model.operators.scalar_memory import StateMemory
 from bwbayes.model.operators.walls import KNOTS, LINES
-from bwbayes.model.reversals import monotone_stretches
 
 at_rest, moves_from = compiled(formulas.at_rest), compiled(formulas.moves_from)
 first_step, integrate = compiled(formulas.first_step), compiled(formulas.integrate)

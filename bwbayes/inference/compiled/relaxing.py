@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, gone
 from bwbayes.inference.compiled.lanes import LANES, inner
 from bwbayes.model import relaxing as formulas
 from bwbayes.model.compiled import compiled, formula
-from bwbayes.model.elementwise import gone
 from bwbayes.model.relaxing import BENT, SHORT, RelaxingStep
 
 relax, bent = compiled(formulas.relax), compiled(formulas.bent)

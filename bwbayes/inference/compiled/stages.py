@@ -3,7 +3,7 @@
 A stage writes the drive's difference from that of the first sample, w − w₀, for a piece of a record
 and for ``LANES`` models side by side. The numbers and the memory of a model are in rows of
 ``LANES`` numbers of one flat array, ``group``; ``plan`` holds numbers that the stage needs in
-advance. An operator that has a step (:mod:`bwbayes.model.step`) is advanced by it; the drive of an
+advance. An operator that has a step (:mod:`bwbayes.model.operator`) is advanced by it; the drive of an
 operator with neither step nor stage is worked out beforehand, and is the plan.
 """
 
@@ -20,12 +20,11 @@ from bwbayes.inference.compiled import extrema, pinned, relaxing
 from bwbayes.inference.compiled.lanes import LANES, inner
 from bwbayes.model.compiled import FormulaType, formula
 from bwbayes.model.declaration import Values
-from bwbayes.model.operator import Operator
+from bwbayes.model.operator import HysteresisStep, Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.stage import Stage
-from bwbayes.model.step import HysteresisStep
 
 Kind = HysteresisStep | RemembersExtrema | None
 

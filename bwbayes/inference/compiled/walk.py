@@ -29,12 +29,11 @@ from bwbayes.inference.compiled.stages import (
 from bwbayes.model.actuator import Actuator, each_model
 from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
-from bwbayes.model.operator import Operator
+from bwbayes.model.operator import HysteresisStep, OneStateStep, Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.scalar_memory import OneState
 from bwbayes.model.relaxing import RelaxingStep
 from bwbayes.model.stage import Stage, pass_stages
-from bwbayes.model.step import HysteresisStep, OneStateStep
 
 
 def walk(

@@ -12,12 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Declaration, Values, normal, refuse, round_to_scale
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Span
+from bwbayes.model.declaration import (
+    Declaration,
+    Distribution,
+    Values,
+    normal,
+    refuse,
+    round_to_scale,
+)
+from bwbayes.model.inputs import Span
+from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, d, initial
 from bwbayes.model.relaxing import RelaxingStep
-from bwbayes.model.step import HysteresisStep
 
 # Bounds that other parameters put on one may be rounded.
 SLACK = 1e-12

@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, refuse
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Operator, Span, narrower
-from bwbayes.model.reversals import PIECE, monotone_stretches
+from bwbayes.model.declaration import Declaration, Distribution, Values, refuse
+from bwbayes.model.inputs import PIECE, Span, monotone_stretches, narrower
+from bwbayes.model.operator import Operator
 
 INITIAL = Declaration(
     name="initial",
@@ -98,7 +97,7 @@ class RemembersExtrema(Operator):
         """Return E from one voltage to another, um: zero where they are the same.
 
         It must be the same whichever of the two is the start. Written once, of what
-        :mod:`bwbayes.model.elementwise` says: for one model, all numbers, where it is compiled, and
+        :mod:`bwbayes.arrays` says: for one model, all numbers, where it is compiled, and
         for all models at once, with ``numbers`` (any, models, 1).
         """
 

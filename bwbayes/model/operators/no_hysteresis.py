@@ -12,9 +12,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
+from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.scalar_memory import OneState, d, initial
 from bwbayes.model.relaxing import RelaxingStep
-from bwbayes.model.step import HysteresisStep
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from typing import ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, check, positive, refuse
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Span
+from bwbayes.model.declaration import Declaration, Distribution, Values, check, positive, refuse
+from bwbayes.model.inputs import Span, monotone_stretches
 from bwbayes.model.operators.rosenbrock import STAGES
 from bwbayes.model.operators.scalar_memory import OneState, initial
 from bwbayes.model.operators.walls import (
@@ -35,7 +34,6 @@ from bwbayes.model.operators.walls import (
     irreversible,
     moves_from,
 )
-from bwbayes.model.reversals import monotone_stretches
 
 # Samples that one stretch is followed for: a number that does not depend on the batch.
 LONGEST = 2048

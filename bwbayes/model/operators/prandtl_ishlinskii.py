@@ -13,13 +13,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, anywhere, gone, select
 from bwbayes.errors import InputError
 from bwbayes.model.declaration import Declaration, Values, positive, round_to_scale
-from bwbayes.model.elementwise import anywhere, gone, select
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
+from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
-from bwbayes.model.step import HysteresisStep
 
 SLOPE = positive(
     "d",

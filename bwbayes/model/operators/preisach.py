@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
+from bwbayes.arrays import FloatArray, gone
 from bwbayes.model.declaration import Declaration, Values, positive
-from bwbayes.model.elementwise import gone
 from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema
 from bwbayes.model.operators.prandtl_ishlinskii import SLOPE
 

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, normal, positive
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Operator, Span
-from bwbayes.model.step import OneStateStep
+from bwbayes.model.declaration import Context, Declaration, Distribution, Values, normal, positive
+from bwbayes.model.inputs import Span
+from bwbayes.model.operator import OneStateStep, Operator
 
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9

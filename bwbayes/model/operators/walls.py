@@ -6,7 +6,7 @@ closed form, an implicit method of order five (:mod:`~bwbayes.model.operators.ro
 over, with steps of its own for each model: walls that are hardly pinned follow P_an within a
 voltage k that is small against all others.
 
-All is written once, of what :mod:`bwbayes.model.elementwise` says: for arrays of models, and
+All is written once, of what :mod:`bwbayes.arrays` says: for arrays of models, and
 compiled for one. ``spins`` says which curve L is: tanh, or that of Langevin.
 """
 
@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.elementwise import anywhere, select
+from bwbayes.arrays import FloatArray, anywhere, select
 from bwbayes.model.operators.rosenbrock import (
     BETWEEN,
     COUPLINGS,

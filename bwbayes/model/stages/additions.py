@@ -10,10 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, lognormal, normal
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.elementwise import select
+from bwbayes.arrays import FloatArray, select
+from bwbayes.model.declaration import Context, Declaration, Distribution, Values, lognormal, normal
 from bwbayes.model.stage import Side, Stage, Timing
 
 

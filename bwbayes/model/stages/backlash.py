@@ -11,10 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Declaration, Values, lognormal
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.elementwise import select
+from bwbayes.arrays import FloatArray, select
+from bwbayes.model.declaration import Declaration, Distribution, Values, lognormal
 from bwbayes.model.stage import Side, Stage, Timing
 
 

@@ -13,8 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Declaration, Values, lognormal, normal
-from bwbayes.model.distributions import Distribution
+from bwbayes.model.declaration import Context, Declaration, Distribution, Values, lognormal, normal
 from bwbayes.model.linear import ComplexArray, first_order_lag
 from bwbayes.model.stage import Side, Stage, Timing
 

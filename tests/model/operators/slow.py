@@ -9,9 +9,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from bwbayes.arrays import FloatArray
-from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.distributions import Distribution
-from bwbayes.model.operator import Operator, Span
+from bwbayes.model.declaration import Context, Distribution, Ranges
+from bwbayes.model.inputs import Span
+from bwbayes.model.operator import Operator
 
 RANGES = Ranges(voltage=50.0, displacement=20.0, middle=5.0, time=0.5, bias=10.0)
 SPAN = Span(-100.0, 100.0)

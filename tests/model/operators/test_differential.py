@@ -10,11 +10,10 @@ from scipy.special import hyp2f1
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.model.operators.backlash_like import BacklashLike
-from bwbayes.model.operators.bouc_wen import BoucWen, ceiling, hysteresis
+from bwbayes.model.operators.bouc_wen import BoucWen, PowerStep, ceiling, hysteresis
 from bwbayes.model.operators.bouc_wen_asymmetric import BoucWenAsymmetric
 from bwbayes.model.operators.duhem import Duhem
 from bwbayes.model.operators.scalar_memory import OneState
-from bwbayes.model.power import PowerStep
 from tests.model.operators.slow import (
     Model,
     assert_close,

@@ -13,7 +13,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Context, Ranges
-from bwbayes.model.operator import Span
+from bwbayes.model.inputs import Span
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.krasnoselskii_pokrovskii import KrasnoselskiiPokrovskii
 from bwbayes.model.operators.maxwell_slip import MaxwellSlip
