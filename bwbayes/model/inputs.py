@@ -5,9 +5,10 @@ column of the record (a temperature, a load). :class:`Inputs` hold all of them o
 
 A drive's own turns, times and speeds do not depend on the sampling rate. The voltage alone decides:
 a record and its every k-th sample have the same turning points. Noise on a measured voltage makes
-none, because a turn counts only where the voltage comes back by a part of its range. :class:`Limits`
-of an amplifier are its voltages and its slew rate: an actuator is a capacitance to it, i = C du/dt,
-so that the current limits the speed of the voltage too.
+none, because a turn counts only where the voltage comes back by a part of its range.
+
+The :class:`Limits` of an amplifier are its voltages and its slew rate: an actuator is a capacitance
+to it, i = C du/dt, so that the current limits the speed of the voltage too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Linear dynamics and creep between the drive w = d u − h and the displacement x, exact at any step.
+"""Linear dynamics and creep between the drive w = d u − h and the displacement x, exact.
 
 Equation (7) of the paper divided by its stiffness, (m/k) x″ + (b/k) x′ + x = w, and as the smaller
 alternative one first-order lag, τ x′ + x = w. Both become a recursion on the samples that is exact

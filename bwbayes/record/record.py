@@ -26,8 +26,8 @@ from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.io.columns import Naming, select
 from bwbayes.record.io.fields import record_fields
 from bwbayes.record.io.grid import clock
+from bwbayes.record.io.recognition import QUANTITIES
 from bwbayes.record.io.series import Source, array_source, frame_source
-from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.voltage_path import VoltagePath, estimate_path
 from bwbayes.shown import brief
 

@@ -23,7 +23,7 @@ from bwbayes.inference import map_estimate
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
-from bwbayes.record.io.hdf5 import record_arrays
+from bwbayes.record.io.binary import record_arrays
 from tests.app import small
 
 INTERVAL, PER_KELVIN, REFERENCE = 0.02, 0.002, 22.0

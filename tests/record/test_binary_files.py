@@ -18,7 +18,7 @@ from hypothesis import assume, example, given, settings, strategies as st
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
-from bwbayes.record.io import matlab
+from bwbayes.record.io import binary
 from tests.record.conftest import quiet
 from tests.record.makers import INSTRUMENTS
 
@@ -95,7 +95,7 @@ def test_a_version_5_file_is_read_as_scipy_wrote_it(tmp_path: Path, compressed: 
         arrays | {"s": {"a": np.arange(4.0), "cells": cells}, "empty": [], "z": np.ones(3) * 1j},
         do_compression=compressed,
     )
-    series = {s.name: s for s in matlab.read_mat(tmp_path / "a.mat").series}
+    series = {s.name: s for s in binary.read_mat(tmp_path / "a.mat").series}
     for kind, expected in arrays.items():
         for row in range(3):
             values = series.pop(f"{kind}[{row + 1}]").numbers("")
@@ -115,7 +115,7 @@ def test_a_place_that_cannot_be_written_to_is_an_input_error(tmp_path: Path, nam
 def test_a_version_7_3_file_bears_the_header_that_matlab_looks_for(tmp_path: Path) -> None:
     path = tmp_path / "record.mat"
     write_record(Record(VOLTAGE, DISPLACEMENT, interval=1.0), path, mat_version="7.3")
-    assert (2, 0) == scipy.io.matlab.matfile_version(path)
+    assert (2, 0) == scipy.io.binary.matfile_version(path)
     with h5py.File(path) as file:
         assert 512 == file.userblock_size
         assert b"double" == file["voltage_V"].attrs["MATLAB_class"]
@@ -200,7 +200,7 @@ def test_dimensions_beyond_the_numbers_are_refused_and_cells_not_made(tmp_path: 
 def test_a_compressed_array_cannot_unpack_to_all_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(matlab, "MAXIMUM_SAMPLES", 625)
+    monkeypatch.setattr(binary, "MAXIMUM_SAMPLES", 625)
     path = store(tmp_path, "compressed", {"zeros": np.zeros(10**5)} | GOOD)
     assert "damaged" in fault(path)
 
@@ -386,7 +386,7 @@ def test_a_matlab_object_is_named_with_how_to_save_it(tmp_path: Path) -> None:
     nameless += element(1, b"") + element(2, bytes(24))
     path.write_bytes(path.read_bytes() + element(14, opaque) + element(14, nameless))
     with pytest.warns(InputWarning, match=r"log: a MATLAB timetable.*timetable2table\(log\)"):
-        assert {*GOOD} == {series.name for series in matlab.read_mat(path).series}
+        assert {*GOOD} == {series.name for series in binary.read_mat(path).series}
     path = store(tmp_path, "7.3", GOOD)
     with h5py.File(path, "r+") as file:
         file["log"] = np.zeros(6, dtype="u4")

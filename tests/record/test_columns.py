@@ -14,8 +14,8 @@ from hypothesis import assume, given, strategies as st
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming, select
+from bwbayes.record.io.recognition import power_of
 from bwbayes.record.io.series import frame_source
-from bwbayes.record.io.units import power_of
 
 TIME = np.arange(200) / 100
 VOLTAGE = 50 * np.sin(6 * TIME)

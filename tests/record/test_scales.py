@@ -13,7 +13,7 @@ from bwbayes.model.registry import HYSTERESIS
 from bwbayes.record import Record, read_record, write_record
 from bwbayes.record.instruments import EXACT, Instruments, Scales
 from bwbayes.record.io.columns import Naming
-from bwbayes.record.io.units import scale_of, unit_in
+from bwbayes.record.io.recognition import scale_of, unit_in
 from tests.model.operators.test_every_operator import drawn_from, posterior
 
 

@@ -3,8 +3,8 @@
 A stage writes the drive's difference from that of the first sample, w − w₀, for a piece of a record
 and for ``LANES`` models side by side. The numbers and the memory of a model are in rows of
 ``LANES`` numbers of one flat array, ``group``; ``plan`` holds numbers that the stage needs in
-advance. An operator that has a step (:mod:`bwbayes.model.operator`) is advanced by it; the drive of an
-operator with neither step nor stage is worked out beforehand, and is the plan.
+advance. An operator that has a step (:mod:`bwbayes.model.operator`) is advanced by it; the drive of
+an operator with neither step nor stage is worked out beforehand, and is the plan.
 """
 
 from __future__ import annotations

@@ -29,19 +29,22 @@ from bwbayes.errors import InputError, InputWarning, one_line
 from bwbayes.quantities import DEFAULT, DISPLACEMENT, TIME, VOLTAGE, Quantities, Quantity
 from bwbayes.record.instruments import EXACT, Instruments, part_of_range, split_uncertainty
 from bwbayes.record.io.recognition import (
+    COMMON_UNITS,
+    QUANTITIES,
     beside,
     columns_error,
     counts_samples,
+    epoch_unit,
     finite,
     is_demand,
     likeness,
     rises,
+    scale_of,
     series_named,
     unit_of,
     with_own_times,
 )
 from bwbayes.record.io.series import Clock, Series, Source
-from bwbayes.record.io.units import COMMON_UNITS, QUANTITIES, epoch_unit, scale_of
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,19 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.model.inputs import VoltageIs, require_voltage_is
-from bwbayes.record.io.alignment import select_pair
+from bwbayes.record.io.binary import (
+    MatVersion,
+    read_hdf5,
+    read_mat,
+    read_netcdf,
+    read_tdms,
+    write_hdf5,
+    write_mat,
+)
 from bwbayes.record.io.columns import ColumnTable, Naming, select
-from bwbayes.record.io.fields import record_fields, reference_fields
-from bwbayes.record.io.hdf5 import read_hdf5, read_netcdf, read_tdms, write_hdf5
-from bwbayes.record.io.matlab import MatVersion, read_mat, write_mat
+from bwbayes.record.io.fields import record_fields, reference_fields, select_pair
+from bwbayes.record.io.recognition import QUANTITIES
 from bwbayes.record.io.series import Source, damaged, read_numpy
-from bwbayes.record.io.units import QUANTITIES
 from bwbayes.record.record import Record
 
 _TEXT = (".csv", ".txt")

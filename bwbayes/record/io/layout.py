@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bwbayes.errors import InputError, NoNumbersError, one_line
-from bwbayes.record.io.series import NOTES, RATES, Clock, Source
-from bwbayes.record.io.units import (
+from bwbayes.record.io.recognition import (
     QUANTITIES,
     is_other_unit,
     is_time_form,
@@ -28,6 +27,7 @@ from bwbayes.record.io.units import (
     unit_in,
     unit_in_brackets,
 )
+from bwbayes.record.io.series import NOTES, RATES, Clock, Source
 
 _NUMBER = re.compile(
     r"[+-]?(\d+[.,]?\d*|[.,]\d+|\d{1,3}(\.\d{3})+(,\d*)?|\d{1,3}(,\d{3})+(\.\d*)?)"

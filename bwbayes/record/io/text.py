@@ -32,7 +32,7 @@ from charset_normalizer import from_bytes
 from numpy.typing import NDArray
 
 from bwbayes.errors import InputError, InputWarning, NoNumbersError, one_line
-from bwbayes.record.io.hdf5 import record_arrays, record_notes
+from bwbayes.record.io.binary import record_arrays, record_notes
 from bwbayes.record.io.layout import (
     EXAMPLE,
     Layout,
