@@ -115,7 +115,7 @@ def test_a_place_that_cannot_be_written_to_is_an_input_error(tmp_path: Path, nam
 def test_a_version_7_3_file_bears_the_header_that_matlab_looks_for(tmp_path: Path) -> None:
     path = tmp_path / "record.mat"
     write_record(Record(VOLTAGE, DISPLACEMENT, interval=1.0), path, mat_version="7.3")
-    assert (2, 0) == scipy.io.binary.matfile_version(path)
+    assert (2, 0) == scipy.io.matlab.matfile_version(path)
     with h5py.File(path) as file:
         assert 512 == file.userblock_size
         assert b"double" == file["voltage_V"].attrs["MATLAB_class"]

@@ -17,9 +17,8 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import monotone_stretches
 from bwbayes.model.operators import walls as formulas
 from bwbayes.model.operators.pinned import LONGEST, Pinned
-from bwbayes.model.operators.rosenbrock import STAGES
 from bwbayes.model.operators.scalar_memory import StateMemory
-from bwbayes.model.operators.walls import KNOTS, LINES
+from bwbayes.model.operators.walls import KNOTS, LINES, STAGES
 
 at_rest, moves_from = compiled(formulas.at_rest), compiled(formulas.moves_from)
 first_step, integrate = compiled(formulas.first_step), compiled(formulas.integrate)

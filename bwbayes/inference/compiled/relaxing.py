@@ -1,8 +1,8 @@
 """The stage of loops that relax: sample by sample, models side by side.
 
 These are Bouc-Wen with n = 1, asymmetric or not, backlash-like and Duhem loops, by the formulas of
-:mod:`bwbayes.model.relaxing`. Their φ functions are a series for all models at once if the fastest
-of them moves little in a sample; otherwise they are doubled from a smaller argument.
+:mod:`bwbayes.model.operators.scalar_memory`. Their φ functions are a series for all models at once
+if the fastest of them moves little in a sample; otherwise they are doubled from a smaller argument.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray, gone
 from bwbayes.inference.compiled.lanes import LANES, inner
-from bwbayes.model import relaxing as formulas
 from bwbayes.model.compiled import compiled, formula
-from bwbayes.model.relaxing import BENT, SHORT, RelaxingStep
+from bwbayes.model.operators import scalar_memory as formulas
+from bwbayes.model.operators.scalar_memory import BENT, SHORT, RelaxingStep
 
 relax, bent = compiled(formulas.relax), compiled(formulas.bent)
 series, third = compiled(formulas.series), compiled(formulas.third)

@@ -23,7 +23,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.operator import HysteresisStep, Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.operators.pinned import DomainWall, JilesAtherton
-from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.operators.scalar_memory import RelaxingStep
 from bwbayes.model.stage import Stage
 
 Kind = HysteresisStep | RemembersExtrema | None

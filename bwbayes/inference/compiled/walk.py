@@ -31,8 +31,7 @@ from bwbayes.model.declaration import Values
 from bwbayes.model.inputs import Inputs
 from bwbayes.model.operator import HysteresisStep, OneStateStep, Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
-from bwbayes.model.operators.scalar_memory import OneState
-from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.operators.scalar_memory import OneState, RelaxingStep
 from bwbayes.model.stage import Stage, pass_stages
 
 

@@ -9,8 +9,15 @@ from dataclasses import dataclass
 
 from bwbayes.model.declaration import Declaration, Values
 from bwbayes.model.operator import HysteresisStep
-from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, ceiling, d, initial
-from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.operators.scalar_memory import (
+    OneState,
+    RelaxingStep,
+    alpha,
+    beta,
+    ceiling,
+    d,
+    initial,
+)
 
 
 @dataclass(frozen=True)

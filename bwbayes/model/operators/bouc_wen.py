@@ -2,7 +2,8 @@
 
 Time does not appear in them: h depends on the path of the voltage alone. So a record is cut where
 the voltage turns, and every stretch between two turns is one array expression for all samples and
-all models at once (:mod:`bwbayes.model.relaxing` for n = 1, :class:`PowerStep` for any n).
+all models at once (:class:`~bwbayes.model.operators.scalar_memory.RelaxingStep` for n = 1,
+:class:`PowerStep` for any n).
 
 For any n, along a stretch of direction s, with v = |u − u₀|, g = s h obeys dg/dv = α − (β + γ) gⁿ
 from zero on, and below it −g does the same with γ − β, backwards. In units of its ceiling g is then
@@ -46,13 +47,13 @@ from bwbayes.model.operator import HysteresisStep, OneStateStep
 from bwbayes.model.operators.scalar_memory import (
     HIGHEST_CEILING,
     OneState,
+    RelaxingStep,
     alpha,
     beta,
     d,
     gamma,
     initial,
 )
-from bwbayes.model.relaxing import RelaxingStep
 
 # Where the tables of the two curves begin among the numbers of a step, and the rows of a table: the
 # time at which each cell begins, how long it lasts, and the coefficients of its polynomial.

@@ -19,8 +19,16 @@ from bwbayes.arrays import ArrayLike, BoolArray, FloatArray
 from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal, refuse
 from bwbayes.model.operator import HysteresisStep
-from bwbayes.model.operators.scalar_memory import OneState, alpha, beta, ceiling, d, gamma, initial
-from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.operators.scalar_memory import (
+    OneState,
+    RelaxingStep,
+    alpha,
+    beta,
+    ceiling,
+    d,
+    gamma,
+    initial,
+)
 
 # Variables of each term, in the order in which their bounds follow from each other.
 TERMS = {

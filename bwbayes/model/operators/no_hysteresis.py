@@ -13,8 +13,7 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Values, lognormal
 from bwbayes.model.operator import HysteresisStep
-from bwbayes.model.operators.scalar_memory import OneState, d, initial
-from bwbayes.model.relaxing import RelaxingStep
+from bwbayes.model.operators.scalar_memory import OneState, RelaxingStep, d, initial
 
 
 @dataclass(frozen=True)

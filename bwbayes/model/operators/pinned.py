@@ -20,11 +20,11 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.model.declaration import Declaration, Distribution, Values, check, positive, refuse
 from bwbayes.model.inputs import Span, monotone_stretches
-from bwbayes.model.operators.rosenbrock import STAGES
 from bwbayes.model.operators.scalar_memory import OneState, initial
 from bwbayes.model.operators.walls import (
     KNOTS,
     LINES,
+    STAGES,
     Walls,
     at_rest,
     curve,

@@ -2,31 +2,101 @@
 
 It is that of :class:`~bwbayes.model.operators.pinned.Pinned`. Where P_an is below P_irr, P follows
 from an implicit equation, which is solved to rounding; from where they meet, which is known in
-closed form, an implicit method of order five (:mod:`~bwbayes.model.operators.rosenbrock`) takes
-over, with steps of its own for each model: walls that are hardly pinned follow P_an within a
-voltage k that is small against all others.
+closed form, an implicit method of order five takes over, with steps of its own for each model:
+walls that are hardly pinned follow P_an within a voltage k that is small against all others. An
+explicit method would have to take steps as short as that, however smooth the solution is. A
+Rosenbrock method puts the slopes f_u and f_p into its stages, and takes steps as long as the
+solution allows, none of which costs an iteration. For dp/du = f(u, p) it is
 
-All is written once, of what :mod:`bwbayes.arrays` says: for arrays of models, and
-compiled for one. ``spins`` says which curve L is: tanh, or that of Langevin.
+    k_i = (f(u + c_i h, p + Σ_j A_ij k_j) + d_i h f_u + Σ_j C_ij k_j / h) / (1/(γ h) − f_p),  j < i,
+
+with p + Σ B_i k_i at the end of the step, an estimated error of k_8, and in between, at θ h,
+
+    p + θ Σ B_i k_i + θ (1 − θ) (K_1 + θ (K_2 + θ K_3)),   K_m = Σ H_mi k_i.
+
+All is written once, of what :mod:`bwbayes.arrays` says: for arrays of models, and compiled for one.
+``spins`` says which curve L is: tanh, or that of Langevin.
+
+Notes
+-----
+Rodas5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks
+within the Julia Differential Equations package, BIT Numerical Mathematics 63, 27 (2023),
+doi:10.1007/s10543-023-00967-x.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from bwbayes.arrays import FloatArray, anywhere, select
-from bwbayes.model.operators.rosenbrock import (
-    BETWEEN,
-    COUPLINGS,
-    DRIFTS,
-    END,
-    PLACES,
-    SHIFT,
-    STAGES,
-    WEIGHTS,
+
+STAGES = 8
+
+
+def _below(*numbers: float) -> FloatArray:
+    """Return a matrix (STAGES, STAGES) with these numbers below its diagonal, by rows."""
+    matrix = np.zeros((STAGES, STAGES))
+    matrix[np.tril_indices(STAGES, -1)] = numbers
+    return matrix
+
+
+# γ, c and d.
+SHIFT = 0.21193756319429014
+# fmt: off
+PLACES: Final = np.array([
+    0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0,
+    1.0,
+])
+DRIFTS: Final = np.array([
+    0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734,
+    2.325825639765069, 0.0, 0.0, 0.0,
+])
+
+# A, whose last rows are B but for ones, B, C and H.
+_LAST = (
+    -7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256,
+    0.030198172008377946,
 )
+WEIGHTS: Final = _below(
+    3.0,
+    2.849394379747939, 0.45842242204463923,
+    -6.954028509809101, 2.489845061869568, -10.358996098473584,
+    2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641,
+    *_LAST,
+    *_LAST, 1.0,
+    *_LAST, 1.0, 1.0,
+)
+END: Final = np.array([*_LAST, 1.0, 1.0, 1.0])
+COUPLINGS: Final = _below(
+    -14.155112264123755,
+    -17.97296035885952, -2.859693295451294,
+    147.12150275711716, -1.41221402718213, 71.68940251302358,
+    165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306,
+    24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125,
+    -0.6610691825249471,
+    30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783,
+    -19.097331116725623, -28.087943162872662,
+    37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047,
+    -40.06618937091002, -54.66780262877968, -9.48861652309627,
+)
+BETWEEN: Final = np.array([
+    [
+        25.948786856663858, -2.5579724845846235, 10.433815404888879, -2.3679251022685204,
+        0.524948541321073, 1.1241088310450404, 0.4272876194431874, -0.17202221070155493,
+    ],
+    [
+        -9.91568850695171, -0.9689944594115154, 3.0438037242978453, -24.495224566215796,
+        20.176138334709044, 15.98066361424651, -6.789040303419874, -6.710236069923372,
+    ],
+    [
+        11.419903575922262, 2.8879645146136994, 72.92137995996029, 80.12511834622643,
+        -52.072871366152654, -59.78993625266729, -0.15582684282751913, 4.883087185713722,
+    ],
+])
+# fmt: on
+
 
 # Steps that are remembered at a time, and what of each: where it begins, V, how long it is, the
 # displacement there, how much it changes, and the bend in between, um.
