@@ -52,9 +52,6 @@ from bwbayes.report.report import Facts, Product, Report
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched
 
-# Arguments of functions that are arrays to be written to.
-WRITTEN = ("after", "settled", "filtered")
-
 
 def c_functions(
     functions: Sequence[Callable[..., Any]],
@@ -64,10 +61,10 @@ def c_functions(
 ) -> str:
     """Return functions and those that they call as static functions of C, callees first.
 
-    They are of numbers and of arrays, with ``shapes`` by the names of arguments; those in
-    ``WRITTEN`` are written to. C returns the first number that a function returns, and writes the
-    others through pointers. ``bindings`` are functions that arguments stand for: C has these by
-    their names. All names begin with ``prefix``.
+    They are of numbers and of arrays, with ``shapes`` by the names of arguments; ``after``,
+    ``settled`` and ``filtered`` are written to. C returns the first number that a function returns,
+    and writes the others through pointers. ``bindings`` are functions that arguments stand for: C
+    has these by their names. All names begin with ``prefix``.
 
     Raises InputError: an expression or statement that has no counterpart here.
     """
@@ -129,7 +126,8 @@ class _Printer(ast.NodeTransformer):
         returned = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
         results = max(len(v.elts) if isinstance(v, ast.Tuple) else 1 for v in returned)
         names = [argument.arg for argument in tree.args.args]
-        kinds = dict.fromkeys(self.shapes, "const double *") | dict.fromkeys(WRITTEN, "double *")
+        written = ("after", "settled", "filtered")
+        kinds = dict.fromkeys(self.shapes, "const double *") | dict.fromkeys(written, "double *")
         arguments = [f"{kinds.get(n, 'double ')}{n}" for n in names if n not in self.bindings]
         arguments += [f"double *result_{number}" for number in range(1, results)]
         return f"static double {self.prefix}{tree.name}({', '.join(arguments)})"

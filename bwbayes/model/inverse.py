@@ -42,9 +42,6 @@ Curve = Callable[[FloatArray], FloatArray]
 # Samples that are searched for together; operators that integrate follow as many.
 LONGEST = 2048
 
-# Passes at most that undo what a stage makes of the command itself.
-PASSES = 40
-
 
 def inverse(
     actuator: Actuator,
@@ -108,9 +105,9 @@ def inverse(
         single = _Single(actuator, column, from_rest)
         inputs = Inputs(np.zeros(samples.size), interval=actuator.interval)
         result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
-        # A stage that sees the command is undone with that of the pass before.
+        # A stage that sees the command is undone with that of the pass before, in 40 at most.
         follows = [stage.name for stage in actuator.stages if stage.sees == "voltage"]
-        for _ in range(PASSES if follows else 0):
+        for _ in range(40 if follows else 0):
             inputs = replace(inputs, voltage=result[row].copy())
             result[row] = single.voltage(samples, inputs, limits or Limits(), nearest)
             change = np.abs(result[row] - inputs.voltage)

@@ -33,9 +33,6 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_SIGN = r"\s*(?:\+-|\+/-|±)\s*"
-# Largest uncertainty: beyond it there is no calibration, and a normal scale would reach zero.
-LARGEST = 0.2
 
 
 class Scales(NamedTuple):
@@ -79,11 +76,13 @@ class Instruments:
     linearity: float = 0.0
 
     def __post_init__(self) -> None:
+        # Beyond the largest uncertainty there is no calibration: a normal scale would reach zero.
+        largest = 0.2
         for name, value in vars(self).items():
-            if not 0 <= value <= LARGEST:
+            if not 0 <= value <= largest:
                 raise InputError(
                     f"{name.replace('_', ' ')}: an uncertainty of {100 * value:.3g} % is no "
-                    f"calibration; give 0 to {100 * LARGEST:g} %"
+                    f"calibration; give 0 to {100 * largest:g} %"
                 )
 
     def updated(self, stated: Instruments) -> Instruments:
@@ -141,11 +140,12 @@ def split_uncertainty(unit: str, where: str) -> tuple[str, float | None]:
 
     Raises InputError: an uncertainty that cannot be read.
     """
-    if not re.search(r"\+-|\+/-|±", unit):
+    sign = r"\s*(?:\+-|\+/-|±)\s*"
+    if not re.search(sign, unit):
         return unit, None
-    if match := re.fullmatch(rf"(.*?\S){_SIGN}({_NUMBER})\s*%", unit.strip()):
+    if match := re.fullmatch(rf"(.*?\S){sign}({_NUMBER})\s*%", unit.strip()):
         return match[1], float(match[2]) / 100
-    match = re.fullmatch(rf"(-?{_NUMBER}){_SIGN}({_NUMBER})\s*(\D.*)", unit.strip())
+    match = re.fullmatch(rf"(-?{_NUMBER}){sign}({_NUMBER})\s*(\D.*)", unit.strip())
     if match is None or float(match[1]) == 0:
         raise InputError(
             f"{where}: cannot read {unit!r}; write '0.35 +- 0.004 um' or '0.35 um +- 1.2 %'"

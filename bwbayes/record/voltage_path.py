@@ -30,9 +30,6 @@ from scipy.optimize import isotonic_regression
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.shown import brief
 
-# Harmless excess of the path, as a part of the path.
-HARMLESS = 1e-3
-
 # Half width, in sds, of the windows' intervals that have to intersect.
 WITHIN = 1.5
 
@@ -104,9 +101,10 @@ def estimate_path(voltage: FloatArray) -> VoltagePath:
     shown = f"noise of {sd:.2g} V SD ({100 * sd / extent:.2g}% of its range)"
     length = _length(path)
     excess = _length(u) - length
-    if excess <= max(HARMLESS * length, 3 * length_sd):  # beyond three sds it is clear
+    harmless = 1e-3 * length
+    if excess <= max(harmless, 3 * length_sd):  # beyond three sds it is clear
         left_in = f"voltage may have {shown}, which cannot be told from the drive: none is removed"
-        return VoltagePath(voltage, remark=left_in * (excess > HARMLESS * length))
+        return VoltagePath(voltage, remark=left_in * (excess > harmless))
     remark = (
         f"voltage has {shown}: the model is driven by its estimated path, with {reversals} "
         f"reversals for {turns(u)}"

@@ -59,10 +59,6 @@ from bwbayes.model.operators.scalar_memory import (
 # time at which each cell begins, how long it lasts, and the coefficients of its polynomial.
 TABLE, ROWS = 7, 10
 
-# Curves are followed to log zⁿ, or where they saturate log zⁿ/(1 − zⁿ), of so much: the rest is
-# lost against one.
-REACH = 36.0
-
 
 class PowerStep(OneStateStep):
     """w = d u − h with Bouc-Wen hysteresis h of any exponent n ≥ 1.
@@ -199,11 +195,13 @@ def tabulate(exponent: FloatArray, *, saturating: bool, top: float = 0.0) -> Flo
     where the curve saturates, it is smooth, and quadrature on each cell is exact to rounding. One
     that grows on is followed to x = ``top``.
     """
-    # Cells are wider outwards, as what they resolve fades like exp(−|x|).
+    # Curves are followed to log zⁿ, or where they saturate log zⁿ/(1 − zⁿ), of so much: the rest is
+    # lost against one. Cells are wider outwards, as what they resolve fades like exp(−|x|).
+    reach = 36.0
     half = [0.0]
-    while half[-1] < REACH:
+    while half[-1] < reach:
         half.append(half[-1] + min(0.2 * np.exp(half[-1] / 8), 3.0))
-    beyond = half[1:] if saturating else np.arange(0.0, min(max(top, 0.0), REACH) + 0.3, 0.15)[1:]
+    beyond = half[1:] if saturating else np.arange(0.0, min(max(top, 0.0), reach) + 0.3, 0.15)[1:]
     x, n, sign = np.array([*-np.array(half[::-1]), *beyond]), exponent[:, None], 1 - 2 * saturating
 
     def log_power(x: FloatArray) -> FloatArray:

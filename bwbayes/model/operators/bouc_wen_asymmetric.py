@@ -20,6 +20,7 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.model.declaration import Declaration, Values, normal, refuse
 from bwbayes.model.operator import HysteresisStep
 from bwbayes.model.operators.scalar_memory import (
+    SLACK,
     OneState,
     RelaxingStep,
     alpha,
@@ -40,9 +41,6 @@ TERMS = {
 }
 
 SIGNS = (1.0, -1.0)
-
-# Bounds that other parameters put on one may be rounded.
-SLACK = 1e-12
 
 
 @dataclass(frozen=True)

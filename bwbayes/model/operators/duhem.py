@@ -22,10 +22,15 @@ from bwbayes.model.declaration import (
 )
 from bwbayes.model.inputs import Span
 from bwbayes.model.operator import HysteresisStep
-from bwbayes.model.operators.scalar_memory import OneState, RelaxingStep, alpha, beta, d, initial
-
-# Bounds that other parameters put on one may be rounded.
-SLACK = 1e-12
+from bwbayes.model.operators.scalar_memory import (
+    SLACK,
+    OneState,
+    RelaxingStep,
+    alpha,
+    beta,
+    d,
+    initial,
+)
 
 
 @dataclass(frozen=True)

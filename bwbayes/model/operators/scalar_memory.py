@@ -35,6 +35,9 @@ from bwbayes.model.operator import OneStateStep, Operator
 # Stands for an infinite ceiling, um.
 HIGHEST_CEILING = 1e9
 
+# Bounds that other parameters put on one may be rounded by this part.
+SLACK = 1e-12
+
 Bounds = Callable[[Values], tuple[ArrayLike, ArrayLike]]
 
 

@@ -55,12 +55,6 @@ from bwbayes.record.io.series import (
 )
 from bwbayes.record.record import Record
 
-# Attributes that may scale or shift raw numbers in an unknown way, and their neutral values.
-_FACTORS = {
-    **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
-    **dict.fromkeys(("sensitivity", "offset", "bias"), (0.0,)),
-}
-
 
 def read_hdf5(path: Path) -> Source:
     """Return the series of numbers in an HDF5 file; a damaged file may raise any exception."""
@@ -253,12 +247,17 @@ def _open(path: Path, *, remark: bool = False) -> Any:
 
 
 def _loaded(path: Path, name: str) -> Any:
+    # Attributes that may scale or shift raw numbers in an unknown way, and their neutral values.
+    factors = {
+        **dict.fromkeys(("gain", "scale", "scaling", "factor", "slope", "calibration"), (0.0, 1.0)),
+        **dict.fromkeys(("sensitivity", "offset", "bias"), (0.0,)),
+    }
     with _open(path) as file:
         attributes = file[name].attrs
         for key in attributes:
-            if key.lower() in _FACTORS and attributes.get_id(key).dtype.kind in "iuf":
+            if key.lower() in factors and attributes.get_id(key).dtype.kind in "iuf":
                 factor = np.ravel(attributes[key])
-                if factor.size == 1 and factor[0] not in _FACTORS[key.lower()]:
+                if factor.size == 1 and factor[0] not in factors[key.lower()]:
                     fact = f"attribute {key} = {factor[0]:g} is not applied"
                     advice = f"if 1 stands for that, say so as a unit, '{factor[0]:g} V'"
                     remark = one_line(f"{path}: {name.strip('/')}: {fact}; {advice}")

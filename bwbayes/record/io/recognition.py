@@ -48,11 +48,6 @@ _OTHERS = {
         **dict.fromkeys(("in", "inch", "inches"), 25_400.0),
     },
 }
-# A power of ten, a ratio, or a factor of ten, hundred or the like: "10^-6", "1:20", "x10", "/100".
-_FACTOR = re.compile(
-    r"(?<![\w.])(?:10\s*\^|10[\u207b\u207a\u2070\u00b9\u00b2\u00b3\u2074-\u2079]|10?[eE][-+]?\d)"
-    r"|(?<![\d.:])1:\d+(?![\d:])|(?:(?<!\w)[xX*]|[\u00d7\u00b7/*])\s*10+(?!\d|\s*[\w.])"
-)
 # Other words in the place of a unit, in lower case.
 _FOREIGN = (
     *("%", "-", "1", "#", "a.u.", "count", "counts", "digit", "digits", "lsb", "bit", "bits"),
@@ -144,7 +139,12 @@ def factor_in(name: str) -> str:
     Names such as ``x / 10⁻⁶ m``, ``U x10 (V)`` or ``monitor 1:100 [V]`` do not tell what 1 in the
     column stands for.
     """
-    factor = _FACTOR.search(name)
+    # A power of ten, a ratio, or a factor of ten, hundred or the like: 10^-6, 1:20, x10, /100.
+    factor = re.search(
+        r"(?<![\w.])(?:10\s*\^|10[\u207b\u207a\u2070\u00b9\u00b2\u00b3\u2074-\u2079]|10?[eE][-+]?\d)"
+        r"|(?<![\d.:])1:\d+(?![\d:])|(?:(?<!\w)[xX*]|[\u00d7\u00b7/*])\s*10+(?!\d|\s*[\w.])",
+        name,
+    )
     return factor[0].strip() if factor else ""
 
 
