@@ -25,7 +25,7 @@ from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray, select
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
-from bwbayes.inference.noise import NOISES, noise_model
+from bwbayes.inference.noise import NOISES, DiscrepancyNoise, noise_model
 from bwbayes.inference.parameter_table import ParameterTable
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Values, positive
@@ -117,6 +117,11 @@ class Bent(OneState):
         return BentStep(np.stack([column[name] for name in names], axis=1))
 
 
+@dataclass(frozen=True)
+class OutsideNoise(DiscrepancyNoise):
+    """A noise from outside."""
+
+
 class Incomplete(RemembersExtrema):
     """Lacks a branch."""
 
@@ -193,13 +198,17 @@ def config(folder: Path, kind: str) -> Config:
 def test_an_operator_from_outside_goes_all_the_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Resolved, fitted, sampled, predicted and reported; the truth is within four sds.
+    """Resolved, fitted, sampled, predicted, reported and opened; the truth is within four sds.
 
+    The noise is from outside, too; what a run has kept of it is read again.
     Of three parameters, such a bound is missed by chance in one of 5,000 runs.
     """
     kind = "TanhLoop"
     small.without_pictures(monkeypatch)
-    folder = RunFolder.create(tmp_path / "run", resolve_config(config(tmp_path, kind), tmp_path))
+    stated = config(tmp_path, kind)
+    noise = {"noise": f"{HERE}:OutsideNoise"}
+    stated = stated.model_copy(update={"model": stated.model.model_copy(update=noise)})
+    folder = RunFolder.create(tmp_path / "run", resolve_config(stated, tmp_path))
     result = resume(folder, Console(quiet=True), workers=1)
     assert result.outcome.converged
     summary = json.loads(folder.summary.read_text(encoding="utf-8"))
@@ -211,6 +220,8 @@ def test_an_operator_from_outside_goes_all_the_way(
     page = (folder.path / "report.html").read_text(encoding="utf-8")
     assert "width of the loop" in page
     assert f"{HERE}:{kind}" in folder.config.read_text(encoding="utf-8")
+    bands = bwbayes.open_run(folder.path).bands["held_out"]
+    np.testing.assert_array_equal(bands.mean, result.bands["held_out"].mean)
 
 
 @pytest.mark.parametrize("kind", list(TRUTH))

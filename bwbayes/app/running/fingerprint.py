@@ -8,14 +8,16 @@ its own), and predictions.
 
 Opening a run only reads files. The file with the results worked out of a chain begins with a
 digest of the rest: arrays, and a text that says how dataclasses are made of them. Nothing in it is
-run: only dataclasses of this package come out of it. It belongs to one state of the run; the
-results of another state, or of a damaged file, are worked out again.
+run: only dataclasses of this package come out of it, and noises from outside that the config names.
+It belongs to one state of the run; the results of another state, or of a damaged file, are worked
+out again.
 """
 
 from __future__ import annotations
 
 import json
 import platform
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
@@ -34,6 +36,7 @@ from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
+from bwbayes.inference.state_space import Noise
 from bwbayes.record.io.formats import draft_of
 from bwbayes.sampling.storage import ChainFile
 
@@ -169,11 +172,13 @@ def _object_of(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     if "class" not in value:
         return items
     module, _, name = value["class"].partition(":")
-    if not module.startswith("bwbayes."):
-        raise ValueError(f"{value['class']} is no class of this package")
-    cls = getattr(import_module(module), name)
+    inside = module.startswith("bwbayes.")
+    # A noise from outside is loaded by now, since the config names it.
+    cls = getattr(import_module(module) if inside else sys.modules.get(module), name)
     if not isinstance(cls, type) or _names_of(cls) is None:
         raise ValueError(f"{value['class']} is no dataclass")
+    if not (inside or issubclass(cls, Noise)):
+        raise ValueError(f"{value['class']} is no class of this package")
     return cls(**items)
 
 
