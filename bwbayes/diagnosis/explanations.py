@@ -8,8 +8,6 @@ none ties with it whose fix keeps them.
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
@@ -54,7 +52,7 @@ TIED = float(np.log(20))
 
 
 def explain(
-    scene: ResidualAnalysis, watch: Watch = unwatched, until: float = math.inf
+    scene: ResidualAnalysis, watch: Watch = unwatched, is_over: Callable[[], bool] = lambda: False
 ) -> tuple[Explanation, ...]:
     """Fit explanations, and rank them, the best first.
 
@@ -63,7 +61,7 @@ def explain(
     discrepancy is smooth, all are first fitted with a rough one; those worth more than the limit
     are fitted with the smooth one as well, and each has the worth of its better fit. Other models
     are fitted to the beginning of a record that is too long. ``watch`` is called with the share
-    that is done. No fit begins after ``until`` s of the process's CPU time.
+    that is done. No fit begins when the time ``is_over``.
     """
     best: dict[str, Explanation] = {}
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
@@ -74,20 +72,20 @@ def explain(
     if not scene.posterior.single_record.inputs.quantities.has_clock:
         kinds = tuple(kind for kind in kinds if kind not in TIMED)
     for number, kind in enumerate(kinds):
-        if time.process_time() > until:
+        if is_over():
             break
         if number == sum(kind in ADDITIONS for kind in kinds):
             if scene.unexplained <= LIMIT and all(e.nats <= LIMIT for e in best.values()):
                 break
             looked_at = scene.of_beginning()
             rough = rough if looked_at is scene else looked_at.with_rough_noise()
-        explanations = [] if rough is None else [*_in_time(kind(rough), until)]
+        explanations = [] if rough is None else [*_in_time(kind(rough), is_over)]
         lead = 0.0 if rough is None else rough.lead
         worth = frozenset(cause.kind for cause in explanations if cause.nats + lead > LIMIT)
         if rough is None:
-            explanations = [*_in_time(kind(looked_at), until)]
+            explanations = [*_in_time(kind(looked_at), is_over)]
         elif worth:
-            explanations += _in_time(kind(replace(looked_at, kinds=worth)), until)
+            explanations += _in_time(kind(replace(looked_at, kinds=worth)), is_over)
         for explanation in explanations:
             previous = best.get(explanation.kind, explanation)
             best[explanation.kind] = max(previous, explanation, key=lambda either: either.nats)
@@ -101,9 +99,11 @@ def explain(
     return _ranked(best.values())
 
 
-def _in_time(explanations: Iterator[Explanation], until: float) -> Iterator[Explanation]:
-    """Yield explanations while the process's CPU time is below ``until`` s."""
-    while time.process_time() < until:
+def _in_time(
+    explanations: Iterator[Explanation], is_over: Callable[[], bool]
+) -> Iterator[Explanation]:
+    """Yield explanations until the time is over."""
+    while not is_over():
         explanation = next(explanations, None)
         if explanation is None:
             return

@@ -9,6 +9,9 @@ that is there.
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Literal
 
@@ -38,3 +41,19 @@ def resolve_engine(choice: EngineChoice = "auto") -> Engine:
     if choice == "numba" and disabled:
         raise InputError("engine: NUMBA_DISABLE_JIT is set; unset it, or choose the numpy engine")
     return "numba" if installed and not disabled and choice != "numpy" else "numpy"
+
+
+@contextmanager
+def stopwatch(engine: Engine) -> Iterator[Callable[[], float]]:
+    """Measure the process's CPU time, s, without what an engine needs to compile.
+
+    So a machine's first run, whose functions no cache has, is given the same time as any later one.
+    """
+    begin = time.process_time()
+    if engine == "numpy":
+        yield lambda: time.process_time() - begin
+        return
+    from bwbayes.inference.compiled.caching import compile_time  # noqa: PLC0415  # needs numba
+
+    with compile_time() as compiling:
+        yield lambda: time.process_time() - begin - compiling.seconds

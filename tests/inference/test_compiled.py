@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
@@ -18,7 +19,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference import compiled, engine
 from bwbayes.inference.compiled.lanes import LANES
-from bwbayes.inference.engine import resolve_engine
+from bwbayes.inference.engine import resolve_engine, stopwatch
 from bwbayes.inference.posterior import Posterior
 from bwbayes.model.registry import HYSTERESIS
 from tests.inference.problems import short_posterior, truth
@@ -204,3 +205,16 @@ def test_engine_is_chosen_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         resolve_engine("numba")
     with pytest.raises(InputError, match="'fortran' is unknown; write one of auto, numpy, numba"):
         resolve_engine("fortran")  # type: ignore[arg-type]
+
+
+def test_the_time_to_compile_is_left_out_of_what_a_search_takes() -> None:
+    """Twin: the reference engine's time has it in."""
+
+    def compiled_anew() -> None:
+        numba.njit(lambda x: np.linalg.inv(x @ x.T) + np.sort(x[0]))(np.eye(3))
+
+    with stopwatch("numba") as clock, stopwatch("numpy") as with_compiling:
+        compiled_anew()
+        assert clock() < with_compiling() / 3
+        sum(range(3_000_000))
+        assert clock() > 0

@@ -11,8 +11,7 @@ while the fit follows what the actuator did not do: no stage mends a transient.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -29,6 +28,7 @@ from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.model import without
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis
 from bwbayes.inference import map_estimate
+from bwbayes.inference.engine import stopwatch
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
 from bwbayes.shown import rounded
@@ -177,11 +177,18 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     stage that leads; then it leaves out again what was added and is not needed any more. No stage
     is added with which the error on readings that were held out grows by a tenth, whatever its
     evidence. Several records have none added: an explanation is one of a single record. Time is CPU
-    time, so that a busy machine finds the same. A search that adds three stages and leaves a
-    model error all the same has not found the mechanism: the config says so (``unexplained``), and
-    the run is inconclusive. With fewer, the error may be a disturbance, and that is a remark.
+    time without that of compiling, so that a busy or a new machine finds the same. A search that
+    adds three stages and leaves a model error all the same has not found the mechanism: the config
+    says so (``unexplained``), and the run is inconclusive. With fewer, the error may be a
+    disturbance, and that is a remark.
     """
-    begin, seconds = time.process_time(), problem.config.model.search_seconds
+    with stopwatch(problem.posterior.engine) as clock:
+        return _search(problem, clock, watch)
+
+
+def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> ChosenModel:
+    """Search as :func:`search_stages`; ``clock`` tells the time, s, since the search began."""
+    seconds = problem.config.model.search_seconds
     point = _fit_point(problem, partial(watch, "MAP estimate"))
     if not seconds or len(problem.records) > 1:
         return ChosenModel(problem, point, (), None)
@@ -190,8 +197,8 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     while True:
         step = partial(watch, f"stages, round {len(steps) + 1}")
         scene = _scene(problem, name, point.optima)
-        explanations = explain(scene, step, begin + seconds)
-        is_over = time.process_time() > begin + seconds
+        explanations = explain(scene, step, lambda: clock() > seconds)
+        is_over = clock() > seconds
         # The last one has just been weighed.
         needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
         models = [cause for cause in explanations if cause.spec is not None]
@@ -209,7 +216,7 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
             notes[added], note = f"stage added: {gain}", f"added: {gain}"
         else:
             break
-        steps.append(f"{note}, {time.process_time() - begin:.0f} s")
+        steps.append(f"{note}, {clock():.0f} s")
         assert chosen.spec is not None
         problem = problem.with_model(chosen.spec, chosen.stated)
         point = _fit_point(problem, partial(watch, "MAP estimate"))

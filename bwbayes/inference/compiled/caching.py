@@ -6,13 +6,16 @@ other files into it. So the name of a cached function contains a digest of all t
 
 from __future__ import annotations
 
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
 from numba import njit
+from numba.core.event import Event, Listener, install_listener
 
 from bwbayes.errors import InputWarning
 
@@ -50,3 +53,29 @@ def compile_cached[Function: Callable[..., Any]](**options: Any) -> Callable[[Fu
         return cast("Function", njit(nogil=True, **options)(function))
 
     return decorate
+
+
+@contextmanager
+def compile_time() -> Iterator[CompileTime]:
+    """Sum up the process's CPU time that numba takes to compile."""
+    with install_listener("numba:compile", CompileTime()) as listener:
+        yield listener
+
+
+class CompileTime(Listener):
+    """The process's CPU time, in ``seconds``, of what numba has compiled while it listens."""
+
+    def __init__(self) -> None:
+        self.seconds, self._depth, self._begin = 0.0, 0, 0.0
+
+    def on_start(self, event: Event) -> None:  # noqa: ARG002
+        """Compilation begins; that of a function includes those that it calls."""
+        if self._depth == 0:
+            self._begin = time.process_time()
+        self._depth += 1
+
+    def on_end(self, event: Event) -> None:  # noqa: ARG002
+        """Compilation ends."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.process_time() - self._begin
