@@ -215,11 +215,11 @@ from bwbayes.watching import WatchSteps, unwatched, watched
 """
 SHORT = '''
 class Far(Reach):
-    NAME = "far"
+    NAME = "very-far"
     shortfall = "it does not move far enough"
     exit_status = ExitStatus.VALIDATION_INCONCLUSIVE
 
-def far(fit: Run, least: float, watch: WatchSteps = unwatched) -> Far:
+def very_far(fit: Run, least: float, watch: WatchSteps = unwatched) -> Far:
     """Say whether it moves far."""
     return Far(least, fit.standing)
 '''
@@ -228,7 +228,7 @@ def far(fit: Run, least: float, watch: WatchSteps = unwatched) -> Far:
 DRIVER = """
 import contextlib, io, json, pydoc, sys, warnings
 from bwbayes.app import verbs
-verbs.VERBS += (verbs.Verb("my_product:reach"), verbs.Verb("my_product:far"))
+verbs.VERBS += (verbs.Verb("my_product:reach"), verbs.Verb("my_product:very_far"))
 import bwbayes
 from bwbayes.app.commands import cli
 from bwbayes.app.running.progress import StepProgress
@@ -271,8 +271,8 @@ def product(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, Any], t
         "reach my --after x",
         "reach none",
         "reach failed --quiet",
-        "far my 3",
-        "far my",
+        "very-far my 3",
+        "very-far my",
     ]
     environment = {**os.environ, "COLUMNS": "100"}
     command = [sys.executable, "-c", DRIVER, json.dumps(lines)]

@@ -58,9 +58,9 @@ def test_type_checkers_see_the_methods_that_come_from_verbs() -> None:
     source = Path(inspect.getfile(bw.Run)).read_text(encoding="utf-8")
     typed = set(re.findall(r"^        (\w+) = fit_method\(\w+\)$", source, re.MULTILINE))
     assert typed
-    assert typed <= {verb.name for verb in VERBS}
+    assert typed <= {verb.method for verb in VERBS}
     for verb in VERBS:
-        method, function = getattr(bw.Run, verb.name), verb.load()
+        method, function = getattr(bw.Run, verb.method), verb.load()
         assert inspect.signature(method) == inspect.signature(function)
         assert inspect.getdoc(method) == inspect.getdoc(function)
 

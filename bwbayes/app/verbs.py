@@ -39,7 +39,7 @@ class Verb:
     also
         The function whose keyword arguments its ``**options`` are, with their help.
     command
-        The command's name, if not the function's.
+        The command's name, if not the function's with hyphens.
     flags
         Names of options and words that differ from their arguments'; one without is no option.
     either
@@ -65,14 +65,19 @@ class Verb:
     parts: bool = False
 
     @property
+    def method(self) -> str:
+        """The name of the function and the method."""
+        return self.function.partition(":")[2]
+
+    @property
     def name(self) -> str:
-        """The name of the command and the method."""
-        return self.command or self.function.partition(":")[2]
+        """The name of the command."""
+        return self.command or self.method.replace("_", "-")
 
     def load(self, name: str = "") -> Any:
         """Return the function itself, or what has another name in its module."""
-        module, _, function = self.function.partition(":")
-        return getattr(import_module(module), name or function)
+        module = self.function.partition(":")[0]
+        return getattr(import_module(module), name or self.method)
 
     def __get__(self, fit: Any, _: object = None) -> Any:
         """Return it as a method of a fit, loaded when it is asked for."""

@@ -683,7 +683,7 @@ class Run(Shown):
 STAGES = {name: stage for name, stage in vars(Run).items() if isinstance(stage, RunStage)}
 
 for verb in VERBS:
-    setattr(Run, verb.name, verb)
+    setattr(Run, verb.method, verb)
 
 
 def open_finished(folder: RunFolder) -> Run:
