@@ -214,6 +214,12 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
     assert (third.creep, third.dynamics, third.noise) == (True, "lag", "white")
 
 
+def test_a_model_in_a_line_may_have_parts_from_outside() -> None:
+    noise, stage = "bwbayes.inference.noise:SmoothNoise", "bwbayes.model.stages.delay:Delay"
+    (model,) = models_of(f"linear + {stage} + {noise} + student", BASE).values()
+    assert (model.stages, model.noise) == ([stage], f"{noise} + student")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -225,6 +231,7 @@ def test_what_is_said_is_taken_and_the_rest_is_the_configs() -> None:
         ("bouc-wen; bouc-wen", "is there twice"),
         (" ; ", "names no model"),
         ("+ quadratic", "begin with an operator"),
+        ("linear + pathlib:Pat", "cannot import 'pathlib:Pat'"),
     ],
 )
 def test_what_cannot_be_read_is_refused_in_a_line(text: str, said: str) -> None:

@@ -6,8 +6,9 @@ same words. ``parameters`` and ``validation`` are tables, as in a config.
 
 ``bouc-wen; bouc-wen + quadratic; maxwell-slip(thresholds=4) + creep`` are three models: of each the
 first word is the hysteresis operator, with its options in brackets; what follows after plus signs
-are terms of the nonlinearity, ``creep``, linear dynamics and noise, by the names that a config
-gives them. All else stays as the config has it, but for nonlinearity and creep, which are left out.
+are terms of the nonlinearity, ``creep``, linear dynamics, stages and noise, by the names that a
+config gives them, or by import paths. All else stays as the config has it, but for nonlinearity and
+creep, which are left out.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from bwbayes.app.config.keys import one_line, synonyms
 from bwbayes.app.config.settings import ModelConfig, RecordConfig, SamplingConfig
 from bwbayes.errors import InputError, suggestion
 from bwbayes.inference.noise import NOISES
-from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS
+from bwbayes.inference.state_space import Noise
+from bwbayes.model.registry import HYSTERESIS, OPTIONS, PARTS, build_part
 from bwbayes.model.spec import ModelSpec, StageSpec
 from bwbayes.record.record import Record
 
@@ -177,13 +179,17 @@ def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
             raise InputError(f"models: {name!r}: {key} is unknown; {suggestion(key, OPTIONS)}")
     words = [term.strip() for term in others]
     stages = [name for key in PARTS if key != "hysteresis" for name in PARTS[key]]
+    noises = {*NOISES}
     for word in words:
-        if word not in (*stages, *NOISES):
+        if ":" in word:
+            outside = build_part(f"models: {name!r}", word, {}, {})
+            (noises.add if isinstance(outside, Noise) else stages.append)(word)
+        elif word not in (*stages, *NOISES):
             hint = suggestion(word, [*stages, *NOISES])
             raise InputError(f"models: {name!r}: {word!r} is unknown; {hint}")
     core = StageSpec.of("hysteresis", operator, stated), StageSpec("dynamics", base.dynamics)
     spec = ModelSpec(core).with_stages(*(word for word in words if word in stages))
-    noise = " + ".join(word for word in words if word in NOISES)
+    noise = " + ".join(word for word in words if word in noises)
     # The course of the voltage and what was before are of the record, not of a model.
     kept = {"hold": base.hold, "history": base.history}
     return dict.fromkeys(OPTIONS) | spec.keys | kept | {"noise": noise or base.noise}
