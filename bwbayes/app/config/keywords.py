@@ -182,7 +182,7 @@ def _keys_of(name: str, base: ModelConfig) -> dict[str, Any]:
     noises = {*NOISES}
     for word in words:
         if ":" in word:
-            outside = build_part(f"models: {name!r}", word, {}, {})
+            outside: object = build_part(f"models: {name!r}", word, {}, {})
             (noises.add if isinstance(outside, Noise) else stages.append)(word)
         elif word not in (*stages, *NOISES):
             hint = suggestion(word, [*stages, *NOISES])
