@@ -34,7 +34,6 @@ from bwbayes.model.stage import (
     Side,
     Stage,
     Timing,
-    advance_stage,
     begin_stages,
     pass_stages,
 )
@@ -350,7 +349,7 @@ class Actuator:
         column: Values,
         inputs: Inputs,
         memories: tuple[FloatArray, ...],
-        advance: Advance = advance_stage,
+        advance: Advance | None = None,
     ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
         """Return what the stages before the hysteresis make of the voltage (samples,), V.
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -190,18 +191,7 @@ class Stage(ABC):
 Advance = Callable[
     [Stage, FloatArray, FloatArray, FloatArray, FloatArray | None], tuple[FloatArray, FloatArray]
 ]
-"""Runs a stage along values: :meth:`Stage.advance`, or the same compiled."""
-
-
-def advance_stage(
-    stage: Stage,
-    numbers: FloatArray,
-    memory: FloatArray,
-    values: FloatArray,
-    seen: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return what a stage's own :meth:`Stage.advance` does."""
-    return stage.advance(numbers, memory, values, seen)
+"""Runs a stage along values, as :meth:`Stage.advance` does."""
 
 
 def begin_stages(
@@ -275,15 +265,16 @@ def pass_stages(
     memories: Sequence[FloatArray],
     inputs: Inputs,
     timing: Timing,
-    advance: Advance = advance_stage,
+    advance: Advance | None = None,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
     """Let values (models, samples) pass stages in a row; return them, and the memories.
 
-    The ``inputs`` are those of the same samples.
+    The ``inputs`` are those of the same samples; ``advance`` replaces :meth:`Stage.advance`.
     """
     after = []
     for stage, memory in zip(stages, memories, strict=True):
         numbers = stage.numbers_at(column, timing, inputs)
-        values, reached = advance(stage, numbers, memory, values, stage.seen(inputs))
+        advance_stage = stage.advance if advance is None else partial(advance, stage)
+        values, reached = advance_stage(numbers, memory, values, stage.seen(inputs))
         after.append(reached)
     return values, tuple(after)
