@@ -1,6 +1,7 @@
 """Readings without noise, as a first try has them: a fit converges, and says what they lack."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,13 @@ def fitted(displacement: FloatArray, voltage: FloatArray = VOLTAGE) -> bw.Run:
     with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
         small.without_explanations(patch)
         warnings.simplefilter("ignore")
-        keys = {"dynamics": "none", "noise": "white", "search": "none", "ess": 200, "walkers": 20}
+        keys: dict[str, Any] = {
+            "dynamics": "none",
+            "noise": "white",
+            "search": "none",
+            "ess": 200,
+            "walkers": 20,
+        }
         return bw.fit(record, progress=False, **keys)
 
 
