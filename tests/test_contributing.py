@@ -7,31 +7,26 @@ import shutil
 import struct
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import emcee
 import numpy as np
 import pytest
 
 import bwbayes
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis import explanations
-from bwbayes.diagnosis.defects import DEFECTS, Defect
-from bwbayes.diagnosis.residual_analysis import ResidualAnalysis, Sighting
+from bwbayes.diagnosis.defects import DEFECTS
+from bwbayes.diagnosis.residual_analysis import ResidualAnalysis
 from bwbayes.inference import map_estimate
 from bwbayes.inference.compiled.walk import walk
-from bwbayes.inference.noise import DISCREPANCY_SD, DISCREPANCY_TIME, SENSOR_SD, DiscrepancyNoise
-from bwbayes.inference.state_space import Noise
-from bwbayes.inference.study import Stated
+from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.model.inputs import Inputs, Span
 from bwbayes.model.inverse import inverse
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.record.io import formats
-from bwbayes.record.io.series import Source, array_source
 from bwbayes.record.teststand import true_values
-from bwbayes.sampling.moves import IndependenceMove
 from tests.app import small
 from tests.diagnosis.plants import plant
 from tests.prediction.runs import problem_of
@@ -45,18 +40,16 @@ def example(name: str) -> str:
     return found[1]
 
 
+def names_of(name: str) -> dict[str, Any]:
+    """Return what an example defines, run as it stands."""
+    names: dict[str, Any] = {"__name__": __name__}
+    exec(example(name), names)
+    return names
+
+
 def test_the_noise_is_the_gaussian_that_it_says_it_is() -> None:
     """Alone and with another one, against the dense covariance."""
-    names = (dataclass, Noise, np, SENSOR_SD, DISCREPANCY_SD, DISCREPANCY_TIME)
-    known = dict(
-        zip(
-            ("dataclass", "Noise", "np", "SENSOR_SD", "DISCREPANCY_SD", "DISCREPANCY_TIME"),
-            names,
-            strict=True,
-        )
-    )
-    exec(example("my_noise.py"), known)
-    swinging = known["Swinging"](0.05)  # type: ignore[operator]
+    swinging = names_of("my_noise.py")["Swinging"](0.05)
     time = 0.05 * np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
     covariance = 4 * np.exp(-time / 0.3) * np.cos(time / 0.3) + 0.01 * np.eye(60)
     residual = np.random.default_rng(1).standard_normal(60)
@@ -77,12 +70,7 @@ def test_a_stage_of_ones_own_is_in_the_chain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By its import path: both engines have it, and a command undoes it."""
-    head = (
-        "import numpy as np\n"
-        "from bwbayes.model.declaration import Declaration, lognormal\n"
-        "from bwbayes.model.stage import Stage\n\n\n"
-    )
-    (tmp_path / "my_stage.py").write_text(head + example("my_stage.py"), encoding="utf-8")
+    (tmp_path / "my_stage.py").write_text(example("my_stage.py"), encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     spec = ModelSpec().with_stages("backlash", "my_stage:SoftMount")
     made = spec.actuator(1e-3, "first", Extent(Span(-50.0, 50.0), 1e-3, 1.0))
@@ -107,13 +95,7 @@ def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By its import path: along its first branch and the next, on both engines and back."""
-    head = (
-        "from dataclasses import dataclass\n"
-        "import numpy as np\n"
-        "from bwbayes.model.declaration import positive\n"
-        "from bwbayes.model.operators.extremum_memory import INITIAL, RemembersExtrema\n\n\n"
-    )
-    (tmp_path / "my_operator.py").write_text(head + example("my_operator.py"), encoding="utf-8")
+    (tmp_path / "my_operator.py").write_text(example("my_operator.py"), encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     spec = ModelSpec.from_keys({"hysteresis": "my_operator:TanhLoop", "dynamics": "none"})
     made = spec.actuator(1e-3, "first", Extent(Span(-50.0, 50.0), 1e-3, 1.0))
@@ -137,10 +119,7 @@ def test_an_operator_of_ones_own_is_simulated_fast_and_inverted(
 
 def test_a_format_of_ones_own_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the way of any file: by its content, with its units, and in one line where it is cut."""
-    names = {"Path": Path, "Source": Source, "array_source": array_source}
-    known: dict[str, Any] = {**names, "np": np, "struct": struct}
-    exec(example("my_reader.py"), known)
-    added = formats.Format(b"SCOPE1", ".scp", known["read_scope"])
+    added = formats.Format(b"SCOPE1", ".scp", names_of("my_reader.py")["read_scope"])
     monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, added))
     voltage = np.float32(40 * np.sin(np.arange(300) / 20))
     content = b"SCOPE1" + struct.pack("<d", 2e-3) + np.stack([voltage, 600 * voltage], 1).tobytes()
@@ -161,9 +140,8 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: float
 ) -> None:
     """Before a vibration of any frequency, which has more to pay for; not in a good record."""
-    known: dict[str, Any] = {"Defect": Defect, "Sighting": Sighting, "Stated": Stated, "np": np}
-    exec(example("my_defect.py"), known)
-    added = known["Swaying"]("swaying table", "oscillation", noise=True)
+    swaying_of = names_of("my_defect.py")["Swaying"]
+    added = swaying_of("swaying table", "oscillation", noise=True)
     tried = (DEFECTS["oscillation"], DEFECTS["drift"], added)
     monkeypatch.setattr(explanations, "ADDITIONS", [defect.explanations for defect in tried])
     monkeypatch.setattr(explanations, "CHANGES", ())
@@ -192,28 +170,18 @@ def test_a_sampler_of_ones_own_goes_on_where_a_run_ended(
     (tmp_path / "results").mkdir()
     (tmp_path / "results/my").symlink_to(small.finished(tmp_path_factory))
     monkeypatch.chdir(tmp_path)
-    known = {"bwbayes": bwbayes, "emcee": emcee, "IndependenceMove": IndependenceMove}
-    exec(example("sampler"), known)
-    sampler, end = known["sampler"], known["end"]
+    names = names_of("sampler")
+    sampler, end = names["sampler"], names["end"]
     fit = bwbayes.open_run("results/my")
     np.testing.assert_array_equal(end.coords, fit.chain.ends[0].coordinates)
     assert (20, *end.coords.shape) == sampler.get_chain().shape
     assert 0.1 < np.mean(sampler.acceptance_fraction)
 
 
-# The imports of the example of a product, and a second product, which falls short.
-IMPORTS = """
-from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar
-import numpy as np
-from bwbayes import InputError, Run
-from bwbayes.diagnosis.validation import ValidationSummary
-from bwbayes.errors import ExitStatus
-from bwbayes.report.report import Product, Report, Text, standing_banner
-from bwbayes.watching import WatchSteps, unwatched, watched
-"""
+# A second product, which falls short.
 SHORT = '''
+from bwbayes.errors import ExitStatus
+
 class Far(Reach):
     NAME = "very-far"
     shortfall = "it does not move far enough"
@@ -256,7 +224,7 @@ print(json.dumps((said, method)))
 def product(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[int, Any], tuple[Any, ...]]:
     """Return status and outputs of command lines with the example's product, and of its method."""
     folder = tmp_path_factory.mktemp("product")
-    (folder / "my_product.py").write_text(IMPORTS + example("my_product.py") + SHORT)
+    (folder / "my_product.py").write_text(example("my_product.py") + SHORT)
     shutil.copytree(small.finished(tmp_path_factory), folder / "my")
     shutil.copytree(folder / "my", folder / "failed")
     numbers = json.loads((folder / "failed/summary.json").read_text())

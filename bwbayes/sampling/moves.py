@@ -167,7 +167,7 @@ class Counted(moves.Move):  # type: ignore[misc]
 def pilot_moves(proposal: StudentMixture | None = None, ahead: int = 1) -> WeightedMoves:
     """Return moves and weights for the pilot: half of its steps use a first guess, if any."""
     share = 0.0 if proposal is None else 0.5
-    return _with_independence(share, proposal, ahead=ahead)
+    return _weighted_moves(share, proposal, ahead=ahead)
 
 
 def sampling_moves(
@@ -175,13 +175,16 @@ def sampling_moves(
 ) -> WeightedMoves:
     """Return moves and weights for the draws that count; without a proposal, those of the pilot."""
     share = 0.0 if proposal is None else 0.85
-    return _with_independence(share, proposal, tries, ahead)
+    return _weighted_moves(share, proposal, tries, ahead)
 
 
-def _with_independence(
+def _weighted_moves(
     share: float, proposal: StudentMixture | None, tries: int = 1, ahead: int = 1
 ) -> WeightedMoves:
-    """Return differential evolution and snooker, and a ``share`` of the independence move."""
+    """Return differential evolution and snooker, and a ``share`` of the independence move.
+
+    emcee divides the weights by their sum.
+    """
     weighted = {
         "differential evolution": (moves.DEMove(), 0.8 * (1 - share)),
         "snooker": (SnookerMove(), 0.2 * (1 - share)),
