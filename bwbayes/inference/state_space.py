@@ -53,6 +53,16 @@ class Filtered(NamedTuple):
     covariance: FloatArray
 
 
+def powers(matrices: FloatArray, readings: float | FloatArray) -> FloatArray:
+    """Return the transition over whole numbers of readings, of that over one.
+
+    ``matrices`` are (models, states, states); shapes as of :meth:`Noise.transition`.
+    """
+    if np.ndim(readings) == 0:
+        return np.asarray(np.linalg.matrix_power(matrices, round(float(readings))))
+    return np.stack([powers(matrices, number) for number in np.asarray(readings).tolist()], axis=1)
+
+
 @dataclass(frozen=True)
 class Noise(ABC):
     """A Gaussian model of the residual between a reading and the forward model.
@@ -104,7 +114,7 @@ class Noise(ABC):
 
     @abstractmethod
     def transition(self, theta: FloatArray, readings: float | FloatArray = 1.0) -> FloatArray:
-        """Return F, by which the states go on over so many intervals between readings.
+        """Return F, by which the states go on over so many intervals, a whole number.
 
         (models, states, states) over one number of them, (models, numbers, states, states) over
         some (numbers,).

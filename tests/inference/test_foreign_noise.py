@@ -27,7 +27,7 @@ from bwbayes.inference.noise import (
     noise_model,
 )
 from bwbayes.inference.readings import Readings
-from bwbayes.inference.state_space import LOG_TWO_PI, Noise, root
+from bwbayes.inference.state_space import LOG_TWO_PI, Noise, powers, root
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Declaration, Distribution
 from tests.inference.problems import INTERVAL, decaying_sine, posterior_of, ring_bender
@@ -66,12 +66,7 @@ class Autoregressive(Noise):
         """Return a power of the companion matrix."""
         matrices = np.zeros((len(theta), 2, 2))
         matrices[:, 0], matrices[:, 1, 0] = theta[:, 2:4], 1.0
-        if np.ndim(readings) == 0:
-            power: FloatArray = np.linalg.matrix_power(matrices, round(float(readings)))
-            return power
-        numbers = np.atleast_1d(readings).tolist()
-        powers = [np.linalg.matrix_power(matrices, round(number)) for number in numbers]
-        return np.asarray(np.stack(powers, axis=1))
+        return powers(matrices, readings)
 
 
 @dataclass(frozen=True)

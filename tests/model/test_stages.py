@@ -198,6 +198,7 @@ def looped(name: str, x: FloatArray, hold: Hold) -> FloatArray:
     }
     if name in of_name:
         return np.asarray(of_name[name])
+    assert name.endswith("-lag"), f"write the equation of the stage {name} here"
     # A lag, four hundred steps between each two samples; of a held command the mean in between.
     lag, fine = v[name.replace("-", "_")], 400
     held = hold == "zero" and name == "amplifier-lag"
