@@ -204,6 +204,9 @@ class Study:
             )
             for name, training in self.records.items()
         ]
+        for dataset in datasets:
+            for stage in dataset.actuator.stages:
+                stage.seen(dataset.inputs)  # refuses a missing covariate before any fit
         first = datasets[0]
         table = ParameterTable(
             first.actuator, first.noise, tuple(self.records), self.per_record, self.shared

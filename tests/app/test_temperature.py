@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,7 @@ from bwbayes.app.running.explaining import search_stages
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate
 from bwbayes.model.actuator import Actuator
+from bwbayes.model.stages.gain import MovingGain
 from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.io.binary import record_arrays
@@ -155,10 +156,17 @@ def test_a_config_names_the_column_of_a_covariate(said: str, shift: float, tmp_p
     assert fixed["temperature_reference"] == pytest.approx(22.5 + shift)
 
 
-def test_a_model_that_needs_a_covariate_is_refused_without(tmp_path: Path) -> None:
+class Dilated(MovingGain):
+    """A gain that follows another covariate, whatever the range of that."""
+
+    sees: ClassVar = "humidity_percent"
+
+
+@pytest.mark.parametrize("stage", ["temperature", "tests.app.test_temperature:Dilated"])
+def test_a_model_that_needs_a_covariate_is_refused_without(tmp_path: Path, stage: str) -> None:
     bare = replace(TRAINED, covariates={})
-    config, records = config_of(bare, {"stages": ["temperature"]})
-    with pytest.raises(bw.InputError, match=r"temperature_degC: .*; name its column in covariates"):
+    config, records = config_of(bare, {"stages": [stage]})
+    with pytest.raises(bw.InputError, match=r"^\w+: .*, and name its column in covariates"):
         resolve_config(config, tmp_path, records)
 
 
