@@ -324,7 +324,8 @@ class Exported(Product):
     @property
     def shortfall(self) -> str:
         """Why it has no inverse; empty if it has one."""
-        return f"no inverse in it: {self.without_inverse}" if self.without_inverse else ""
+        reason = (self.without_inverse or "").removeprefix("inverse: ")
+        return f"no inverse in it: {reason}" if reason else ""
 
     def report(self) -> Report:
         """Return the parts, for a page: the files are all there is to see on a screen."""
