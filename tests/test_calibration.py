@@ -25,8 +25,9 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import load, parse
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.calibration.evaluation import LIMIT, Calibration, evaluate_calibration
 from bwbayes.calibration.replicates import CalibrationSetup, Replicate
@@ -51,7 +52,7 @@ FEW = 7
 FULL = 500
 
 
-def problem(fixed: tuple[str, ...] = (), **priors: str) -> Problem:
+def problem(fixed: tuple[str, ...] = (), **priors: str) -> Run:
     config = load(CONFIG)
     medians = {"d": 0.7, "alpha": 0.35, "beta": 0.03, "gamma": 0.0, "lag": 0.03, "offset": 0.0}
     lines = [f"{name} = {{ fixed = {medians[name]} }}" for name in fixed]

@@ -31,7 +31,7 @@ from scipy import stats
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.replicates import CalibrationSetup, Replicate
 from bwbayes.inference.noise import DiscrepancyNoise

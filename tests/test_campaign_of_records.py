@@ -15,7 +15,8 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.chain import draws
@@ -30,7 +31,7 @@ SAMPLE_RATE = 250.0
 JUDGED = ("d", "alpha", "beta", "gamma", "damping", "creep_1", "creep_2", "creep_3")
 
 
-def campaign(seed: int) -> Problem:
+def campaign(seed: int) -> Run:
     """Return the campaign with other noise, and fewer samples."""
     config = load(RUNS / "ring_bender_campaign.toml")
     changes = {
@@ -41,10 +42,10 @@ def campaign(seed: int) -> Problem:
     return resolve_config(config.model_copy(update=changes), RUNS)
 
 
-def intervals(problem: Problem, posterior: Posterior) -> dict[str, FloatArray]:
+def intervals(problem: Run, posterior: Posterior) -> dict[str, FloatArray]:
     """Return the 95% interval of each judged parameter."""
     plan = replace(problem.plan, walkers=max(64, 2 * posterior.prior.dimensions + 6))
-    outcome, chain = sampled(replace(problem, posterior=posterior, plan=plan))
+    outcome, chain = sampled(posterior, plan, problem.study.seed)
     assert outcome.converged
     flat = draws(posterior, chain).reshape(-1, posterior.prior.dimensions)
     return {
@@ -62,8 +63,8 @@ def test_joint_intervals_cover_the_truth_and_are_narrower_than_from_the_loops_al
     narrower: dict[str, list[float]] = {name: [] for name in JUDGED}
     for seed in range(1, SEEDS + 1):
         problem = campaign(seed)
-        both = intervals(problem, problem.posterior)
-        loops = intervals(problem, problem.posterior.for_record("loops"))
+        both = intervals(problem, problem.study.posterior)
+        loops = intervals(problem, problem.study.posterior.for_record("loops"))
         for name in JUDGED:
             low, high = both[name]
             covered[name].append(bool(low <= problem.config.truth[name] <= high))

@@ -18,7 +18,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import parse
 from bwbayes.app.jobs.campaign import config_text, resume, start
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from tests.app import small
 from tests.app.specimens import CONFIG, specimens
 from tests.measured import keep
@@ -101,7 +101,9 @@ def written(folder: Path) -> None:
     for number, (name, values) in enumerate(truths().items()):
         lines = "".join(f"{key} = {value!r}\n" for key, value in values.items())
         text = STAND.format(seed=number + 1) + lines
-        bw.write_record(resolve_config(parse(text, name), Path()).record, folder / f"{name}.csv")
+        bw.write_record(
+            resolve_config(parse(text, name), Path()).study.record, folder / f"{name}.csv"
+        )
     for name, content in MALFORMED.items():
         (folder / f"bad_{name}.csv").write_text(content)
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import bwbayes as bw
-from bwbayes.app.problem.records import generator
 from bwbayes.control.loop import Stand
 from bwbayes.control.tracking import Tracking, track
+from bwbayes.inference.study import generator
 from bwbayes.model.inputs import Span
 from bwbayes.record.teststand import PROCESS_SD, PROCESS_TIME
 from tests.control import cases
@@ -43,11 +43,11 @@ def fitted(seed: int) -> bw.Run:
 
 def on_the_stand(fit: bw.Run) -> Tracking:
     """Return how well the true actuator follows, in as many runs as there were draws."""
-    one = fit.problem.posterior.single_record
+    one = fit.study.posterior.single_record
     stand = bw.VirtualTestStand()
     known = stand.parameters()
     truth = np.array([[known[name] for name in one.actuator.parameters]])
-    every = fit.problem.posterior.prior.theta(fit.result.flat_draws[:1000])
+    every = fit.study.posterior.prior.theta(fit.result.flat_draws[:1000])
     return track(
         stand.actuator,
         np.tile(truth, (DRAWS, 1)),

@@ -29,7 +29,7 @@ from bwbayes.record.io import formats
 from bwbayes.record.teststand import true_values
 from tests.app import small
 from tests.diagnosis.plants import plant
-from tests.prediction.runs import problem_of
+from tests.prediction.runs import study_of
 
 TEXT = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
@@ -149,12 +149,10 @@ def test_a_defect_of_ones_own_is_named_where_it_is(
     assert record.displacement is not None
     swaying = record.displacement + size * np.sin(2 * np.pi * 2.7 * record.time)
     bwbayes.write_record(replace(record, displacement=swaying), tmp_path / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(1)
-    optima = map_estimate.fit(problem.posterior, rng).optima
-    ranked = explanations.explain(
-        ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
-    )
+    optima = map_estimate.fit(study.posterior, rng).optima
+    ranked = explanations.explain(ResidualAnalysis.of(study.posterior, optima, rng, study))
     causes = explanations.likely_causes(ranked)
     if size:
         assert (causes[0].kind, ranked[0].kind) == ("swaying table", "swaying table")

@@ -16,8 +16,8 @@ import pytest
 from scipy import stats
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.predictions import predictions
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
 from bwbayes.sampling.chain import draws
@@ -45,11 +45,12 @@ def replicate(seed: int, discrepancy: str) -> Replicate:
     )
     config = parse(re.sub(r"ess = \d+", "ess = 500", text), "coverage")
     problem = resolve_config(config.model_copy(update={"seed": seed}), CONFIG.parent)
-    posterior = problem.posterior
-    outcome, chain = sampled(problem)
+    posterior = problem.study.posterior
+    outcome, chain = sampled(posterior, problem.plan, seed)
     assert outcome.converged, outcome.stop_reason
     kept = draws(posterior, chain)
-    bands = predictions(problem, kept.reshape(-1, kept.shape[-1]), no_rivals)[-1]
+    run = problem.with_cache(flat_draws=kept.reshape(-1, kept.shape[-1]), widening_rivals=no_rivals)
+    bands = predictions(run)[-1]
     # A stand without discrepancy has none to cover: its sd and time are no truths.
     truth = problem.config.truth
     ranks = [np.mean(kept[..., i] < truth[n]) for i, n in enumerate(posterior.names) if n in truth]

@@ -13,7 +13,7 @@ import pytest
 
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from tests.app import small
 from tests.examples import (
     LEAVES,
@@ -111,7 +111,7 @@ CONFIGS = [text for page in (README, *guides().values()) for text in blocks("tom
 
 @pytest.mark.parametrize("text", CONFIGS)
 def test_a_config_is_understood(text: str, empty: Path) -> None:
-    assert resolve_config(load(Path(written(text, empty))), empty).posterior.prior.dimensions
+    assert resolve_config(load(Path(written(text, empty))), empty).study.posterior.prior.dimensions
 
 
 @pytest.mark.slow

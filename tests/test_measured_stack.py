@@ -15,9 +15,9 @@ from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, thin_draws
 from bwbayes.record import Record, read_record
 from tests.app import small
@@ -90,9 +90,8 @@ def test_the_95_percent_sensor_band_is_right_and_narrow(honest: Any, folder: Pat
     held_out = honest["validation"]["held_out"]
     fit = open_finished(RunFolder.open(folder))
     flat = fit.result.flat_draws
-    sets = [
-        predictions(fit.problem, flat[i::8], fit.widening_rivals, training=False) for i in range(8)
-    ]
+    runs = [fit.with_cache(flat_draws=flat[i::8]) for i in range(8)]
+    sets = [predictions(run, training=False) for run in runs]
     covered = [np.mean(bands.covers("sensor", 95, np.asarray(bands.measured))) for (bands,) in sets]
     error = held_out["coverage_error"]["sensor"]["95"]
     assert abs(float(np.mean(covered)) - 0.95) <= 2 * error
@@ -143,7 +142,7 @@ def voltages_missed(folder: Path) -> dict[float, tuple[float, float]]:
     some samples makes much of a sensor's noise.
     """
     fit = bw.open_run(folder)
-    record, posterior = fit.problem.record, fit.problem.posterior
+    record, posterior = fit.study.record, fit.study.posterior
     model = posterior.single_record.table.actuator(
         posterior.prior.theta(fit.result.flat_draws)
     ).mean(axis=0)
@@ -192,7 +191,7 @@ def fitted(folder: Path, honest: Any) -> tuple[Posterior, FloatArray]:
     """Return the posterior of 25 to 36 s and draws of it."""
     assert honest["converged"]
     fit = open_finished(RunFolder.open(folder))
-    return fit.problem.posterior, thin_draws(fit.flat_draws, np.random.default_rng(1))
+    return fit.study.posterior, thin_draws(fit.flat_draws, np.random.default_rng(1))
 
 
 def cut(record: Record, number: int, transient: float = 0.0) -> Record:
@@ -255,7 +254,7 @@ def test_records_cut_out_in_motion_are_predicted_as_promised_with_parts(
     fit = open_finished(RunFolder.open(parts_folder))
     # So many draws are enough: most of their band is the discrepancy.
     chosen = thin_draws(fit.flat_draws, np.random.default_rng(1), 250)
-    usual, knocked = on_cuts(fit.problem.posterior, chosen)
+    usual, knocked = on_cuts(fit.study.posterior, chosen)
     plain, _ = plain_on_cuts
     assert 0.88 <= usual[0] <= 0.99
     assert usual[1] < plain[1]

@@ -19,9 +19,9 @@ from rich.console import Console
 
 import bwbayes
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, select
 from bwbayes.control.exported import exported
 from bwbayes.errors import InputError
@@ -228,7 +228,7 @@ def test_an_operator_from_outside_goes_all_the_way(
 def test_both_engines_give_one_log_density(kind: str, tmp_path: Path) -> None:
     """Of a problem whose truth may be stated in the operator's own parameters."""
     stated = config(tmp_path, kind).model_copy(update={"truth": TRUTH[kind]})
-    posterior = resolve_config(stated, tmp_path).posterior
+    posterior = resolve_config(stated, tmp_path).study.posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     one = replace(posterior, engine="numpy").log_likelihood(theta)
     other = replace(posterior, engine="numba").log_likelihood(theta)

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 
 import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.design import RivalDesign, RivalScore
 from bwbayes.diagnosis.validation import ValidationSummary
@@ -230,11 +230,11 @@ def test_a_loop_without_time_is_rate_independent_and_says_so() -> None:
         record = Record.from_arrays(h, b, interval=interval, **stated)
         config, records = config_of(record, keys, "fit")
         problem = resolve_config(config, Path(), records)
-        names = {parameter.name for parameter in problem.parameters}
+        names = {parameter.name for parameter in problem.study.parameters}
         timed = {"lag", "sensor_lag", "discrepancy_time"} & names
         assert "backlash" in names
         assert bool(timed) == (interval is not None)
-        said = any("rate independent" in remark for remark in problem.remarks)
+        said = any("rate independent" in remark for remark in problem.record_remarks)
         assert said == (interval is None)
 
 

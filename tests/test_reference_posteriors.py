@@ -21,11 +21,14 @@ import pytest
 
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.posterior import Posterior
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.diagnostics import SamplingResult
+from bwbayes.sampling.plan import SamplingPlan
 from tests.reference.make import digest, from_cube
 from tests.reference.plain import FOLDER, MEASURED, Case, load_case, log_likelihood, log_prior
 from tests.sampled import sampled
@@ -45,7 +48,7 @@ absent = pytest.mark.skipif(
 class Reference:
     """A case twice, as the package and as the plain code read it, and what dynesty found."""
 
-    problem: Problem
+    problem: Run
     case: Case
     result: Mapping[str, Any]
 
@@ -78,17 +81,18 @@ def reference(
 @pytest.fixture(scope="module")
 def drawn_by_a_run(reference: Reference) -> FloatArray:
     """Draws of the case by the normal path, (draws, free)."""
-    outcome, result = run(reference.problem)
+    study = reference.problem.study
+    outcome, result = run(study.posterior, reference.problem.plan, study.seed)
     check = outcome.check
     assert outcome.converged, outcome.stop_reason
     assert min(check.ess_bulk.min(), check.ess_tail.min()) >= ESS
     return result
 
 
-def run(problem: Problem) -> tuple[SamplingResult, FloatArray]:
-    """Sample a problem as a run does; draws (draws, free)."""
-    outcome, chain = sampled(problem)
-    return outcome, draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+def run(posterior: Posterior, plan: SamplingPlan, seed: int) -> tuple[SamplingResult, FloatArray]:
+    """Sample a posterior as a run does; draws (draws, free)."""
+    outcome, chain = sampled(posterior, plan, seed)
+    return outcome, draws(posterior, chain).reshape(-1, len(posterior.names))
 
 
 def deviations(
@@ -116,7 +120,7 @@ def drawn(case: Case, size: int) -> list[dict[str, float]]:
 
 
 def test_both_read_the_same_case(reference: Reference) -> None:
-    posterior, case = reference.problem.posterior, reference.case
+    posterior, case = reference.problem.study.posterior, reference.case
     assert case.names == posterior.prior.names
     assert case.training == posterior.single_record.training
     assert case.hold == posterior.single_record.actuator.hold
@@ -131,7 +135,7 @@ def test_the_reference_is_of_this_case(reference: Reference) -> None:
 
 
 def test_the_likelihood_is_the_plain_one(reference: Reference) -> None:
-    posterior, case = reference.problem.posterior, reference.case
+    posterior, case = reference.problem.study.posterior, reference.case
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 40))
     rows = [dict(zip(case.names, row, strict=True)) for row in theta.tolist()]
     expected = np.array([log_likelihood(case, row) for row in rows])
@@ -140,7 +144,7 @@ def test_the_likelihood_is_the_plain_one(reference: Reference) -> None:
 
 def test_the_prior_is_the_plain_one(reference: Reference) -> None:
     """But for a constant; and zero at the same places."""
-    prior, case = reference.problem.posterior.prior, reference.case
+    prior, case = reference.problem.study.posterior.prior, reference.case
     rows = drawn(case, 100)
     expected = np.array([log_prior(case, row) for row in rows])
     got = prior.log_density(np.array([[row[name] for name in case.free] for row in rows]))
@@ -168,14 +172,10 @@ def test_twin_draws_that_are_too_narrow_are_found(
 
 def test_twin_noise_with_a_wrong_correlation_is_found(reference: Reference) -> None:
     """Its correlation decays as if the samples were half as far apart again."""
-    problem = reference.problem
     wrong = WrongCorrelation(reference.case.interval, 1.5)
-    planted = replace(
-        problem,
-        posterior=problem.posterior.altered(noise=wrong),
-        plan=replace(problem.plan, ess=1000.0, walkers=24),
-    )
-    outcome, got = run(planted)
+    planted = reference.problem.study.posterior.altered(noise=wrong)
+    plan = replace(reference.problem.plan, ess=1000.0, walkers=24)
+    outcome, got = run(planted, plan, reference.problem.study.seed)
     assert outcome.converged, outcome.stop_reason
     off = deviations(reference.result, reference.case.free, got)
     assert max(off.values()) > 2, off

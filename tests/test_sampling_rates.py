@@ -19,13 +19,13 @@ import scipy
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import LEVELS
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, covered, study_of, weighted_draws
 from tests.stand import play
 
 RATE, SECONDS = 5000.0, 4.0
@@ -92,21 +92,21 @@ def answer(fitted: Record, other: Record, every: int, noise: str, folder: Path) 
     reading[np.arange(reading.size) % every != 0] = np.nan
     write_record(replace(fitted, displacement=reading), folder / "record.h5")
     lines = '[record]\nfile = "record.h5"\ntrain = [[0.0, 4.0]]\nfrom_rest = true\n'
-    problem = problem_of(f'{lines}[model]\nnoise = "{noise}"\n', folder)
+    study = study_of(f'{lines}[model]\nnoise = "{noise}"\n', folder)
     source = np.random.default_rng([82, every])
-    draws, weights = weighted_draws(problem.posterior, source)
+    draws, weights = weighted_draws(study.posterior, source)
     chosen = draws[source.choice(len(draws), KEPT, p=weights)]
     start = InitialConditions(from_rest=True, estimate_offset=False)
-    bands = predict_record(problem.posterior, chosen, other, start, source)
+    bands = predict_record(study.posterior, chosen, other, start, source)
     assert bands.measured is not None
-    columns = [problem.posterior.names.index(name) for name in SHAPE]
+    columns = [study.posterior.names.index(name) for name in SHAPE]
     mean = weights @ draws[:, columns]
     sd = np.sqrt(weights @ (draws[:, columns] - mean) ** 2)
-    sensor = float(weights @ draws[:, problem.posterior.names.index("sensor_sd")])
+    sensor = float(weights @ draws[:, study.posterior.names.index("sensor_sd")])
     error = float(np.sqrt(np.mean((bands.measured - bands.mean) ** 2)))
     coverage = {level: covered(bands, level) for level in LEVELS}
     width = float(np.mean(bands.upper["sensor", 95] - bands.lower["sensor", 95]))
-    return Answer(problem.config.model.noise, mean, sd, sensor, error, coverage, width)
+    return Answer(study.spec.noise, mean, sd, sensor, error, coverage, width)
 
 
 def judged(seeds: Iterable[int], noise: str, folder: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from scipy import stats
 from bwbayes.prediction.bands import Bands
 from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.prediction.runs import Judged, judge, problem_of
+from tests.prediction.runs import Judged, judge, study_of
 from tests.stand import Stand
 
 RATE = 100.0
@@ -47,7 +47,7 @@ def told(record: Record, folder: Path, model: str = "") -> Judged:
     write_record(record, folder / "record.h5")
     text = '[record]\nfile = "record.h5"\ntrain = [[0.0, 12.0]]\n[validation.rest]\n'
     text += f"window = [12.0, 16.0]\n{model}"
-    return judge(problem_of(text, folder), np.random.default_rng(4), again=False)
+    return judge(study_of(text, folder), np.random.default_rng(4), again=False)
 
 
 def width(bands: Bands) -> float:
@@ -66,11 +66,8 @@ def test_spikes_are_set_aside_and_the_bands_stay_as_wide(tmp_path: Path, seed: i
         told(record, tmp_path),
     )
     assert (
-        rows
-        == np.flatnonzero(np.isnan(aside.problem.posterior.single_record.displacement)).tolist()
+        rows == np.flatnonzero(np.isnan(aside.study.posterior.single_record.displacement)).tolist()
     )
-    (remark,) = (line for line in aside.problem.remarks if "set aside" in line)
-    assert remark.startswith("10 readings set aside as isolated outliers, at ")
     assert width(aside.bands["rest"]) == pytest.approx(width(clean.bands["rest"]), rel=0.1)
     assert aside.validation["training"].passed is not False
     # The twin: left in, they widen the bands, and the verdict says why.
@@ -95,7 +92,7 @@ def test_intervals_cover_with_spikes_set_aside(tmp_path: Path) -> None:
         record, rows = spiky(measured(seed), seed)
         clean, aside = told(measured(seed), tmp_path), told(record, tmp_path, ASIDE)
         gone = set(
-            np.flatnonzero(np.isnan(aside.problem.posterior.single_record.displacement)).tolist()
+            np.flatnonzero(np.isnan(aside.study.posterior.single_record.displacement)).tolist()
         )
         outcome, false = outcome + len(gone & set(rows)), false + len(gone - set(rows))
         ratios.append(width(aside.bands["rest"]) / width(clean.bands["rest"]))

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import write_record
 from bwbayes.sampling.chain import draws
 from tests.measured import keep
@@ -29,7 +30,7 @@ PHYSICAL = ("d", "alpha", "beta", "gamma", "initial", "lag", "offset", "sensor_s
 RECORDS = 40
 
 
-def steady_sine(seed: int, folder: Path) -> Problem:
+def steady_sine(seed: int, folder: Path) -> Run:
     voltage = 150 * np.sin(2 * np.pi * np.arange(3 * RATE) / RATE)
     record = STAND.measure(voltage, np.random.default_rng([7, seed]), offset=0.0)
     path = folder / f"sine_{seed}.csv"
@@ -41,7 +42,8 @@ def steady_sine(seed: int, folder: Path) -> Problem:
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_steady_sine_converges_within_hundreds_of_steps(seed: int, tmp_path: Path) -> None:
     """Pilot and all. Two of four ensembles in the hopeless mode took 3,000 for the pilot alone."""
-    outcome, chain = sampled(steady_sine(seed, tmp_path), workers=2)
+    problem = steady_sine(seed, tmp_path)
+    outcome, chain = sampled(problem.study.posterior, problem.plan, seed, workers=2)
     assert outcome.converged, outcome.stop_reason
     assert chain.steps("pilot") + chain.steps("sampling") <= 1200
 
@@ -58,13 +60,15 @@ def test_forty_steady_sines_converge_and_their_intervals_cover(tmp_path: Path) -
     for seed in range(RECORDS):
         problem = steady_sine(seed, tmp_path)
         begun = time.monotonic()
-        outcome, chain = sampled(problem, workers=2)
+        outcome, chain = sampled(problem.study.posterior, problem.plan, seed, workers=2)
         seconds.append(time.monotonic() - begun)
         steps.append(chain.steps("pilot") + chain.steps("sampling"))
         assert outcome.converged, (seed, outcome.stop_reason)
-        every = draws(problem.posterior, chain).reshape(-1, len(problem.posterior.names))
+        every = draws(problem.study.posterior, chain).reshape(
+            -1, len(problem.study.posterior.names)
+        )
         for i, name in enumerate(PHYSICAL):
-            below = np.mean(every[:, problem.posterior.names.index(name)] < TRUTH[name])
+            below = np.mean(every[:, problem.study.posterior.names.index(name)] < TRUTH[name])
             both[:, seed, i] = abs(below - 0.5) < np.array([0.475, 0.25])
     covers = [dict(zip(PHYSICAL, x.sum(axis=0).astype(int).tolist(), strict=True)) for x in both]
     keep(

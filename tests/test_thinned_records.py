@@ -36,7 +36,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.prediction import predict_windows
 from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, covered, study_of, weighted_draws
 from tests.stand import Stand
 
 SEEDS = 20
@@ -109,15 +109,15 @@ def answer(
     end = float(record.time[-1] + record.interval)
     text = f'[record]\nfile = "record.h5"\ntrain = [[0.0, {stop}]]\n{lines}\n'
     text += f"[validation.rest]\nwindow = [{stop}, {end}]\n"
-    problem, source = problem_of(text, folder), np.random.default_rng([32, seed])
-    draws, weights = weighted_draws(problem.posterior, source)
-    window = problem.validations["rest"].windows
+    study, source = study_of(text, folder), np.random.default_rng([32, seed])
+    draws, weights = weighted_draws(study.posterior, source)
+    window = study.validations["rest"].windows
     assert window is not None
     chosen = draws[source.choice(len(draws), KEPT, p=weights)]
-    (bands,) = predict_windows(problem.posterior, chosen, problem.record, {"rest": window}, source)
+    (bands,) = predict_windows(study.posterior, chosen, study.record, {"rest": window}, source)
     return {
         name: middle(column if name in PLAIN else np.log(column), weights)
-        for name, column in zip(problem.posterior.names, draws.T, strict=True)
+        for name, column in zip(study.posterior.names, draws.T, strict=True)
     }, {level: covered(bands, level) for level in (50, 90, 95)}
 
 

@@ -14,13 +14,13 @@ import pytest
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.study import InitialConditions
 from bwbayes.inference.voltage_noise import path_covariance, widen_draws
 from bwbayes.model.actuator import Actuator
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.measured import keep
-from tests.prediction.runs import KEPT, covered, problem_of, weighted_draws
+from tests.prediction.runs import KEPT, covered, study_of, weighted_draws
 from tests.record.drives import DRIVES, drive
 
 TRUTH = {"d": 0.12, "alpha": 0.04, "beta": 0.028, "gamma": 0.009, "exponent": 1.0, "lag": 0.003}
@@ -73,12 +73,12 @@ def noisy(record: Record, part: float, seed: int) -> Record:
 def answer(fitted: Record, other: Record, folder: Path) -> Answer:
     """Fit a record as a run does it, and predict the other one."""
     write_record(fitted, folder / "record.h5")
-    problem = problem_of(CONFIG, folder)
-    posterior, source = problem.posterior, np.random.default_rng(5)
+    study = study_of(CONFIG, folder)
+    posterior, source = study.posterior, np.random.default_rng(5)
     point = pointfit.fit(posterior, source)
     draws, weights = weighted_draws(posterior, source, point)
     draws = draws[source.choice(len(draws), 8 * KEPT, p=weights)]
-    more = path_covariance(posterior, {"record": problem.record.path}, point, source)
+    more = path_covariance(posterior, {"record": study.record.path}, point, source)
     wide = widen_draws(posterior.prior.unconstrain(draws), point.covariance, more)
     draws, _ = posterior.prior.constrain(wide)
     shape = draws[:, [posterior.names.index(name) for name in SHAPE]]

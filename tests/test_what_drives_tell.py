@@ -44,7 +44,7 @@ def fitted(record: Record, **model: Any) -> tuple[bw.Run, float, float]:
     fit = bw.fit(record, dynamics="lag", search="none", progress=False, **model)
     seconds = time.process_time() - begun
     assert fit.converged, fit.outcome.stop_reason
-    plan = fit.problem.plan
+    plan = fit.plan
     steps = sum(fit.chain.steps(phase) for phase in ("pilot", "tuning", "sampling"))
     count = steps * plan.walkers * plan.ensembles * plan.tries
     return fit, seconds, count / fit.outcome.check.lowest_ess

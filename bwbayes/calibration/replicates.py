@@ -32,9 +32,10 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.state_space import Noise
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import rate
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
+from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.prediction.prediction import predict_record, predict_windows, thin_draws
 from bwbayes.record.record import Record, Window
 from bwbayes.sampling.chain import draws

@@ -34,9 +34,9 @@ from bwbayes.inference.likelihood import batches
 from bwbayes.inference.linearization import value_and_jacobian
 from bwbayes.inference.mode_finding import Target
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.study import Study
+from bwbayes.inference.study import InitialConditions, Study
 from bwbayes.model.inputs import Limits
-from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
+from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
     Banner,

@@ -34,15 +34,12 @@ from bwbayes.control.references import Reference
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus, InputError, suggestion
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import HOLD_NAMES, Hold, Limits
 from bwbayes.model.inverse import inverse
 from bwbayes.prediction.bands import KINDS, LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import (
-    InitialConditions,
-    InitialStates,
-    estimate_initial_states,
-)
+from bwbayes.prediction.initial_state import InitialStates, estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.io.grid import clock

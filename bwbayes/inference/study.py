@@ -1,8 +1,9 @@
-"""A study: a model, the records to fit, and statements about its parameters.
+"""A study: a model, its records, and statements about its parameters.
 
-A :class:`Study` makes the posterior. Statements about parameters (priors, values, bounds, names)
-come before the declarations of the model's parts. The same study with another model keeps the
-statements about parameters that both have.
+A :class:`Study` makes the posterior of the records that are fitted, and knows what is held out.
+Statements about parameters (priors, values, bounds, names) come before the declarations of the
+model's parts. The same study with another model keeps the statements about parameters that both
+have.
 """
 
 from __future__ import annotations
@@ -28,12 +29,16 @@ from bwbayes.inference.parameters import JointPrior, Parameter
 from bwbayes.inference.posterior import Dataset, Posterior
 from bwbayes.model.actuator import OFFSET
 from bwbayes.model.declaration import Context, Declaration, Distribution, Ranges
-from bwbayes.model.inputs import Span
+from bwbayes.model.inputs import Hold, Span
 from bwbayes.model.registry import PARTS
 from bwbayes.model.spec import Extent, ModelSpec
 from bwbayes.quantities import Quantities
 from bwbayes.record import Record
+from bwbayes.record.instruments import EXACT, Scales
+from bwbayes.record.record import Window
 from bwbayes.shown import brief
+
+type Slices = tuple[slice, ...]
 
 
 @dataclass(frozen=True)
@@ -59,32 +64,117 @@ class Stated:
             keys["prior"] = {"distribution": self.prior.name, **self.prior.arguments}
         return keys
 
+    @classmethod
+    def of(cls, parameter: Parameter, quantities: Quantities) -> Self:
+        """State all of a parameter in explicit numbers, in the quantities' units."""
+        return cls(
+            parameter.prior,
+            parameter.fixed,
+            parameter.lower if np.isfinite(parameter.lower) else None,
+            parameter.upper if np.isfinite(parameter.upper) else None,
+            quantities.say(parameter.unit),
+            parameter.label,
+            parameter.description,
+        )
+
 
 @dataclass(frozen=True)
-class TrainingRecord:
-    """A record that is fitted, the windows of it (slices), and whether it starts from rest."""
+class InitialConditions:
+    """Initial conditions of another record.
+
+    Parameters
+    ----------
+    from_rest
+        The actuator starts demagnetized and at rest: the voltage came from zero volts. Otherwise
+        h is a state that an earlier drive within the voltage range could have left, and the
+        dynamics may be moving.
+    estimate_offset
+        The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
+        the training record, as it is for a planned voltage without a measurement.
+    lead_in
+        Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
+        the discrepancy at most: after these the offset hardly widens the bands.
+    lead_in_start
+        Time at which it begins, s; by default that of the record's first sample. Samples before it
+        are simulated.
+    hold
+        How the voltage goes between samples; by default as the record says.
+    after
+        Everything after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
+        readings leave it.
+    settled
+        Without a lead-in: the actuator has waited at the first voltage until it stood still, with
+        whatever earlier drives have left of hysteresis and creep, and displacements count from
+        where it stands.
+    """
 
     __repr__ = brief
 
-    record: Record
-    windows: tuple[slice, ...]
     from_rest: bool = False
+    estimate_offset: bool = True
+    lead_in: float | None = None
+    lead_in_start: float | None = None
+    hold: Hold | None = None
+    after: bool = False
+    settled: bool = False
 
-    @property
-    def displacement(self) -> FloatArray:
-        """The displacement (samples,), um, of a record that has one."""
-        assert self.record.displacement is not None
-        return self.record.displacement
+    def window(self, record: Record, memory: float = np.inf) -> slice | None:
+        """Return the samples of the lead-in, or None if nothing can be learned from one.
 
-    @cached_property
-    def ranges(self) -> Ranges:
-        """Ranges in its windows, which default priors may depend on."""
-        return ranges_of(self.record.inputs, self.displacement, self.windows)
+        ``memory`` is the discrepancy's correlation time, s.
+
+        Raises
+        ------
+        InputError
+            It reaches outside the record, leaves nothing of it, or holds no reading; a forecast of
+            a record without any.
+        """
+        if self.after and record.displacement is None:
+            raise InputError(
+                f"{record.origin}: has no readings after which a forecast could start; give a "
+                "record with a measured lead-in, or leave the forecast out"
+            )
+        if record.displacement is None:
+            return None
+        if self.from_rest and not self.estimate_offset and not self.after:
+            return None
+        begin = record.start if self.lead_in_start is None else self.lead_in_start
+        first = round((begin - record.start) / record.interval)
+        # White noise forgets at once: then a hundred readings tell the offset.
+        longest = max(10 * memory, 100 * record.interval)
+        length = self.lead_in or min(0.25 * (record.samples - first) * record.interval, longest)
+        last = first + round(length / record.interval)
+        lead_in = f"a lead-in of {length:g} s from {record.clock(begin)} s on"
+        if not (0 <= first < last < record.samples):
+            end = record.start + record.duration
+            raise InputError(
+                f"{record.origin}: {lead_in} leaves nothing of the record from "
+                f"{record.clock(record.start)} to {record.clock(end)} s; choose another one"
+            )
+        if not np.isfinite(record.displacement[first:last]).any():
+            raise InputError(f"{record.origin}: no reading in {lead_in}; choose another one")
+        return slice(first, last)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out data: windows (slices) of a training record, or another record and its start.
+
+    ``judged`` is the window in s of another record that is judged, if not all of it. ``of`` is the
+    training record that the windows are of, or whose own parameters another record takes where
+    nothing tells its own.
+    """
+
+    windows: Slices = ()
+    record: Record | None = None
+    start: InitialConditions = field(default_factory=InitialConditions)
+    judged: Window | None = None
+    of: str = "record"
 
 
 @dataclass(frozen=True)
 class Study:
-    """A model, the records that it is fitted to, and what is stated of its parameters.
+    """A model, the records that it is fitted to and held against, and what is stated of both.
 
     Parameters
     ----------
@@ -92,6 +182,10 @@ class Study:
         The model.
     records
         Records to fit, by name.
+    training
+        Windows of each that are fitted (slices), by its name.
+    from_rest
+        Names of those that start from a demagnetized actuator at rest.
     stated
         Statements about parameters, by name, or by name[record] for one record.
     per_record, shared
@@ -99,21 +193,62 @@ class Study:
         those that all records share.
     engine
         Engine of the likelihood.
+    validations
+        What is held out, by name.
+    seed
+        Seed of all random numbers.
     """
 
     __repr__ = brief
 
     spec: ModelSpec
-    records: Mapping[str, TrainingRecord]
+    records: Mapping[str, Record]
+    training: Mapping[str, Slices]
+    from_rest: frozenset[str] = frozenset()
     stated: Mapping[str, Stated] = field(default_factory=dict)
     per_record: tuple[str, ...] = ()
     shared: tuple[str, ...] = ()
     engine: Engine = "numpy"
+    validations: Mapping[str, Validation] = field(default_factory=dict)
+    seed: int = 1
+
+    @property
+    def record(self) -> Record:
+        """The record that is fitted; of several, the first."""
+        return next(iter(self.records.values()))
+
+    @property
+    def others(self) -> dict[str, Record]:
+        """The records that are predicted, by name, besides those that are fitted."""
+        records = {name: validation.record for name, validation in self.validations.items()}
+        return {name: record for name, record in records.items() if record is not None}
 
     @property
     def quantities(self) -> Quantities:
-        """Quantities of the records."""
-        return next(iter(self.records.values())).record.quantities
+        """Quantities of the records, in whose words all is said."""
+        return self.record.quantities
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """All parameters of the model and the noise."""
+        return self.posterior.prior.parameters
+
+    def generator(self, purpose: str) -> np.random.Generator:
+        """Return the generator of one purpose: each has a stream of its own."""
+        return generator(self.seed, purpose)
+
+    def held_out(self, record: str) -> dict[str, Slices]:
+        """Return the windows of a training record that were held out, by name."""
+        validations = self.validations.items()
+        return {name: v.windows for name, v in validations if v.windows and v.of == record}
+
+    def windows(self, record: str) -> dict[str, Slices]:
+        """Return the windows of a training record by the names of their bands, fitted ones first.
+
+        Those of one record alone are called "training", those of several as their record is.
+        """
+        name = "training" if len(self.records) == 1 else record
+        return {name: self.training[record], **self.held_out(record)}
 
     def with_model(self, spec: ModelSpec, added: Mapping[str, Stated] | None = None) -> Self:
         """Return the study of another model.
@@ -133,20 +268,39 @@ class Study:
             tuple(name for name in names if name in units)
             for names in (self.per_record, self.shared)
         )
-        return replace(self, spec=spec, stated=stated, per_record=per_record, shared=shared)
+        other = replace(self, spec=spec, stated=stated, per_record=per_record, shared=shared)
+        vars(other)["ranges"] = self.ranges  # of the same windows
+        return other
 
     def for_record(self, record: str) -> Self:
         """Return the study of one of the records, with what is stated of its own parameters."""
         stated = {
             name.removesuffix(f"[{record}]"): statement for name, statement in self.stated.items()
         }
-        return replace(
+        alone = replace(
             self,
             records={record: self.records[record]},
             stated={name: statement for name, statement in stated.items() if "[" not in name},
             per_record=(),
             shared=(),
         )
+        vars(alone)["ranges"] = {record: self.ranges[record]}
+        return alone
+
+    @property
+    def explicit(self) -> Self:
+        """The study with all that it leaves open stated in numbers, but the hold.
+
+        So a config says it, and another model keeps the numbers that both have.
+        """
+        posterior = self.posterior
+        explicit = replace(
+            self,
+            spec=self.spec.explicit(posterior.datasets[0].actuator),
+            stated={p.name: Stated.of(p, self.quantities) for p in self.parameters},
+        )
+        vars(explicit).update(posterior=posterior, ranges=self.ranges)
+        return explicit
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -160,19 +314,24 @@ class Study:
             for key, value in stated.keys.items():
                 if key not in ("label", "description"):
                     keys[f"parameters.{name}.{key}"] = value
-        for name, training in self.records.items():
-            record, table = training.record, place_of(name)
-            edges = np.array([[window.start, window.stop] for window in training.windows])
+        for name, record in self.records.items():
+            table = place_of(name)
+            edges = np.array([[window.start, window.stop] for window in self.training[name]])
             keys[f"{table}.train"] = (record.start + record.interval * edges).tolist()
-            keys[f"{table}.from_rest"] = training.from_rest
+            keys[f"{table}.from_rest"] = name in self.from_rest
             if record.path.noise_sd:
                 keys[f"voltage of {name}"] = "without its noise"
         return keys
 
     @property
-    def data_sha256(self) -> str:
-        """A digest of all readings: that of the record, or of several with their names."""
-        digests = {name: training.record.sha256 for name, training in self.records.items()}
+    def digests(self) -> dict[str, str]:
+        """The digest of each record by name, of those that are fitted and those predicted."""
+        return {name: record.sha256 for name, record in {**self.records, **self.others}.items()}
+
+    @property
+    def sha256(self) -> str:
+        """A digest of all fitted readings: that of the record, or of several with their names."""
+        digests = {name: record.sha256 for name, record in self.records.items()}
         if len(digests) == 1:
             return next(iter(digests.values()))
         return sha256(json.dumps(digests).encode()).hexdigest()
@@ -180,7 +339,15 @@ class Study:
     @cached_property
     def extent(self) -> Extent:
         """The quantities that the model takes from all records."""
-        return extent_of([training.record for training in self.records.values()])
+        return extent_of(self.records.values())
+
+    @cached_property
+    def ranges(self) -> dict[str, Ranges]:
+        """Ranges of each record in its windows, which default priors may depend on."""
+        return {
+            name: ranges_of(record.inputs, _readings(record), self.training[name])
+            for name, record in self.records.items()
+        }
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -194,15 +361,15 @@ class Study:
         """
         datasets = [
             Dataset(
-                training.record.inputs,
-                training.displacement,
-                training.windows,
-                self.spec.actuator(training.record.interval, training.record.hold, self.extent),
-                noise_model(self.spec.noise, training.record.interval),
-                training.from_rest,
+                record.inputs,
+                _readings(record),
+                self.training[name],
+                self.spec.actuator(record.interval, record.hold, self.extent),
+                noise_model(self.spec.noise, record.interval),
+                name in self.from_rest,
                 name,
             )
-            for name, training in self.records.items()
+            for name, record in self.records.items()
         ]
         for dataset in datasets:
             for stage in dataset.actuator.stages:
@@ -232,21 +399,20 @@ class Study:
         InputError
             Voltage or displacement does not vary there, in any of them.
         """
-        ranges = {name: training.ranges for name, training in self.records.items()}
         varied = [
-            extents
-            for extents in ranges.values()
-            if extents.voltage > 0 and extents.displacement > 0
+            ranges
+            for ranges in self.ranges.values()
+            if ranges.voltage > 0 and ranges.displacement > 0
         ]
         if not varied:
             table = place_of(next(iter(self.records)))
             raise InputError(f"{table}.train: voltage or displacement is constant there; widen it")
         pooled = join_ranges(varied)
-        contexts = {"": Context(pooled, self._values())}
-        for name, extents in ranges.items():
+        contexts = {"": Context(pooled, _values_of(self.stated))}
+        for name, ranges in self.ranges.items():
             # A record whose voltage stands still says where its sensor is, and nothing else.
-            extent = extents if extents in varied else replace(pooled, middle=extents.middle)
-            contexts[name] = Context(extent, self._values(name))
+            extent = ranges if ranges in varied else replace(pooled, middle=ranges.middle)
+            contexts[name] = Context(extent, _values_of(self.stated, name))
         return contexts
 
     @cached_property
@@ -260,9 +426,23 @@ class Study:
             name: default for name, default in defaults.items() if isinstance(default, Distribution)
         }
 
-    def _values(self, record: str = "") -> dict[str, float | Distribution]:
-        """Return what is stated of parameters, also of a record's own: values, and priors."""
-        return _values_of(self.stated, record)
+    def scales(self, draws: int) -> Scales:
+        """Return the scales of the instruments for so many draws."""
+        return self.record.instruments.scales(draws, self.generator("instruments"))
+
+    def true_draws(self, read: FloatArray) -> FloatArray:
+        """Return draws (..., free), as the readings have them, in true um and V."""
+        if self.record.instruments == EXACT:
+            return read
+        flat, names = read.reshape(-1, read.shape[-1]), self.posterior.names
+        scales, parameters = self.scales(len(flat)), {p.name: p for p in self.parameters}
+        exponent: float | FloatArray | None = 1.0
+        if "exponent" in parameters:
+            exponent = parameters["exponent"].fixed
+        if exponent is None:
+            exponent = flat[:, names.index("exponent")]
+        factors = [scales.factor(parameters[name].unit, exponent) for name in names]
+        return (flat * np.stack(factors, axis=1)).reshape(read.shape)
 
     def _said_of(self, column: Column) -> Stated:
         """Return what is stated of a column of θ: of it alone, or of all records' together."""
@@ -274,7 +454,7 @@ class Study:
         if column.declaration.scope == "record" and at_rest is not None:
             names = [column.record] if column.record else [*self.records]
             known = name == "initial" and self.spec.history == "demagnetized"
-            rested = [known or self.records[record].from_rest for record in names]
+            rested = [known or record in self.from_rest for record in names]
             if all(rested):
                 return Stated(fixed=at_rest)
             if any(rested):
@@ -283,6 +463,17 @@ class Study:
                     "rest and some do not; remove it"
                 )
         return Stated()
+
+
+def generator(seed: int, purpose: str) -> np.random.Generator:
+    """Return the generator of one purpose of a run: each has a stream of its own."""
+    return np.random.default_rng([seed, *purpose.encode()])
+
+
+def _readings(record: Record) -> FloatArray:
+    """Return the displacement (samples,), um, of a record that has one."""
+    assert record.displacement is not None
+    return record.displacement
 
 
 def _values_of(stated: Mapping[str, Stated], record: str = "") -> dict[str, float | Distribution]:

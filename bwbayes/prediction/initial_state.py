@@ -16,12 +16,12 @@ import numpy as np
 import scipy
 
 from bwbayes.arrays import FloatArray, IntArray
-from bwbayes.errors import InputError
 from bwbayes.inference.importance import resample
 from bwbayes.inference.likelihood import Likelihood, LinearStart
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.readings import Readings
-from bwbayes.model.inputs import Hold, Inputs, Span
+from bwbayes.inference.study import InitialConditions
+from bwbayes.model.inputs import Inputs, Span
 from bwbayes.prediction.bands import LeadIn
 from bwbayes.prediction.discrepancy_state import DiscrepancyState, filter_discrepancy
 from bwbayes.prediction.histories import Histories, choose_histories, uniform
@@ -31,84 +31,6 @@ from bwbayes.watching import Watch, part, unwatched
 
 # Turns in which the unknowns of a start are chosen.
 SWEEPS = 4
-
-
-@dataclass(frozen=True)
-class InitialConditions:
-    """Initial conditions of another record.
-
-    Parameters
-    ----------
-    from_rest
-        The actuator starts demagnetized and at rest: the voltage came from zero volts. Otherwise
-        h is a state that an earlier drive within the voltage range could have left, and the
-        dynamics may be moving.
-    estimate_offset
-        The sensor has an offset of its own, estimated from the lead-in. Otherwise it is that of
-        the training record, as it is for a planned voltage without a measurement.
-    lead_in
-        Length of the lead-in, s; by default a quarter of the record, and ten correlation times of
-        the discrepancy at most: after these the offset hardly widens the bands.
-    lead_in_start
-        Time at which it begins, s; by default that of the record's first sample. Samples before it
-        are simulated.
-    hold
-        How the voltage goes between samples; by default as the record says.
-    after
-        Everything after the lead-in is a forecast: the discrepancy goes on from where the lead-in's
-        readings leave it.
-    settled
-        Without a lead-in: the actuator has waited at the first voltage until it stood still, with
-        whatever earlier drives have left of hysteresis and creep, and displacements count from
-        where it stands.
-    """
-
-    __repr__ = brief
-
-    from_rest: bool = False
-    estimate_offset: bool = True
-    lead_in: float | None = None
-    lead_in_start: float | None = None
-    hold: Hold | None = None
-    after: bool = False
-    settled: bool = False
-
-    def window(self, record: Record, memory: float = np.inf) -> slice | None:
-        """Return the samples of the lead-in, or None if nothing can be learned from one.
-
-        ``memory`` is the discrepancy's correlation time, s.
-
-        Raises
-        ------
-        InputError
-            It reaches outside the record, leaves nothing of it, or holds no reading; a forecast of
-            a record without any.
-        """
-        if self.after and record.displacement is None:
-            raise InputError(
-                f"{record.origin}: has no readings after which a forecast could start; give a "
-                "record with a measured lead-in, or leave the forecast out"
-            )
-        if record.displacement is None:
-            return None
-        if self.from_rest and not self.estimate_offset and not self.after:
-            return None
-        begin = record.start if self.lead_in_start is None else self.lead_in_start
-        first = round((begin - record.start) / record.interval)
-        # White noise forgets at once: then a hundred readings tell the offset.
-        longest = max(10 * memory, 100 * record.interval)
-        length = self.lead_in or min(0.25 * (record.samples - first) * record.interval, longest)
-        last = first + round(length / record.interval)
-        lead_in = f"a lead-in of {length:g} s from {record.clock(begin)} s on"
-        if not (0 <= first < last < record.samples):
-            end = record.start + record.duration
-            raise InputError(
-                f"{record.origin}: {lead_in} leaves nothing of the record from "
-                f"{record.clock(record.start)} to {record.clock(end)} s; choose another one"
-            )
-        if not np.isfinite(record.displacement[first:last]).any():
-            raise InputError(f"{record.origin}: no reading in {lead_in}; choose another one")
-        return slice(first, last)
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from bwbayes.arrays import ArrayLike, FloatArray, Floating
 from bwbayes.errors import InputError
 from bwbayes.inference.heavy_tails import scale_mixture
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import rate
 from bwbayes.prediction import mixture
 from bwbayes.prediction.bands import KINDS, LEVELS, WIDTH_90, Bands, Kind
 from bwbayes.prediction.initial_state import (
-    InitialConditions,
     InitialStates,
     continue_discrepancy,
     estimate_initial_states,

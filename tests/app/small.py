@@ -16,8 +16,8 @@ from filelock import FileLock
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study.resolve import resolve_config
 
 TEXT = """\
 seed = 3

@@ -6,7 +6,7 @@ import numpy as np
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 
 # Medians and relative spreads of the population that specimens are drawn from.
 POPULATION = {"d": (0.7, 0.05), "alpha": (0.3575, 0.08)}
@@ -69,7 +69,7 @@ def truths(number: int) -> dict[str, float]:
 
 def record(number: int) -> bw.Record:
     config = parse(STAND.format(seed=number + 1, **truths(number)), "stand")
-    return resolve_config(config, Path()).record
+    return resolve_config(config, Path()).study.record
 
 
 def specimens(folder: Path, count: int) -> None:

@@ -18,10 +18,10 @@ from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.jobs import campaign as module
 from bwbayes.app.jobs.campaign import Campaign, Row, config_text, resume, start
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import CampaignFolder, RunFolder
 from bwbayes.app.running.progress import batch
 from bwbayes.app.running.run import resume as resume_run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.report.outputs import write_summary
 from bwbayes.report.result import summary
@@ -146,7 +146,7 @@ def test_columns_and_units_of_all_records_are_said_once(bwbayes: Type, tmp_path:
     }
     for name in ("a", "b"):
         origin = start(folder, "", tmp_path, batch, reading=reading)
-        read = module._run_folder(folder / f"{name}.csv", origin)[1].record
+        read = module._begun_run(folder / f"{name}.csv", origin).study.record
         np.testing.assert_allclose(
             np.asarray(read.displacement), np.asarray(stand.displacement), atol=1e-9
         )

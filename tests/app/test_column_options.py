@@ -14,9 +14,10 @@ from hypothesis import given
 import bwbayes as bw
 from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.column_options import column_options_from, record_naming
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study.column_options import column_options_from, record_naming
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, read_record, write_record
 from tests.app.conftest import Type
 
@@ -121,7 +122,7 @@ units = { time = "ms", voltage = "V", displacement = "nm" }
 noise = "white"
 """
     folder = RunFolder.create(tmp_path / "run", resolve_config(parse(text, "text"), tmp_path))
-    problem = folder.problem()
+    problem = Run(folder)
     assert {
         "columns": {"time": "a", "voltage": "b", "displacement": "c"},
         "units": {"time": "ms", "voltage": "V", "displacement": "nm"},
@@ -146,8 +147,8 @@ def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
     folder = RunFolder.create(tmp_path / "run", resolve_config(load(config), tmp_path))
     for name in "ux":
         (tmp_path / f"{name}.txt").rename(tmp_path / f"{name}2.txt")
-    problem = folder.problem()
-    np.testing.assert_allclose(problem.records["record"].voltage, voltage)
+    problem = Run(folder)
+    np.testing.assert_allclose(problem.study.records["record"].voltage, voltage)
     alike = column_options_from(tmp_path / "u2.txt", problem.config.records["record"].read_as)
     plan = readable(tmp_path / "u2.txt", **alike)
     measured = readable(tmp_path / "u2.txt", displacement_file=tmp_path / "x2.txt", **alike)

@@ -15,7 +15,7 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.record import Record

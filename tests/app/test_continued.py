@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.record import Record, write_record
@@ -40,14 +41,14 @@ def parts(record: Record, *cuts: int, own_clock: bool = False) -> list[Record]:
     return [replace(one, start=0.0) if own_clock else one for one in made]
 
 
-def problem(record: Any, **keys: Any) -> Problem:
+def problem(record: Any, **keys: Any) -> Run:
     config, records = config_of(record, keys)
     return resolve_config(config, Path(), records)
 
 
-def densities(made: Problem) -> np.ndarray[Any, Any]:
-    z = np.random.default_rng(2).standard_normal((5, len(made.posterior.names)))
-    return made.posterior.log_density(z)
+def densities(made: Run) -> np.ndarray[Any, Any]:
+    z = np.random.default_rng(2).standard_normal((5, len(made.study.posterior.names)))
+    return made.study.posterior.log_density(z)
 
 
 def chained(named: Mapping[str, Record], **first: Any) -> dict[str, dict[str, Any]]:
@@ -65,11 +66,11 @@ def test_halves_that_follow_at_once_are_the_whole(engine: Engine, own_clock: boo
     one = problem(record, engine=engine)
     first, second = parts(record, 170, own_clock=own_clock)
     two = problem(chained({"first": first, "second": second}), engine=engine)
-    assert ["first"] == [*two.records]
-    assert one.posterior.names == two.posterior.names
-    assert one.sha256 == two.sha256
-    assert {n: str(p) for n, p in one.defaults.items()} == {
-        n: str(p) for n, p in two.defaults.items()
+    assert ["first"] == [*two.study.records]
+    assert one.study.posterior.names == two.study.posterior.names
+    assert one.study.sha256 == two.study.sha256
+    assert {n: str(p) for n, p in one.study.defaults.items()} == {
+        n: str(p) for n, p in two.study.defaults.items()
     }
     np.testing.assert_allclose(densities(two), densities(one), rtol=1e-10)
 
@@ -81,7 +82,7 @@ def test_records_of_their_own_are_something_else() -> None:
     first, second = parts(record, 170)
     keys = {"shared": ["initial", "offset"]}
     two = problem({"first": first, "second": second}, **keys)
-    assert one.posterior.names == two.posterior.names
+    assert one.study.posterior.names == two.study.posterior.names
     assert np.abs(densities(two) - densities(one)).min() > 0.1
 
 
@@ -98,8 +99,10 @@ def test_windows_and_what_is_held_out_are_those_of_the_whole(order: tuple[int, .
     listed = {"abc"[i]: tables["abc"[i]] for i in order}
     validation = {"late": {"window": (0.2, 1.0), "of": "c"}}
     three = problem(listed, validation=validation)
-    assert one.posterior.single_record.training == three.posterior.single_record.training
-    assert one.validations["late"].windows == three.validations["late"].windows
+    assert (
+        one.study.posterior.single_record.training == three.study.posterior.single_record.training
+    )
+    assert one.study.validations["late"].windows == three.study.validations["late"].windows
     np.testing.assert_allclose(densities(three), densities(one), rtol=1e-10)
 
 
@@ -115,11 +118,11 @@ def test_a_continued_record_beside_another(tmp_path: Path) -> None:
         "other": {"record": files["other"]},
     }
     made = problem(tables, per_record=["sensor_sd"])
-    assert ["a", "other"] == [*made.records]
-    assert {"offset[a]", "offset[other]", "sensor_sd[other]"} <= {*made.posterior.names}
+    assert ["a", "other"] == [*made.study.records]
+    assert {"offset[a]", "offset[other]", "sensor_sd[other]"} <= {*made.study.posterior.names}
     assert made.config.records["a"].outliers == [0.5, 3.5]
     assert made.config.records["a"].continues is None
-    assert made.records["a"].origin == "a.h5, then b.h5"
+    assert made.study.records["a"].origin == "a.h5, then b.h5"
     table = {"record": record, "outliers": [0.5, 3.5]}
     both = problem({"a": table, "other": other}, per_record=["sensor_sd"])
     np.testing.assert_allclose(densities(made), densities(both), rtol=1e-10)

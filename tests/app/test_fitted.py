@@ -54,7 +54,7 @@ def keys(folder: Path, opened: Run) -> dict[str, Any]:
             "held-out": (5, 6),
             "sine": {"record": read_record(folder / "records/sine.h5"), "from_rest": True},
         },
-        "truth": opened.problem.config.truth,
+        "truth": opened.config.truth,
         "workers": 1,
         "progress": False,
     }
@@ -88,7 +88,7 @@ def test_draws_and_summary_are_labeled_and_agree(fit: Run) -> None:
 
 
 def test_residuals_are_the_readings_less_the_bands_mean(fit: Run) -> None:
-    record = fit.problem.record
+    record = fit.study.record
     assert record.displacement is not None
     residuals = fit.residuals
     assert (record.samples,) == residuals.shape
@@ -115,14 +115,14 @@ def test_the_heading_says_for_which_drives_validation_passed(
     opened: Run, passed: bool | None
 ) -> None:
     heading = opened.with_cache(standing=ValidationSummary(passed)).heading
-    drives = f" for drives like the training record's ({opened.problem.facts['drive']})"
+    drives = f" for drives like the training record's ({opened.facts['drive']})"
     assert heading.endswith(f"validation passed{drives}") == bool(passed)
     assert (drives in heading) == bool(passed)
 
 
 def test_the_notebooks_html_shows_names_as_they_are(opened: Run) -> None:
-    config = opened.problem.config.model_copy(update={"name": "<b>x</b>"})
-    shown = opened.with_cache(problem=replace(opened.problem, config=config), result=opened.result)
+    config = opened.config.model_copy(update={"name": "<b>x</b>"})
+    shown = opened.with_cache(config=config, result=opened.result)
     assert "&lt;b&gt;x" in shown._repr_html_()
 
 
@@ -200,7 +200,7 @@ def test_a_lead_in_that_is_only_a_hold_is_said_to_tell_little(
     opened: Run, held: bool, said: bool
 ) -> None:
     """With the length of one that moves; nothing where the state is known."""
-    first = opened.problem.record
+    first = opened.study.record
     assert first.displacement is not None
     hold = round(1.0 / first.interval)
     voltage, readings = (
@@ -227,7 +227,7 @@ def test_without_convergence_every_interval_is_refused_in_one_line(folder: Path)
         lambda: made.bands,
         lambda: made.residuals,
         lambda: made.loops,
-        lambda: made.predict(made.problem.record),
+        lambda: made.predict(made.study.record),
         lambda: made.compensate("sine", amplitude=20, frequency=1),
         lambda: made.design("d"),
         lambda: made.export("out"),

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError
 from tests.app import small
 from tests.forks import FORKS
@@ -23,7 +24,7 @@ NOBODY = 65534
 
 
 @pytest.fixture(scope="module")
-def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return resolve_config(small.config(), tmp_path_factory.mktemp("config"))
 
 
@@ -32,14 +33,14 @@ def content(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-def assert_refused(path: Path, problem: Problem, *, overwrite: bool, why: str) -> None:
+def assert_refused(path: Path, problem: Run, *, overwrite: bool, why: str) -> None:
     with pytest.raises(InputError, match=why) as error:
         RunFolder.create(path, problem, overwrite)
     assert "\n" not in str(error.value)
     assert str(error.value).startswith(f"{path}: ")
 
 
-def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Problem) -> None:
+def test_run_is_not_overwritten_unless_told(tmp_path: Path, problem: Run) -> None:
     path = tmp_path / "a"
     made = RunFolder.create(path, problem, overwrite=False)
     made.summary.write_bytes(b"{}")
@@ -57,9 +58,7 @@ def hold(path: Path, held: Event, enough: Event) -> None:
         enough.wait(60)
 
 
-def test_second_writer_is_refused_while_the_first_one_lives(
-    tmp_path: Path, problem: Problem
-) -> None:
+def test_second_writer_is_refused_while_the_first_one_lives(tmp_path: Path, problem: Run) -> None:
     made = RunFolder.create(tmp_path / "a", problem, overwrite=False)
     held, enough = FORKS.Event(), FORKS.Event()
     other = FORKS.Process(target=hold, args=(made.path, held, enough))
@@ -99,7 +98,7 @@ def read_only() -> Iterator[Path]:
         path.chmod(0o755)
 
 
-def test_read_only_folder_is_refused(read_only: Path, problem: Problem) -> None:
+def test_read_only_folder_is_refused(read_only: Path, problem: Run) -> None:
     made = RunFolder.create(read_only / "a", problem, overwrite=False)
     for path in (made.path, read_only):
         path.chmod(0o555)
@@ -136,7 +135,7 @@ def test_full_disk_leaves_no_folder(tmp_path: Path, size: int) -> None:
     assert not path.exists()
 
 
-def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -> None:
+def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Run) -> None:
     partial = tmp_path / "results/.a.partial/records/old.h5"
     partial.parent.mkdir(parents=True)
     partial.write_bytes(b"half a record")
@@ -148,7 +147,7 @@ def test_new_folder_has_all_that_a_run_needs(tmp_path: Path, problem: Problem) -
 
 
 @pytest.mark.parametrize("named", ["thesis.tex", "config.toml", "records/notes.txt"])
-def test_what_is_no_runs_is_never_replaced(tmp_path: Path, problem: Problem, named: str) -> None:
+def test_what_is_no_runs_is_never_replaced(tmp_path: Path, problem: Run, named: str) -> None:
     path = tmp_path / "mine"
     (path / named).parent.mkdir(parents=True)
     (path / named).write_text("years of work")

@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, example, given, settings, strategies as st
 from scipy import stats
 
 from bwbayes.app.config.proposal import draft_config
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputWarning
 from bwbayes.record.io.columns import Naming
@@ -78,7 +79,7 @@ def written(
     return path
 
 
-def resolved(path: Path, naming: Naming | None = None) -> Problem:
+def resolved(path: Path, naming: Naming | None = None) -> Run:
     """Return the problem of a file that has no config: all but the sampling of a run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
@@ -126,13 +127,13 @@ def test_any_ordinary_record_gets_a_config_that_resolves(
     options: dict[str, Any] = {"rate": rate, "start": start, "units": units}
     path = written(tmp_path / "a.csv", voltage, displacement, separator=separator, **options)
     problem = resolved(path)
-    record = problem.record
+    record = problem.study.record
     assert (samples, samples) == (record.samples, record.readings)
     rounded = np.spacing(abs(start) + samples / rate)  # of the times in the file
     assert record.interval == pytest.approx(1 / rate, rel=1e-4, abs=2 * rounded / (samples - 1))
     np.testing.assert_allclose(record.voltage, voltage, rtol=1e-8, atol=1e-9)
-    fitted = np.concatenate([np.r_[w] for w in problem.posterior.single_record.training])
-    held = [np.r_[w] for v in problem.validations.values() for w in v.windows]
+    fitted = np.concatenate([np.r_[w] for w in problem.study.posterior.single_record.training])
+    held = [np.r_[w] for v in problem.study.validations.values() for w in v.windows]
     assert all(window.size for window in held)
     every = np.sort(np.concatenate([fitted, *held]))
     np.testing.assert_array_equal(every, np.arange(samples))
@@ -149,7 +150,7 @@ def test_what_is_held_out_is_like_the_rest(tmp_path: Path, kind: str, periods: f
     voltage = drive(kind, periods, np.arange(4000) / 4000)
     path = written(tmp_path / "a.csv", voltage, moved(voltage, np.random.default_rng(0)))
     held = np.zeros(voltage.size, dtype=np.bool_)
-    for window in resolved(path).validations["held_out"].windows:
+    for window in resolved(path).study.validations["held_out"].windows:
         held[window] = True
     rates = np.abs(np.gradient(voltage))
     for values in (voltage, rates):

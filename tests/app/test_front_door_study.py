@@ -14,9 +14,9 @@ import pytest
 
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.config.proposal import draft_config
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError, InputWarning
 from tests.app import small
 from tests.app.test_front_door import SEPARATORS, UNITS, drive, moved, written

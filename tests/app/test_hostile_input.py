@@ -27,14 +27,15 @@ import pytest
 
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs import check as app_check
-from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running import explaining
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import generator
 from bwbayes.watching import Watch
 from tests.app import small
 from tests.app.mutations import KINDS, QUICK, Case, case, made
@@ -145,16 +146,17 @@ def assert_becomes_a_run(place: Path) -> None:
     before = {path.name for path in place.iterdir()}
     folder = RunFolder.create(place / "out", problem, overwrite=False)
     assert before | {"out"} == {path.name for path in place.iterdir()}
-    again = folder.problem()
+    again = Run(folder)
     assert again.config == problem.config
-    assert again.record.sha256 == problem.record.sha256
-    prior = problem.posterior.prior
+    assert again.study.record.sha256 == problem.study.record.sha256
+    prior = problem.study.posterior.prior
     coordinates = prior.unconstrain(prior.draw(generator(1, "hostile"), 8))
     np.testing.assert_array_equal(
-        problem.posterior.log_density(coordinates), again.posterior.log_density(coordinates)
+        problem.study.posterior.log_density(coordinates),
+        again.study.posterior.log_density(coordinates),
     )
     free, _ = prior.constrain(coordinates)
-    assert np.isfinite(problem.posterior.simulate(prior.theta(free))).all()
+    assert np.isfinite(problem.study.posterior.simulate(prior.theta(free))).all()
     shutil.rmtree(folder.path)
 
 

@@ -95,8 +95,8 @@ def test_run_keeps_its_instruments_and_files_of_its_columns_have_them(
     both: tuple[bw.Run, bw.Run], tmp_path: Path
 ) -> None:
     again = bw.open_run(both[1].folder.path)
-    assert both[1].problem.record.instruments == again.problem.record.instruments
-    assert "known to 2 % (one standard uncertainty)" == again.problem.facts["sensor scale"]
+    assert both[1].study.record.instruments == again.study.record.instruments
+    assert "known to 2 % (one standard uncertainty)" == again.facts["sensor scale"]
     write_record(specimens.record(1), tmp_path / "next.csv")
     with warnings.catch_warnings(action="ignore", category=bw.InputWarning):
         predicted = again.predict(tmp_path / "next.csv")
@@ -143,7 +143,7 @@ def test_certificate_says_what_was_stated_and_found(
     assert half == pytest.approx(found["d"]["expanded_uncertainty"], rel=1e-9)
     assert half / d["sd"] == pytest.approx(found["d"]["coverage_factor"], rel=1e-9)
     assert sha256(config.read_bytes()).hexdigest() == numbers["config.toml, SHA-256"]
-    assert both[1].problem.sha256 == numbers["data, SHA-256"]
+    assert both[1].study.sha256 == numbers["data, SHA-256"]
     assert {"stack <7>", "23 degC", "CS1"} <= {*numbers["stated"].values()}
     page = (tmp_path / "run/certificate/certificate.html").read_text(encoding="utf-8")
     for text in ("stack &lt;7&gt;", "dh = α du", "JCGM 101", "for drives like", "known to 2 %"):

@@ -11,10 +11,11 @@ import pytest
 import bwbayes
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.calibration.replicates import replicate
 from bwbayes.errors import InputError
 from bwbayes.record import Record, write_record
@@ -59,7 +60,7 @@ from_rest = true
 """
 
 
-def problem(*changes: tuple[str, str]) -> Problem:
+def problem(*changes: tuple[str, str]) -> Run:
     return resolve_config(small.config(*changes, text=TEXT), Path())
 
 
@@ -81,12 +82,14 @@ def test_default_priors_and_the_spans_of_parts_come_from_all_records() -> None:
     lone = lone.replace("[record.loops]", "[record]").replace('of = "loops"\n', "")
     _, head, tail = lone.replace(*changes).partition("[record]\n")
     text = f'{head}file = "loops.h5"\n{tail.partition(chr(10))[2]}'
-    alone = resolve_config(parse(text, ""), Path(), {"record": both.records["loops"]})
-    shared = [name for name in alone.defaults if name in both.defaults]
+    alone = resolve_config(parse(text, ""), Path(), {"record": both.study.records["loops"]})
+    shared = [name for name in alone.study.defaults if name in both.study.defaults]
     assert {"d", "alpha", "sensor_sd"} <= {*shared}
-    assert {n: alone.defaults[n] for n in shared} == {n: both.defaults[n] for n in shared}
-    assert both.defaults["offset[step]"] != both.defaults["offset[loops]"]
-    spans = {one.actuator.span for one in both.posterior.datasets}
+    assert {n: alone.study.defaults[n] for n in shared} == {
+        n: both.study.defaults[n] for n in shared
+    }
+    assert both.study.defaults["offset[step]"] != both.study.defaults["offset[loops]"]
+    spans = {one.actuator.span for one in both.study.posterior.datasets}
     assert len(spans) == 1
     assert next(iter(spans)).low < -50  # type: ignore[union-attr]
 
@@ -157,7 +160,7 @@ def test_python_takes_a_list_or_a_dict_of_records(tmp_path: Path) -> None:
     made, records = config_of(table, {"train": (0, 1)})
     assert ["first"] == [*records]
     assert [[[0.0, 1.0]], [[0.5, 1.5]]] == [given.train for given in made.records.values()]
-    assert 2 == len(resolve_config(made, Path(), records).records)
+    assert 2 == len(resolve_config(made, Path(), records).study.records)
     with pytest.raises(InputError, match="two records are called 'later'; give a dict"):
         config_of([tmp_path / "later.h5", tmp_path / "later.h5"], {})
     nothing: list[Any] = [[], {}, 3, [3]]
@@ -223,4 +226,4 @@ def test_readings_do_not_count_twice(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^record\.b: the same measurement as record\.a, whose"):
         resolve_config(parse(text, ""), tmp_path)
     apart = text.replace("[record.b]", "train = [0.0, 1.0]\n[record.b]") + "train = [1.0, 2.0]\n"
-    assert 2 == len(resolve_config(parse(apart, ""), tmp_path).records)
+    assert 2 == len(resolve_config(parse(apart, ""), tmp_path).study.records)

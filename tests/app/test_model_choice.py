@@ -19,19 +19,18 @@ import bwbayes as bw
 from bwbayes.app.config.config import Config, dump, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.jobs.check import check
-from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running import explaining
 from bwbayes.app.running.explaining import chosen_noise, search_stages
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.remarks import lines
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.diagnosis.explanations import explain, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
 from bwbayes.inference import map_estimate as pointfit
-from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.inference.study import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import plant
@@ -48,7 +47,7 @@ def config_of(kind: str, folder: Path) -> Config:
 
 def test_a_quadratic_gain_is_added(tmp_path: Path) -> None:
     chosen = search_stages(resolve_config(config_of("quadratic", tmp_path), tmp_path))
-    model, record = chosen.problem.config.model, chosen.problem.config.records["record"]
+    model, record = chosen.run.config.model, chosen.run.config.records["record"]
     assert "quadratic" in model.nonlinearity
     note, *others = record.remarks or [""]
     assert re.match(r"stage added: quadratic.* nats, RMSE .* um\)$", note)
@@ -66,7 +65,7 @@ def test_a_search_that_adds_many_stages_and_leaves_an_error_has_not_found_the_me
 ) -> None:
     """Here one stage counts as many: the plant's own discrepancy remains beside a quadratic one."""
     monkeypatch.setattr(explaining, "MAX_STAGES", 1)
-    chosen = search_stages(resolve_config(config_of("quadratic", tmp_path), tmp_path)).problem
+    chosen = search_stages(resolve_config(config_of("quadratic", tmp_path), tmp_path)).run
     unexplained = chosen.config.model.unexplained
     assert unexplained is not None
     assert unexplained > explaining.MAX_DISCREPANCY
@@ -89,12 +88,12 @@ def test_a_run_adds_a_quadratic_gain_and_says_what_it_is_worth(tmp_path: Path) -
         )
     (note,) = [str(w.message) for w in caught if "stage added" in str(w.message)]
     assert re.match(r"stage added: quadratic.* nats, RMSE .* um, held out .* um\)$", note)
-    assert "quadratic" in fit.problem.config.model.nonlinearity
+    assert "quadratic" in fit.config.model.nonlinearity
     assert fit.validation["rest"].passed is not False
     # The run that is opened has the same model, which is not searched again.
     again = bw.open_run(tmp_path / "run")
-    assert again.problem.config.model.stages == []
-    assert again.problem.config.model.nonlinearity == fit.problem.config.model.nonlinearity
+    assert again.config.model.stages == []
+    assert again.config.model.nonlinearity == fit.config.model.nonlinearity
 
 
 @pytest.mark.slow
@@ -102,8 +101,8 @@ def test_nothing_is_added_to_a_right_model(tmp_path: Path) -> None:
     problem = resolve_config(config_of("good", tmp_path), tmp_path)
     chosen = search_stages(problem)
     assert chosen.steps == ()
-    assert chosen.problem.posterior is problem.posterior
-    assert chosen.problem.config.model.stages == []
+    assert chosen.run.study.posterior is problem.study.posterior
+    assert chosen.run.config.model.stages == []
 
 
 @pytest.mark.parametrize(
@@ -119,12 +118,12 @@ def test_what_the_actuator_did_not_do_is_fitted_in_its_record_and_not_expected_o
         problem = resolve_config(config_of(plant_kind, tmp_path), tmp_path)
         if plant_kind == kind:
             chosen = search_stages(problem)
-            problem, point = chosen.problem, chosen.point
+            problem, point = chosen.run, chosen.point
             stage = "oscillation" if kind == "mains" else kind.replace(" ", "-")
             assert problem.config.model.stages == [stage]
         else:
-            point = pointfit.fit(problem.posterior, np.random.default_rng(1))
-        posterior, rng = problem.posterior, np.random.default_rng(2)
+            point = pointfit.fit(problem.study.posterior, np.random.default_rng(1))
+        posterior, rng = problem.study.posterior, np.random.default_rng(2)
         coordinates = rng.multivariate_normal(point.mode, point.covariance, 200)
         draws, density = posterior.prior.constrain(coordinates)
         following = plant("good", (8, 1), 8.0)
@@ -156,14 +155,14 @@ def test_noise_that_grows_with_the_speed_is_as_wide_where_the_next_drive_is_fast
     config = Config(record=RecordConfig(file="record.h5", from_rest=True))
     problem = resolve_config(config, tmp_path)
     chosen = search_stages(problem)
-    assert chosen.problem.study.spec.noise == "discrepancy + paced"
+    assert chosen.run.study.spec.noise == "discrepancy + paced"
     following, shares = measured(2), []
     assert following.displacement is not None
     fast = np.abs(np.gradient(following.voltage))
     fast = fast > np.median(fast)
-    level = pointfit.fit(problem.posterior, np.random.default_rng(1))
-    for made, point in ((chosen.problem, chosen.point), (problem, level)):
-        posterior, rng = made.posterior, np.random.default_rng(2)
+    level = pointfit.fit(problem.study.posterior, np.random.default_rng(1))
+    for made, point in ((chosen.run, chosen.point), (problem, level)):
+        posterior, rng = made.study.posterior, np.random.default_rng(2)
         draws, density = posterior.prior.constrain(
             rng.multivariate_normal(point.mode, point.covariance, 200)
         )
@@ -183,7 +182,7 @@ def test_stages_that_are_named_are_not_searched(keys: dict[str, Any], tmp_path: 
     model = config.model.model_copy(update=keys)
     problem = resolve_config(config.model_copy(update={"model": model}), tmp_path)
     chosen = search_stages(problem)
-    assert chosen.problem is problem
+    assert chosen.run is problem
     assert chosen.explanations is None
 
 
@@ -204,7 +203,7 @@ def test_a_stage_that_errs_more_on_held_out_readings_is_not_added(
     monkeypatch.setattr(explaining, "explain", misled)
     problem = resolve_config(config_of("quadratic", tmp_path), tmp_path)
     chosen = search_stages(problem)
-    assert chosen.problem.study.spec == problem.study.spec
+    assert chosen.run.study.spec == problem.study.spec
     assert chosen.steps[0].startswith("not added: quadratic")
     assert "held out 0.12 um instead of 0.1 um" in chosen.steps[0]
 
@@ -217,7 +216,7 @@ def test_several_records_have_no_stage_added(tmp_path: Path) -> None:
         for name, train in parts.items()
     }
     problem = resolve_config(Config(record=files), tmp_path)
-    assert search_stages(problem).problem is problem
+    assert search_stages(problem).run is problem
 
 
 @given(st.floats(-5, 100), st.floats(0.01, 10), st.floats(0.1, 10))
@@ -269,8 +268,8 @@ def test_the_noise_is_chosen_by_evidence(
 ) -> None:
     write_record(made(), tmp_path / "record.h5")
     problem = resolve_config(parse(CONFIG, "config"), tmp_path)
-    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
-    noise, why = chosen_noise(problem, point)
+    point = pointfit.fit(problem.study.posterior, problem.study.generator("point fit"))
+    noise, why = chosen_noise(problem.study, point)
     assert noise in expected
     assert why.startswith(f"noise: {noise} (")
     # A noise that could not gain anything is not fitted, which is said.
@@ -301,16 +300,18 @@ def test_a_noise_that_takes_up_the_readings_is_not_chosen(tmp_path: Path) -> Non
     windows = [[0.0, 5.0], [7.5, 15.0], [17.5, 25.0], [27.5, 35.0], [37.5, 45.0], [47.5, 50.0]]
     config = parse(f'[record]\nfile = "record.h5"\ntrain = {windows}\n', "config")
     problem = resolve_config(config, tmp_path)
-    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
-    rough = climb(problem.posterior, point.optima)
+    point = pointfit.fit(problem.study.posterior, problem.study.generator("point fit"))
+    rough = climb(problem.study.posterior, point.optima)
     other = problem.study.with_model(replace(problem.study.spec, noise="smooth")).posterior
-    starts = [dict(zip(problem.posterior.names, place, strict=True)) for place in point.optima]
+    starts = [
+        dict(zip(problem.study.posterior.names, place, strict=True)) for place in point.optima
+    ]
     places = [[start.get(name, 0.0) for name in other.names] for start in starts]
     smooth = climb(other, np.array(places))
     assert smooth.log_evidence > rough.log_evidence
     assert rough.follows
     assert not smooth.follows
-    assert chosen_noise(problem, point)[0] == "discrepancy"
+    assert chosen_noise(problem.study, point)[0] == "discrepancy"
 
 
 def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
@@ -321,13 +322,13 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
     problem = resolve_config(
         parse(f'{text}[model]\nper_record = ["sensor_sd"]\n', "config"), tmp_path
     )
-    point = pointfit.fit(problem.posterior, generator(problem.config.seed, "point fit"))
-    noise, why = chosen_noise(problem, point)
+    point = pointfit.fit(problem.study.posterior, problem.study.generator("point fit"))
+    noise, why = chosen_noise(problem.study, point)
     assert noise == "smooth"
     assert why.count("nats against") == 2
-    chosen = problem.with_noise(noise).posterior
+    chosen = with_noise(problem, noise).study.posterior
     new = ["discrepancy_quality"]
-    assert sorted(chosen.names) == sorted([*problem.posterior.names, *new])
+    assert sorted(chosen.names) == sorted([*problem.study.posterior.names, *new])
     assert {"sensor_sd[a]", "offset[a]"} < set(chosen.names)
     assert "offset[b]" not in chosen.names
 
@@ -348,8 +349,8 @@ def test_a_run_says_its_noise_and_keeps_it(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", resolve_config(config, tmp_path))
     console = Console(file=io.StringIO(), width=200)
     fit = resume(folder, console, workers=1, files=False)
-    assert fit.problem.config.model.noise == "smooth"
-    assert "discrepancy_quality" in fit.problem.posterior.names
+    assert fit.config.model.noise == "smooth"
+    assert "discrepancy_quality" in fit.study.posterior.names
     assert 'noise = "smooth"' in folder.config.read_text(encoding="utf-8")
     said = console.file.getvalue()  # type: ignore[attr-defined]
     assert said.count("noise: smooth") == 1

@@ -37,7 +37,7 @@ def test_an_exact_record_gives_its_parameters() -> None:
     assert fit.converged
     assert fit.passed is not False, fit.standing.lines
     assert any("no noise" in note for note in fit.notes)
-    means = dict(zip(fit.problem.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
+    means = dict(zip(fit.study.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
     for name, value in {"d": 0.7, **TRUTH}.items():
         assert means[name] == pytest.approx(value, rel=1e-5)
 
@@ -47,7 +47,7 @@ def test_a_drive_that_jumps_gives_its_parameters() -> None:
     voltage = np.repeat(np.random.default_rng(3).uniform(-60, 60, 100), 4)
     fit = fitted(0.7 * voltage - np.ravel(bw.hysteresis(voltage, **TRUTH)), voltage)
     assert fit.converged
-    means = dict(zip(fit.problem.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
+    means = dict(zip(fit.study.posterior.names, fit.flat_draws.mean(axis=0), strict=True))
     for name, value in {"d": 0.7, **TRUTH}.items():
         assert means[name] == pytest.approx(value, rel=1e-5)
 

@@ -271,7 +271,7 @@ def test_corrected_band_stands_beside_the_failed_one(failed: Path) -> None:
 def test_predictions_of_drives_alike_have_it_and_others_do_not(
     failed: Path, bwbayes: Type, tmp_path: Path
 ) -> None:
-    record = bw.open_run(failed).problem.record
+    record = bw.open_run(failed).study.record
     for name, times in (("alike", 1.0), ("further", 1.3)):
         pd.DataFrame({"time_s": record.time, "voltage_V": times * record.voltage}).to_csv(
             tmp_path / f"{name}.csv", index=False

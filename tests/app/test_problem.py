@@ -11,12 +11,14 @@ import pytest
 
 import bwbayes
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem import problem as problem_module
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator, windows_of
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study import resolve as resolve_module
+from bwbayes.app.study.records import windows_of
+from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.errors import InputError
 from bwbayes.inference.parameters import Parameter
+from bwbayes.inference.study import generator
 from bwbayes.record import Record, write_record
 from bwbayes.record.io import formats
 from bwbayes.record.io.fields import record_fields
@@ -24,7 +26,7 @@ from tests.app import small
 from tests.record.spoilt import SPOILT, looping
 
 
-def of(text: str, folder: Path) -> Problem:
+def of(text: str, folder: Path) -> Run:
     return resolve_config(parse(text, "my.toml"), folder)
 
 
@@ -54,8 +56,8 @@ KNOWN |= {"lag": 0.01, "offset": 0.0, "sensor_sd": 0.5, "discrepancy_sd": 1.0}
 KNOWN |= {"discrepancy_time": 0.5}
 
 
-def by_name(problem: Problem) -> dict[str, Parameter]:
-    return {parameter.name: parameter for parameter in problem.parameters}
+def by_name(problem: Run) -> dict[str, Parameter]:
+    return {parameter.name: parameter for parameter in problem.study.parameters}
 
 
 def test_each_purpose_and_each_seed_has_a_random_stream_of_its_own() -> None:
@@ -73,27 +75,31 @@ def test_default_priors_do_not_know_what_is_held_out(tmp_path: Path) -> None:
     for factor in (1.0, 3.0):
         displacement = made.displacement * np.where(np.arange(400) < 200, 1.0, factor)
         write_record(replace(made, displacement=displacement), tmp_path / "record.csv")
-        result.append(of(text, tmp_path).parameters)
+        result.append(of(text, tmp_path).study.parameters)
     assert result[0] == result[1]
 
 
 def test_resolved_config_resolves_to_the_same_numbers(tmp_path: Path) -> None:
     first = resolve_config(small.config(), tmp_path)
     folder = RunFolder.create(tmp_path / "run", first, overwrite=False)
-    again = RunFolder.open(folder.path.rename(tmp_path / "moved")).problem()
+    again = Run(RunFolder.open(folder.path.rename(tmp_path / "moved")))
     assert first.config == again.config
-    assert first.record.sha256 == again.record.sha256
-    np.testing.assert_array_equal(first.record.truth, again.record.truth)
-    assert first.parameters == again.parameters
+    assert first.study.record.sha256 == again.study.record.sha256
+    np.testing.assert_array_equal(first.study.record.truth, again.study.record.truth)
+    assert first.study.parameters == again.study.parameters
     assert first.plan == again.plan
-    assert first.posterior.single_record.training == again.posterior.single_record.training
-    for name, one in first.validations.items():
-        other = again.validations[name]
+    assert (
+        first.study.posterior.single_record.training == again.study.posterior.single_record.training
+    )
+    for name, one in first.study.validations.items():
+        other = again.study.validations[name]
         assert (one.windows, one.start) == (other.windows, other.start)
         if one.record is not None and other.record is not None:
             assert one.record.sha256 == other.record.sha256
-    z = np.random.default_rng(1).standard_normal((5, first.posterior.prior.dimensions))
-    np.testing.assert_array_equal(first.posterior.log_density(z), again.posterior.log_density(z))
+    z = np.random.default_rng(1).standard_normal((5, first.study.posterior.prior.dimensions))
+    np.testing.assert_array_equal(
+        first.study.posterior.log_density(z), again.study.posterior.log_density(z)
+    )
 
 
 @pytest.mark.usefixtures("_without_explanations", "_without_pictures")
@@ -107,14 +113,16 @@ def test_a_run_resolves_once_and_reads_each_record_once(
         calls[call.__name__] += 1
         return call(*args, **options)
 
-    for call, module in ((windows_of, problem_module), (record_fields, formats)):
+    for call, module in ((windows_of, resolve_module), (record_fields, formats)):
         monkeypatch.setattr(module, call.__name__, partial(counted, call))
     fit = bwbayes.fit(made.config, folder=tmp_path / "run", workers=1, progress=False)
     assert calls == {"windows_of": 1, "record_fields": 2}
     # What is in its folder is what was fitted.
-    read = bwbayes.open_run(tmp_path / "run").problem
-    for name in ("config", "digests", "remarks", "facts", "defaults", "plan", "parameters"):
-        assert getattr(read, name) == getattr(fit.problem, name), name
+    read = bwbayes.open_run(tmp_path / "run")
+    for name in ("config", "record_remarks", "facts", "plan"):
+        assert getattr(read, name) == getattr(fit, name), name
+    for name in ("spec", "stated", "digests", "keys", "defaults", "parameters"):
+        assert getattr(read.study, name) == getattr(fit.study, name), name
 
 
 @pytest.mark.parametrize("train", ["train = [[1.0, 2.0]]\n", ""])
@@ -123,17 +131,28 @@ def test_readings_that_count_are_chosen_once_and_the_history_is_kept(
 ) -> None:
     text = RECORD + "start = 1.0\nstop = 3.0\ndecimate = 2\nexclude = [1.5, 1.7]\n" + train
     first = of(text, folder)
-    assert (300, 0.01, 0.0) == (first.record.samples, first.record.interval, first.record.start)
-    np.testing.assert_array_equal(record().voltage[:300], first.posterior.single_record.voltage)
+    assert (300, 0.01, 0.0) == (
+        first.study.record.samples,
+        first.study.record.interval,
+        first.study.record.start,
+    )
+    np.testing.assert_array_equal(
+        record().voltage[:300], first.study.posterior.single_record.voltage
+    )
     assert [*range(100, 150, 2), *range(170, 300, 2)] == np.flatnonzero(
-        first.record.has_reading
+        first.study.record.has_reading
     ).tolist()
-    assert (slice(100, 200 if train else 299),) == first.posterior.single_record.training
+    assert (slice(100, 200 if train else 299),) == first.study.posterior.single_record.training
     assert first.facts["record"].endswith("90 readings, none from 0 to 1 s")
-    again = RunFolder.create(folder / "run", first, overwrite=False).problem()
-    assert (again.record.samples, again.record.sha256) == (300, first.record.sha256)
-    assert again.posterior.single_record.training == first.posterior.single_record.training
-    assert again.parameters == first.parameters
+    again = Run(RunFolder.create(folder / "run", first, overwrite=False))
+    assert (again.study.record.samples, again.study.record.sha256) == (
+        300,
+        first.study.record.sha256,
+    )
+    assert (
+        again.study.posterior.single_record.training == first.study.posterior.single_record.training
+    )
+    assert again.study.parameters == first.study.parameters
     assert again.config == first.config
 
 
@@ -148,11 +167,11 @@ def test_automatic_hold_follows_what_the_voltage_is(
     silent = [row for row in rows if not row.startswith("#")]
     (folder / "record.csv").write_text("\n".join(silent) + "\n")
     problem = of(RECORD + said, folder)
-    assert hold == problem.posterior.single_record.actuator.hold
+    assert hold == problem.study.posterior.single_record.actuator.hold
     # Kept as it was asked for: another record has a hold of its own.
     assert problem.config.model.hold == "auto"
     given = of(RECORD + said + "[model]\nhold = 'first'", folder)
-    assert "first" == given.posterior.single_record.actuator.hold
+    assert "first" == given.study.posterior.single_record.actuator.hold
 
 
 def test_given_prior_bounds_and_names_replace_the_defaults(folder: Path) -> None:
@@ -172,8 +191,8 @@ def test_nothing_is_said_of_a_record_in_memory_that_stays_as_it_is(tmp_path: Pat
     marked = np.tile(np.append(-9999.0, np.arange(49.0)), 8)
     in_memory = {"record": replace(record(), displacement=marked)}
     problem = resolve_config(parse(RECORD, "my.toml"), tmp_path, in_memory)
-    assert problem.record.sha256 == in_memory["record"].sha256
-    assert not any("taken as missing" in remark for remark in problem.remarks)
+    assert problem.study.record.sha256 == in_memory["record"].sha256
+    assert not any("taken as missing" in remark for remark in problem.record_remarks)
 
 
 @pytest.mark.parametrize(
@@ -223,9 +242,9 @@ def test_what_was_said_of_a_record_stays_with_its_run(folder: Path) -> None:
     rows = [f"{line},21.5" for line in text if not line.startswith("#")]
     (folder / "record.csv").write_text("\n".join([rows[0].replace("21.5", "temp_C"), *rows[1:]]))
     first = of(RECORD, folder)
-    assert first.remarks[0].endswith("ignored columns: temp_C")
-    again = RunFolder.create(folder / "run", first, overwrite=False).problem()
-    assert first.remarks == again.remarks
+    assert first.record_remarks[0].endswith("ignored columns: temp_C")
+    again = Run(RunFolder.create(folder / "run", first, overwrite=False))
+    assert first.record_remarks == again.record_remarks
 
 
 def test_a_model_without_hysteresis_needs_no_loops(tmp_path: Path) -> None:
@@ -267,13 +286,13 @@ def test_lead_in_that_is_no_part_of_the_record_is_refused_before_sampling(
 def test_seed_makes_the_stands_records_whose_true_values_are_known(tmp_path: Path) -> None:
     def records(seed: int) -> tuple[str | None, ...]:
         problem = resolve_config(small.config(("seed = 3", f"seed = {seed}")), tmp_path)
-        assert "zero" == problem.posterior.single_record.actuator.hold
+        assert "zero" == problem.study.posterior.single_record.actuator.hold
         truth = problem.config.truth
         names = ("d", "alpha", "beta", "sensor_sd")
         assert (0.7, 0.3575, 0.0272, 0.5) == tuple(truth[name] for name in names)
         assert "mass" not in truth
-        sine = problem.validations["sine"].record
-        return problem.record.sha256, sine.sha256 if sine else None
+        sine = problem.study.validations["sine"].record
+        return problem.study.record.sha256, sine.sha256 if sine else None
 
     assert records(1) == records(1)
     assert not {*records(1)} & {*records(2), None}
@@ -284,7 +303,7 @@ def test_with_another_noise_what_is_known_and_said_of_its_parameters_stays(tmp_p
     before = resolve_config(small.config(), tmp_path)
     discrepancy = {"discrepancy_sd", "discrepancy_time"}
     for noise, gone in (("discrepancy", set()), ("smooth", set()), ("white", discrepancy)):
-        after = before.with_noise(noise).config
+        after = with_noise(before, noise).config
         assert noise == after.model.noise
         for key in ("truth", "parameters"):
             stated, kept = getattr(before.config, key), getattr(after, key)

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.proposal import ConfigProposal, draft_config
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.record import Record, read_record
@@ -126,8 +126,8 @@ def test_outliers_are_set_aside_where_fitted_and_left_out_where_held_out(
     problem = resolve_config(proposal.config, path.parent)
     aside = rows.size - len(held)
     said = f"{aside} reading{'s' * (aside > 1)} set aside"
-    assert any(remark.startswith(said) for remark in problem.remarks), problem.remarks
-    assert rows.tolist() == np.flatnonzero(~problem.record.has_reading).tolist()
+    assert any(remark.startswith(said) for remark in problem.record_remarks), problem.record_remarks
+    assert rows.tolist() == np.flatnonzero(~problem.study.record.has_reading).tolist()
 
 
 @pytest.mark.parametrize(
@@ -208,8 +208,8 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     assert (path.parent / "page/check.html").exists()
     assert 0 == command("init", path, "--unit", "displacement=-um").return_value
     problem = resolve_config(load(path.with_suffix(".toml")), path.parent)
-    assert problem.record.displacement is not None
-    np.testing.assert_allclose(problem.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
+    assert problem.study.record.displacement is not None
+    np.testing.assert_allclose(problem.study.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
     assert () == problem.findings["record"]
 
 
@@ -227,7 +227,7 @@ def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write
     elsewhere = path.parent / "configs/a.toml"
     assert 0 == command("init", path, "--out", elsewhere).return_value
     assert "../mine.csv" == load(elsewhere).records["record"].file
-    assert 600 == resolve_config(load(elsewhere), elsewhere.parent).record.samples
+    assert 600 == resolve_config(load(elsewhere), elsewhere.parent).study.record.samples
     for unit in ("displacement", "length=nm", "displacement=furlong", "time=-s"):
         assert isinstance(command("init", path, "--unit", unit).exception, InputError)
 
@@ -260,9 +260,9 @@ def test_readings_that_are_clipped_are_missing(write: Write) -> None:
     again = f'{proposal.text}\n[validation.again]\nfile = "{path.name}"\n'
     problem = resolve_config(parse(again, str(path)), path.parent)
     assert () == problem.findings["record"]
-    another = problem.validations["again"].record
+    another = problem.study.validations["again"].record
     assert another is not None
-    for record in (problem.record, another):
+    for record in (problem.study.record, another):
         assert record.displacement is not None
         assert limits[0] < np.nanmin(record.displacement) < np.nanmax(record.displacement)
         assert np.nanmax(record.displacement) < limits[1]

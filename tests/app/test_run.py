@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray
 
-from bwbayes.app.fit.fitted import STAGES, open_finished
+from bwbayes.app.fit.fitted import STAGES, Run, open_finished
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import redraw, resume
 from bwbayes.errors import InputError
@@ -24,7 +24,10 @@ from tests.app import small
 
 def test_posterior_has_readings_log_likelihood_and_whether_it_has_converged(run: Path) -> None:
     """Of each draw it is that of all readings; with the log prior it makes the log density."""
-    record, posterior = (read_record(run / "records/record.h5"), RunFolder(run).problem().posterior)
+    record, posterior = (
+        read_record(run / "records/record.h5"),
+        Run(RunFolder(run)).study.posterior,
+    )
     with xarray.open_datatree(run / "posterior.nc", engine="h5netcdf") as tree:
         assert 1 == tree.attrs["converged"] == tree["posterior"].attrs["converged"]
         for group, name in (("observed_data", "displacement"), ("constant_data", "voltage")):
@@ -101,8 +104,9 @@ def test_a_prior_that_the_record_contradicts_is_a_remark(run: Path) -> None:
     fit = fit.with_cache(outcome=outcome, kept={})
     assert () == fit.remarks
     nanometres = Distribution("lognormal", {"median": 1e-3, "sigma": 0.6})
-    odd = replace(fit.problem, defaults={**fit.problem.defaults, "d": nanometres})
-    (remark,) = open_finished(folder).with_cache(problem=odd, outcome=outcome, kept={}).remarks
+    study = replace(fit.study)
+    vars(study)["defaults"] = {**fit.study.defaults, "d": nanometres}
+    (remark,) = open_finished(folder).with_cache(study=study, outcome=outcome, kept={}).remarks
     assert "Fix: check its unit" in remark
 
 

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.diagnosis.record_checks import inspect
 from bwbayes.errors import InputWarning
@@ -75,18 +76,18 @@ def of_the_family(seed: int, most: int) -> Spoiled:
     return with_spikes(good, rows, sizes, np.where(rng.random(rows.size) < 0.5, -1.0, 1.0))
 
 
-def resolved(record: Record, model: str = "") -> Problem:
+def resolved(record: Record, model: str = "") -> Run:
     config = parse(f'[record]\nfile = "record.h5"\n[model]\n{model}\n', "my.toml")
     return resolve_config(config, Path(), {"record": record})
 
 
-def set_aside(problem: Problem) -> list[int]:
-    return np.flatnonzero(np.isnan(problem.posterior.single_record.displacement)).tolist()
+def set_aside(problem: Run) -> list[int]:
+    return np.flatnonzero(np.isnan(problem.study.posterior.single_record.displacement)).tolist()
 
 
-def prior_arguments(problem: Problem) -> FloatArray:
+def prior_arguments(problem: Run) -> FloatArray:
     values: list[float] = []
-    for parameter in problem.parameters:
+    for parameter in problem.study.parameters:
         arguments = parameter.prior.arguments if parameter.prior else {}
         values += [v / arguments.get("sd", 1.0) for k, v in arguments.items() if k == "mean"]
         values += [v for k, v in arguments.items() if k != "mean"]
@@ -97,6 +98,8 @@ def off(spoiled: Spoiled) -> str:
     problem = resolved(spoiled.record, "outliers = true")
     if set_aside(problem) != spoiled.rows.tolist():
         return f"{set_aside(problem)} for {spoiled.rows.tolist()}, {spoiled.sizes} um"
+    if not any("set aside as isolated outlier" in remark for remark in problem.record_remarks):
+        return "not said"
     without, clean = prior_arguments(problem), prior_arguments(resolved(spoiled.good))
     worst = float(np.max(np.abs(without - clean) / np.maximum(np.abs(clean), 1.0)))
     return f"priors off by {worst:.2g}" if worst > NEARLY else ""

@@ -16,13 +16,13 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.config.config import load
 from bwbayes.app.config.keywords import config_of
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.explaining import search_stages
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.stages.gain import MovingGain
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.io.binary import record_arrays
 from tests.app import small
@@ -71,7 +71,7 @@ def fit() -> Any:
 
 def test_the_coefficient_is_inside_its_interval(fit: Any) -> None:
     """One truth in a hundred is not, and one noise in a hundred shows no such coefficient."""
-    found = fit.flat_draws[:, fit.problem.posterior.names.index("temperature_gain")]
+    found = fit.flat_draws[:, fit.study.posterior.names.index("temperature_gain")]
     low, high = np.quantile(found, [0.005, 0.995])
     assert low < PER_KELVIN < high
     assert np.std(found) < 0.1 * PER_KELVIN
@@ -132,7 +132,7 @@ def test_a_model_that_does_not_see_the_temperature_needs_none() -> None:
 
 def test_both_engines_give_one_log_density() -> None:
     config, records = config_of(TRAINED, {"stages": ["temperature"], "dynamics": "lag"})
-    posterior = resolve_config(config, Path(), records).posterior
+    posterior = resolve_config(config, Path(), records).study.posterior
     theta = posterior.prior.theta(posterior.prior.draw(np.random.default_rng(1), 20))
     one, other = (
         replace(posterior, engine=engine).log_likelihood(theta) for engine in ("numpy", "numba")
@@ -150,9 +150,9 @@ def test_a_config_names_the_column_of_a_covariate(said: str, shift: float, tmp_p
     text = f"[record]\nfile = 'bench.csv'\ncovariates = {said}\n[model]\nstages = ['temperature']"
     (tmp_path / "bench.toml").write_text(text, encoding="utf-8")
     problem = resolve_config(load(tmp_path / "bench.toml"), tmp_path)
-    read = problem.records["record"]
+    read = problem.study.records["record"]
     np.testing.assert_allclose(read.covariates["temperature_degC"], temperature + shift)
-    fixed = {p.name: p.fixed for p in problem.posterior.prior.parameters}
+    fixed = {p.name: p.fixed for p in problem.study.posterior.prior.parameters}
     assert fixed["temperature_reference"] == pytest.approx(22.5 + shift)
 
 
@@ -202,10 +202,10 @@ def test_self_heating_is_found_and_carried_to_another_drive() -> None:
     config, records = config_of(record, {"dynamics": "none", "from_rest": True})
     problem = resolve_config(config, Path(), records)
     chosen, rng = search_stages(problem), np.random.default_rng(3)
-    assert chosen.problem.config.model.stages == ["heating"]
+    assert chosen.run.config.model.stages == ["heating"]
     other, found = heated([0.2, 2, 2, 0.3, 2], 22), []
-    without = problem.posterior, map_estimate.fit(problem.posterior, rng)
-    for posterior, point in ((chosen.problem.posterior, chosen.point), without):
+    without = problem.study.posterior, map_estimate.fit(problem.study.posterior, rng)
+    for posterior, point in ((chosen.run.study.posterior, chosen.point), without):
         coordinates = rng.multivariate_normal(point.mode, point.covariance, 200)
         draws, density = posterior.prior.constrain(coordinates)
         start = InitialConditions(from_rest=True)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.fit.fitted import VOLTAGE_NOISE
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import planned_noise
 from bwbayes.app.running.run import resume
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.errors import InputError
-from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.inference.study import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws
@@ -45,37 +45,41 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def problem(folder: Path) -> Problem:
+def problem(folder: Path) -> Run:
     return resolve_config(parse(TEXT, "my.toml"), folder)
 
 
-def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(problem: Problem) -> None:
-    record, measured = problem.record, noisy_record(1)
+def test_the_model_is_driven_by_the_path_and_the_record_stays_as_measured(problem: Run) -> None:
+    record, measured = problem.study.record, noisy_record(1)
     np.testing.assert_array_equal(record.voltage, measured.voltage)
     assert record.sha256 == measured.sha256
-    np.testing.assert_array_equal(problem.posterior.single_record.voltage, record.path.voltage)
+    np.testing.assert_array_equal(
+        problem.study.posterior.single_record.voltage, record.path.voltage
+    )
     assert np.std(record.path.voltage - record.voltage) > 0.1
-    said = [remark for remark in problem.remarks if "voltage has noise of 0.1" in remark]
+    said = [remark for remark in problem.record_remarks if "voltage has noise of 0.1" in remark]
     assert [remark.split(":")[0] for remark in said] == ["record", "next"]
-    draws = problem.posterior.prior.draw(np.random.default_rng(0), 20)
+    draws = problem.study.posterior.prior.draw(np.random.default_rng(0), 20)
     rng = np.random.default_rng(0)
-    (bands,) = predict_windows(problem.posterior, draws, record, {"all": slice(0, 5000)}, rng)
+    (bands,) = predict_windows(problem.study.posterior, draws, record, {"all": slice(0, 5000)}, rng)
     np.testing.assert_array_equal(bands.voltage, record.path.voltage)
     other = noisy_record(2)
-    bands = predict_record(problem.posterior, draws, other, InitialConditions(from_rest=True), rng)
+    bands = predict_record(
+        problem.study.posterior, draws, other, InitialConditions(from_rest=True), rng
+    )
     np.testing.assert_array_equal(bands.voltage, other.path.voltage)
 
 
 def test_a_folder_keeps_the_voltage_as_measured_and_drives_the_model_alike(
-    problem: Problem, tmp_path: Path
+    problem: Run, tmp_path: Path
 ) -> None:
     kept = RunFolder.create(tmp_path / "run", problem, overwrite=False)
-    again = RunFolder.open(kept.path).problem()
-    np.testing.assert_array_equal(again.record.voltage, problem.record.voltage)
+    again = Run(RunFolder.open(kept.path))
+    np.testing.assert_array_equal(again.study.record.voltage, problem.study.record.voltage)
     np.testing.assert_array_equal(
-        again.posterior.single_record.voltage, problem.posterior.single_record.voltage
+        again.study.posterior.single_record.voltage, problem.study.posterior.single_record.voltage
     )
-    assert again.remarks == problem.remarks
+    assert again.record_remarks == problem.record_remarks
 
 
 def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(
@@ -86,7 +90,7 @@ def test_a_runs_draws_are_wider_by_what_the_path_leaves_unsure(
     text = f"{TEXT}{model}[sampling]\ness = 100\nsteps = 200\nblock = 25\n"
     kept = RunFolder.create(tmp_path / "run", resolve_config(parse(text, "my.toml"), folder))
     fit = resume(kept, small.quiet(), workers=1, predict=False)
-    posterior, chain = fit.problem.posterior, fit.chain
+    posterior, chain = fit.study.posterior, fit.chain
     more = np.array(json.loads(str(chain.attributes()[VOLTAGE_NOISE])))
     column = posterior.names.index("d")
     assert more[column, column] > 0.1 * chain.point.covariance[column, column]
@@ -120,5 +124,7 @@ def test_noise_on_a_planned_voltage_is_said() -> None:
 def test_a_command_is_what_it_says(folder: Path) -> None:
     text = TEXT.replace('"noisy.h5"\n', '"noisy.h5"\nvoltage_is = "command"\n')
     problem = resolve_config(parse(text, "my.toml"), folder)
-    np.testing.assert_array_equal(problem.posterior.single_record.voltage, problem.record.voltage)
-    assert not any(remark.startswith("record: voltage has") for remark in problem.remarks)
+    np.testing.assert_array_equal(
+        problem.study.posterior.single_record.voltage, problem.study.record.voltage
+    )
+    assert not any(remark.startswith("record: voltage has") for remark in problem.record_remarks)

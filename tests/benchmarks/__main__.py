@@ -79,7 +79,7 @@ main.add_command(campaigns)
 
 def _measured(*, quick: bool) -> Iterator[tuple[str, Table]]:
     rounds = 2 if quick else 7
-    posterior = models.paper_record().posterior
+    posterior = models.paper_record().study.posterior
     yield "engines", models.engines(posterior, rounds)
     yield "threads", models.threads(posterior, rounds)
     yield from runs.sampling(rounds, 800 if quick else 6000)

@@ -17,7 +17,7 @@ from rich.console import Console
 import bwbayes as bw
 from bwbayes.app.config.config import load
 from bwbayes.app.jobs.campaign import Campaign, config_text, resume, start
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from tests.benchmarks.measuring import ROOT, timed
 from tests.measured import keep
 
@@ -39,7 +39,9 @@ def written(folder: Path, count: int) -> None:
         parts = {"parameters": config.stand.parameters | drawn, "model": model}
         stand = config.stand.model_copy(update=parts)
         one = config.model_copy(update={"seed": number + 1, "stand": stand})
-        bw.write_record(resolve_config(one, ROOT / "runs").record, folder / f"s{number:04d}.csv")
+        bw.write_record(
+            resolve_config(one, ROOT / "runs").study.record, folder / f"s{number:04d}.csv"
+        )
 
 
 @click.command()

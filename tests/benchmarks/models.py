@@ -7,7 +7,8 @@ from functools import partial
 import numpy as np
 
 from bwbayes.app.config.config import load
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.control.sampled import SampledModel
 from bwbayes.inference.posterior import Posterior
@@ -33,7 +34,7 @@ MODELS, ESS = 64, 4000.0
 SAMPLES, DRAWS = 500, 1000
 
 
-def paper_record() -> Problem:
+def paper_record() -> Run:
     """Return the problem of the paper's record, with the target of effective draws."""
     config = load(ROOT / "runs" / "ring_bender.toml")
     sampling = config.sampling.model_copy(update={"ess": ESS, "engine": "numba"})

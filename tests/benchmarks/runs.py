@@ -24,13 +24,14 @@ from arviz_stats.base import array_stats  # not in an __all__
 from emcee.moves import StretchMove
 
 from bwbayes.app.config.config import load
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.calibrate import experiment
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import open_executor
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.calibration.replicates import replicate
 from bwbayes.inference import map_estimate
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import generator
 from bwbayes.sampling.chain import Block, Chain, EnsembleState, Phase
 from bwbayes.sampling.diagnostics import ConvergenceDiagnostics, SamplingResult, as_chains
 from bwbayes.sampling.ensemble import advance
@@ -43,7 +44,7 @@ PARTS = ("point fit", "pilot", "tuning", "sampling", "checks")
 
 
 @dataclass(frozen=True)
-class Run:
+class OurRun:
     """A run of ours: its chain and outcome, and the seconds that each part of it took."""
 
     chain: Chain
@@ -56,9 +57,9 @@ class Run:
         return float(np.min([self.outcome.check.ess_bulk, self.outcome.check.ess_tail]))
 
 
-def our_run(problem: Problem) -> Run:
+def our_run(problem: Run) -> OurRun:
     """Fit, start and sample as a run does, with two workers."""
-    posterior, seed = problem.posterior, problem.config.seed
+    posterior, seed = problem.study.posterior, problem.config.seed
     seconds = dict.fromkeys(PARTS, 0.0)
     last = time.perf_counter()
 
@@ -76,7 +77,7 @@ def our_run(problem: Problem) -> Run:
     passed("point fit")
     with open_executor(2, posterior.engine) as pool:
         outcome = sample(posterior, problem.plan, chain, pool, watcher)
-    return Run(chain, outcome, seconds)
+    return OurRun(chain, outcome, seconds)
 
 
 def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
@@ -86,14 +87,14 @@ def stretched(posterior: Posterior, state: EnsembleState, steps: int) -> Block:
 def sampling(rounds: int, steps: int) -> Iterator[tuple[str, Table]]:
     """Measure whole runs and the stretch move of so many steps, and the ratios between them."""
     paper = paper_record()
-    posterior = paper.posterior
+    posterior = paper.study.posterior
     # What is not timed: the first call on the compiled engine, and a first run to start from.
     first = our_run(paper)
     draws = first.chain.coordinates("sampling").reshape(-1, posterior.prior.dimensions)
     chosen = np.random.default_rng(1).choice(len(draws), MODELS, replace=False)
     density = posterior.log_density(draws[chosen])
     state = replace(first.chain.ends[0], coordinates=draws[chosen], log_density=density)
-    runs: list[Run] = []
+    runs: list[OurRun] = []
     calls: dict[str, Call] = {
         name: partial(stretched, one, state, 1) for name, one in by_engine(posterior).items()
     }

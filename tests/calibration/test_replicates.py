@@ -22,10 +22,10 @@ from bwbayes.calibration.replicates import (
 from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import resolve_engine
 from bwbayes.inference.noise import WhiteNoise
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import KINDS, LEVELS
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record.record import Record
 from bwbayes.sampling.chain import draws
 from bwbayes.sampling.plan import SamplingPlan

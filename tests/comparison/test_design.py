@@ -19,7 +19,7 @@ from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
-from bwbayes.inference.study import Study, TrainingRecord
+from bwbayes.inference.study import Study
 from bwbayes.model.inputs import Limits
 from bwbayes.model.spec import ModelSpec
 from tests.inference.linear import Linear
@@ -174,8 +174,13 @@ def test_drives_that_tell_rivals_apart_are_told_from_those_that_do_not() -> None
     stand = Stand(lag=0.005, discrepancy=0.0, sensor=0.5)
     time = np.arange(SAMPLES) / stand.rate
     voltage = 50 * (1 - np.cos(2 * np.pi * time)) * np.exp(-0.1 * time)
-    training = TrainingRecord(stand.measure(voltage, rng), (slice(0, SAMPLES),), from_rest=True)
-    study = Study(ModelSpec(noise="smooth"), {"record": training}, engine="numba")
+    study = Study(
+        ModelSpec(noise="smooth"),
+        {"record": stand.measure(voltage, rng)},
+        {"record": (slice(0, SAMPLES),)},
+        frozenset({"record"}),
+        engine="numba",
+    )
     posterior = study.posterior
     fits = {}
     for spec in (study.spec, study.spec.with_stages("duhem")):

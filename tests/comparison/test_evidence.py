@@ -16,9 +16,8 @@ from scipy import integrate, stats
 
 from bwbayes.app.config.config import load
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import one_thread
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.comparison.evidence import (
     BLOCKS,
@@ -33,6 +32,7 @@ from bwbayes.comparison.evidence import (
 )
 from bwbayes.inference.parameters import JointPrior
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import generator
 from bwbayes.model.declaration import Distribution
 from bwbayes.record import Record, write_record
 from bwbayes.sampling.chain import draws, log_densities
@@ -125,7 +125,7 @@ def test_nested_sampling_agrees_on_the_measured_record(tmp_path: Path) -> None:
     )
     source = RecordConfig(file="t.h5", train=config.record.train)
     problem = resolve_config(config.model_copy(update={"record": source}), tmp_path)
-    made = estimated(problem.posterior, problem.plan, generator(1, "evidence"))
+    made = estimated(problem.study.posterior, problem.plan, generator(1, "evidence"))
     away = made.log_evidence + made.log_prior_mass - np.mean(known["log_evidence"])
     keep("log evidence of the measured record", {"less dynesty's": round(float(away), 3)})
     assert abs(away) < 0.1
@@ -138,7 +138,7 @@ def test_nested_sampling_agrees() -> None:
     """
     problem = resolve_config(load(FOLDER / "virtual.toml"), FOLDER)
     plan = replace(problem.plan, ess=1000.0)
-    made = estimated(problem.posterior, plan, generator(1, "evidence"))
+    made = estimated(problem.study.posterior, plan, generator(1, "evidence"))
     reference = json.loads((FOLDER / "virtual.json").read_text(encoding="utf-8"))
     known = np.mean(reference["log_evidence"])
     assert abs(made.log_evidence + made.log_prior_mass - known) < 0.1

@@ -22,9 +22,9 @@ from bwbayes.app.config.config import Config
 from bwbayes.app.config.keywords import config_of, models_of
 from bwbayes.app.fit.fitted import open_finished
 from bwbayes.app.jobs.compare import compare_models
-from bwbayes.app.problem.problem import resolve_config
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import begin
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.comparison.comparison import Comparison
 from bwbayes.record import Record
@@ -80,7 +80,7 @@ def plant(model: str, seed: int) -> tuple[Record, Record]:
     (parts,) = models_of(model, config.model).values()
     posterior = resolve_config(
         config.model_copy(update={"model": parts}), Path(), records
-    ).posterior
+    ).study.posterior
     theta = posterior.prior.theta(posterior.prior.draw(rng, 1))
     actuator = posterior.likelihood.actuator
     of_actuator = posterior.single_record.table.actuator(theta)
@@ -124,11 +124,14 @@ def errors(comparison: Comparison, folder: Path, fresh: Record) -> dict[str, flo
         if candidate.converged:
             mean = open_finished(run).predict(planned, from_rest=True, estimate_offset=False).mean
         else:
-            problem, point = begin(run)
-            free, _ = problem.posterior.prior.constrain(point.mode[np.newaxis])
-            theta = problem.posterior.prior.theta(free)
-            mean = problem.posterior.likelihood.actuator.displacement(
-                problem.posterior.single_record.table.actuator(theta), fresh.voltage, from_rest=True
+            begun = begin(run)
+            posterior, point = begun.study.posterior, begun.chain.point
+            free, _ = posterior.prior.constrain(point.mode[np.newaxis])
+            theta = posterior.prior.theta(free)
+            mean = posterior.likelihood.actuator.displacement(
+                posterior.single_record.table.actuator(theta),
+                fresh.voltage,
+                from_rest=True,
             )[0]
         made[candidate.name] = float(np.sqrt(np.mean((fresh.displacement - mean) ** 2)))
     return made

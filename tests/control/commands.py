@@ -5,16 +5,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from bwbayes.app.config.config import parse
 from bwbayes.app.config.keywords import config_of
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
-from bwbayes.app.running.folder import RunFolder
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import Compensation, compensate
 from bwbayes.control.references import Reference
@@ -37,14 +35,13 @@ LIMITS = Limits(-100.0, 100.0)
 SENSOR, DISCREPANCY, TIME, FAST = 0.1, 0.3, 0.5, 10_000.0
 
 
-def fit_of(problem: Problem, flat: FloatArray) -> Run:
+def fit_of(problem: Run, flat: FloatArray) -> Run:
     """Return a fit with draws (draws, free) that come from no chain."""
-    fit = Run(cast(Any, None), RunFolder(Path()))
-    return fit.with_cache(problem=problem, flat_draws=flat, standing=ValidationSummary())
+    return problem.with_cache(flat_draws=flat, standing=ValidationSummary())
 
 
 @cache
-def problem(discrepancy: str = "process", rate: float = 100.0, seed: int = 1) -> Problem:
+def problem(discrepancy: str = "process", rate: float = 100.0, seed: int = 1) -> Run:
     """Return that of the ring bender with the command for a voltage."""
     text = CONFIG.read_text(encoding="utf-8").replace(
         'discrepancy = "process"', f'discrepancy = "{discrepancy}"\nsample_rate = {rate}'
@@ -53,7 +50,7 @@ def problem(discrepancy: str = "process", rate: float = 100.0, seed: int = 1) ->
     return resolve_config(config.model_copy(update={"seed": seed}), CONFIG.parent)
 
 
-def measured_voltage(rate: float, seed: int = 1) -> Problem:
+def measured_voltage(rate: float, seed: int = 1) -> Run:
     """Return that of a ring bender whose amplifier's output is measured at a rate, Hz.
 
     The amplifier moves as fast as it can, whatever the rate, and the discrepancy is small.
@@ -84,29 +81,29 @@ def discrepancy(samples: int, interval: float, source: np.random.Generator) -> F
     return noise.draw(np.array([[0.0, DISCREPANCY, TIME]]), samples, source)[0]
 
 
-def drawn(of: Problem) -> FloatArray:
+def drawn(of: Run) -> FloatArray:
     """Fit a problem, and return a thousand draws (draws, free)."""
-    outcome, chain = sampled(of)
+    outcome, chain = sampled(of.study.posterior, of.plan, of.study.seed)
     assert outcome.converged, outcome.stop_reason
-    flat = draws(of.posterior, chain).reshape(-1, len(of.posterior.names))
-    return thin_draws(flat, generator(of.config.seed, "draws"))
+    flat = draws(of.study.posterior, chain).reshape(-1, len(of.study.posterior.names))
+    return thin_draws(flat, of.study.generator("draws"))
 
 
-def about(of: Problem, spread: float, count: int, source: np.random.Generator) -> FloatArray:
+def about(of: Run, spread: float, count: int, source: np.random.Generator) -> FloatArray:
     """Return draws (draws, free) about the truth, each parameter with this relative sd."""
     truth = of.config.truth
-    known = np.array([truth.get(name, 0.5) for name in of.posterior.names])
+    known = np.array([truth.get(name, 0.5) for name in of.study.posterior.names])
     scale = np.where(known == 0.0, 1.0, known)
     return known + spread * scale * source.standard_normal((count, known.size))
 
 
-def compensated(of: Problem, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
+def compensated(of: Run, asked: Reference, flat: FloatArray, **options: Any) -> Compensation:
     options = {"from_rest": True, "limits": LIMITS, **options}
-    return compensate(of.posterior, flat, asked, np.random.default_rng(7), **options)
+    return compensate(of.study.posterior, flat, asked, np.random.default_rng(7), **options)
 
 
 def promised(
-    of: Problem,
+    of: Run,
     command: Compensation,
     truths: FloatArray,
     source: np.random.Generator,
@@ -118,8 +115,8 @@ def promised(
     Each plays the command by a DAC, which holds it, after another voltage, and has a sample at
     which it is judged.
     """
-    record = of.posterior.single_record
-    theta = of.posterior.prior.theta(truths)
+    record = of.study.posterior.single_record
+    theta = of.study.posterior.prior.theta(truths)
     actuator = replace(record.actuator, interval=command.reference.interval, hold="zero")
     noise = record.noise.at(command.reference.interval)
     samples = np.arange(command.voltage.size)[judged]

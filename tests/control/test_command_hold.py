@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.control import export
-from bwbayes.app.problem.problem import Problem
 from bwbayes.control.references import Reference, build_reference
 from bwbayes.model.inputs import Hold
 from tests.control.commands import (
@@ -35,7 +35,7 @@ RATE, SEEDS, PLAYS = 200.0, 40, 5
 
 
 @pytest.fixture(scope="module")
-def measured() -> Problem:
+def measured() -> Run:
     return measured_voltage(RATE)
 
 
@@ -45,12 +45,12 @@ def asked() -> Reference:
 
 
 @pytest.mark.parametrize("fitted", ["command", "output"])
-def test_by_default_a_command_is_for_a_dac(
-    measured: Problem, asked: Reference, fitted: str
-) -> None:
+def test_by_default_a_command_is_for_a_dac(measured: Run, asked: Reference, fitted: str) -> None:
     """With the right model the stand is at the reference but for the DAC's steps of 0.1 V."""
     of = measured if fitted == "output" else problem()
-    assert ("first" if fitted == "output" else "zero") == of.posterior.single_record.actuator.hold
+    assert (
+        "first" if fitted == "output" else "zero"
+    ) == of.study.posterior.single_record.actuator.hold
     flat = about(of, 0.0, 2, np.random.default_rng(1))
     command = compensated(of, asked, flat)
     assert ("zero", "zoh", "command") == (
@@ -66,20 +66,20 @@ def test_by_default_a_command_is_for_a_dac(
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
 def test_between_samples_the_displacement_is_where_it_is_said_to_be(
-    measured: Problem, asked: Reference, hold: Hold
+    measured: Run, asked: Reference, hold: Hold
 ) -> None:
     """Against the stand's actuator at a hundred times the rate."""
     flat = about(measured, 0.0, 2, np.random.default_rng(1))
     command = compensated(measured, asked, flat, hold=hold)
     actuator = replace(
-        measured.posterior.single_record.actuator, interval=asked.interval / 100, hold=hold
+        measured.study.posterior.single_record.actuator, interval=asked.interval / 100, hold=hold
     )
     samples, fine = np.arange(asked.time.size), np.arange(100 * (asked.time.size - 1) + 1) / 100
     voltage = np.interp(fine, samples, command.voltage)
     if hold == "zero":
         voltage = np.repeat(command.voltage, 100)[: fine.size]
-    theta = measured.posterior.single_record.table.actuator(
-        measured.posterior.prior.theta(flat[:1])
+    theta = measured.study.posterior.single_record.table.actuator(
+        measured.study.posterior.prior.theta(flat[:1])
     )
     moved = actuator.displacement(theta, voltage, from_rest=True)[0]
     between = np.max(np.abs(moved - np.interp(fine, samples, moved[::100])))
@@ -87,13 +87,13 @@ def test_between_samples_the_displacement_is_where_it_is_said_to_be(
     assert command.summary["between_samples_um"] == command.between
     # A command that does well at its samples alone says so.
     assert not any("shorter sampling interval" in remark for remark in command.remarks)
-    flat[:, measured.posterior.names.index("discrepancy_sd")] = 1e-6
+    flat[:, measured.study.posterior.names.index("discrepancy_sd")] = 1e-6
     smooth = Reference(asked.displacement, asked.interval)
     command = compensated(measured, smooth, flat, hold=hold)
     assert any("shorter sampling interval" in remark for remark in command.remarks)
 
 
-def test_truths_are_where_a_command_for_a_dac_says(measured: Problem, asked: Reference) -> None:
+def test_truths_are_where_a_command_for_a_dac_says(measured: Run, asked: Reference) -> None:
     """The twin goes in straight lines between samples as the measured voltage did; it is found."""
     source = np.random.default_rng(3)
     flat, truths = (about(measured, 0.005, count, source) for count in (2000, 400))
@@ -104,7 +104,7 @@ def test_truths_are_where_a_command_for_a_dac_says(measured: Problem, asked: Ref
     assert max(result["band", 95], result["rms", 95]) < -4.0, result
 
 
-def test_a_model_is_exported_for_a_dac(measured: Problem, tmp_path: Path) -> None:
+def test_a_model_is_exported_for_a_dac(measured: Run, tmp_path: Path) -> None:
     """Whatever the voltage did in the record, unless it is said."""
     flat = about(measured, 0.001, 3, np.random.default_rng(1))
     held = export(fit_of(measured, flat), tmp_path / "held")

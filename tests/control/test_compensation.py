@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.workers import one_thread
 from bwbayes.arrays import FloatArray
 from bwbayes.control.references import SHAPES, Reference, build_reference
 from bwbayes.errors import InputError
 from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference.study import generator
 from bwbayes.prediction.bands import LEVELS
 from bwbayes.record.waveforms import signal
 from tests.control.commands import (
@@ -57,8 +57,8 @@ def test_errors_are_ten_times_smaller_on_the_stand_with_the_right_model() -> Non
     """Fitted to the paper's identification signal without discrepancy; rms over each reference."""
     of = problem("none")
     with one_thread():
-        point = pointfit.fit(of.posterior, generator(1, "point fit"))
-    flat = of.posterior.prior.constrain(point.mode[np.newaxis])[0].repeat(2, axis=0)
+        point = pointfit.fit(of.study.posterior, generator(1, "point fit"))
+    flat = of.study.posterior.prior.constrain(point.mode[np.newaxis])[0].repeat(2, axis=0)
     smaller = {}
     for name, asked in references(1e-3).items():
         command = compensated(of, asked, flat)
@@ -99,8 +99,8 @@ def test_truths_that_ran_before_are_where_a_command_from_any_state_says(asked: R
     """The twin, which takes them to be demagnetized, is found."""
     of, source = problem(), np.random.default_rng(3)
     flat, truths = (about(of, 0.02, 400, source) for _ in range(2))
-    flat[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
-    truths[:, of.posterior.names.index("discrepancy_sd")] *= 0.4
+    flat[:, of.study.posterior.names.index("discrepancy_sd")] *= 0.4
+    truths[:, of.study.posterior.names.index("discrepancy_sd")] *= 0.4
 
     # Before the first swing all are where they stand, after it they have forgotten how they came.
     samples = asked.time.size
@@ -131,7 +131,7 @@ def test_errors_are_those_to_the_reference_as_requested(asked: Reference) -> Non
     of, source = problem(), np.random.default_rng(3)
     flat = about(of, 0.0, 2, source)
     # Nearly: a discrepancy has a sd.
-    flat[:, of.posterior.names.index("discrepancy_sd")] = 1e-9
+    flat[:, of.study.posterior.names.index("discrepancy_sd")] = 1e-9
     command = compensated(of, asked, flat, limit=0.1)
     moved = asked.given - np.asarray(asked.displacement)
     assert np.max(np.abs(moved)) == asked.moved > 0.5

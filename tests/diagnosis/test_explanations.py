@@ -29,7 +29,7 @@ from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import normal
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, FINE, RATE, drawn, hysteresis, lagged, plant
-from tests.prediction.runs import problem_of
+from tests.prediction.runs import study_of
 from tests.stand import Stand, play
 
 
@@ -39,10 +39,10 @@ def scene(
     (folder / "record.h5").unlink(missing_ok=True)
     write_record(plant(kind, (5, seed), seconds), folder / "record.h5")
     text = f'[record]\nfile = "record.h5"\nfrom_rest = true\n[parameters]\n{parameters}\n'
-    problem = problem_of(text, folder)
+    study = study_of(text, folder)
     rng = np.random.default_rng(seed)
-    point = pointfit.fit(problem.posterior, rng)
-    return ResidualAnalysis.of(problem.posterior, point.optima, rng, problem.study)
+    point = pointfit.fit(study.posterior, rng)
+    return ResidualAnalysis.of(study.posterior, point.optima, rng, study)
 
 
 LINEAR = """
@@ -64,14 +64,14 @@ discrepancy_time = { fixed = 0.2 }
 def test_the_evidence_of_a_linear_model_is_that_of_the_dense_gaussian(tmp_path: Path) -> None:
     """With gain and offset free alone, and a trend of an unknown size, all is jointly normal."""
     write_record(plant("drift", (5, 1), seconds=2.0), tmp_path / "record.h5")
-    problem = problem_of(f'[record]\nfile = "record.h5"\nfrom_rest = true\n{LINEAR}', tmp_path)
-    posterior, readings = problem.posterior, problem.posterior.single_record.readings.values
-    time = problem.record.time
+    study = study_of(f'[record]\nfile = "record.h5"\nfrom_rest = true\n{LINEAR}', tmp_path)
+    posterior, readings = study.posterior, study.posterior.single_record.readings.values
+    time = study.record.time
     stated = {"drift": Stated(normal(0.0, 2.0)), "drift_curvature": Stated(fixed=0.0)}
-    drifting = problem.study.with_model(problem.study.spec.with_stages("drift"), stated).posterior
-    lag = problem.record.interval * np.abs(np.subtract.outer(*2 * [np.arange(readings.size)]))
+    drifting = study.with_model(study.spec.with_stages("drift"), stated).posterior
+    lag = study.record.interval * np.abs(np.subtract.outer(*2 * [np.arange(readings.size)]))
     covariance = 0.25 * np.exp(-lag / 0.2) + 0.09 * np.eye(readings.size)
-    covariance += 0.09 * np.outer(problem.record.voltage, problem.record.voltage) + 25.0
+    covariance += 0.09 * np.outer(study.record.voltage, study.record.voltage) + 25.0
     center = posterior.simulate(posterior.prior.theta(np.array([[0.7, 0.0]])))[0]
     for model_of, added in ((posterior, 0.0), (drifting, 4 * np.outer(time, time))):
         exact = multivariate_normal.logpdf(readings, center, covariance + added)
@@ -157,10 +157,10 @@ def test_a_late_column_is_named_with_its_delay_up_to_a_quarter_of_the_period(
     other = slice(rows.start + count, rows.stop + count)
     record = Record(fine[::FINE][other], readings[rows], interval=1 / RATE)
     write_record(record, tmp_path / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\n', tmp_path)
+    study = study_of('[record]\nfile = "record.h5"\n', tmp_path)
     rng = np.random.default_rng(1)
-    optima = pointfit.fit(problem.posterior, rng).optima
-    analysis = ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
+    optima = pointfit.fit(study.posterior, rng).optima
+    analysis = ResidualAnalysis.of(study.posterior, optima, rng, study)
     delays = [*DEFECTS["delay"].explanations(analysis), *LONG_DELAY.explanations(analysis)]
     found = max(delays, key=lambda explanation: explanation.nats)
     assert found.nats > LIMIT
@@ -229,14 +229,14 @@ def test_a_step_among_readings_that_are_held_out_has_its_own_time(
 ) -> None:
     """Not that of the first reading after them, where the fit comes upon it."""
     write_record(plant("good", (5, 2), 5.0), tmp_path / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
-    shifted = problem.posterior.single_record.displacement + 5.0 * (problem.record.time >= time)
+    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    shifted = study.posterior.single_record.displacement + 5.0 * (study.record.time >= time)
     windows = slice(0, 320), slice(480, 1000)
-    posterior = problem.posterior.altered(displacement=shifted, training=windows)
+    posterior = study.posterior.altered(displacement=shifted, training=windows)
     rng = np.random.default_rng(0)
     optima = pointfit.fit(posterior, rng).optima
     held_out = [slice(320, 480)]
-    analysis = ResidualAnalysis.of(posterior, optima, rng, problem.study, held_out)
+    analysis = ResidualAnalysis.of(posterior, optima, rng, study, held_out)
     (found,) = DEFECTS["step"].explanations(analysis)
     assert found.nats > LIMIT
     assert found.text.endswith(f"um at {time:g} s")
@@ -258,10 +258,10 @@ def test_no_model_gains_more_than_the_discrepancy_takes_up(tmp_path: Path) -> No
     good = Stand(discrepancy=0.0, sensor=0.1)
     record = good.measure(100 * np.sin(0.02 * np.pi * np.arange(800.0)), np.random.default_rng(1))
     write_record(record, tmp_path / "record.h5")
-    problem = problem_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
+    study = study_of('[record]\nfile = "record.h5"\nfrom_rest = true\n', tmp_path)
     rng = np.random.default_rng(0)
-    optima = pointfit.fit(problem.posterior, rng).optima
-    small = ResidualAnalysis.of(problem.posterior, optima, rng, problem.study)
+    optima = pointfit.fit(study.posterior, rng).optima
+    small = ResidualAnalysis.of(study.posterior, optima, rng, study)
     assert small.unexplained < LIMIT
     fitted: list[float] = []
     explain(small, fitted.append)
@@ -308,7 +308,7 @@ def test_creep_that_began_before_the_record_errs_by_the_sensor_alone(tmp_path: P
         creep = [0.1, 1.0, 10.0]
         dynamics = "none"
         """
-    posterior = problem_of(text, tmp_path).posterior
+    posterior = study_of(text, tmp_path).posterior
     fitted = climb(posterior, pointfit.fit(posterior, rng).optima)
     assert fitted.rmse == pytest.approx(0.01, rel=0.05)
     assert fitted.error([slice(0, 500)]) == pytest.approx(0.01, rel=0.1)
@@ -337,14 +337,14 @@ def test_plays_that_a_first_load_has_moved_are_told_from_plays_that_ran(
         dynamics = "none"
         noise = "discrepancy"
         """
-    problem = problem_of(text, tmp_path)
-    point = pointfit.fit(problem.posterior, rng)
-    analysis = ResidualAnalysis.of(problem.posterior, point.optima, rng, problem.study)
+    study = study_of(text, tmp_path)
+    point = pointfit.fit(study.posterior, rng)
+    analysis = ResidualAnalysis.of(study.posterior, point.optima, rng, study)
     (history,) = model.history(analysis)
     assert (history.nats > 100) if loaded else (history.nats < 0)
     # The fix, once it is taken, is the whole cure.
     assert history.spec is not None
-    cured = replace(analysis, study=problem.study.with_model(history.spec))
+    cured = replace(analysis, study=study.with_model(history.spec))
     assert not [*model.history(cured)]
 
 

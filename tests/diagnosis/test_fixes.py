@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.parameters import with_model
-from bwbayes.app.problem.problem import Problem
+from bwbayes.app.config.settings import ParameterConfig
 from bwbayes.app.running.explaining import explain_record
 from bwbayes.diagnosis.explanations import likely_causes
 from bwbayes.diagnosis.residual_analysis import Explanation
@@ -25,7 +24,7 @@ from bwbayes.inference import map_estimate as pointfit
 from bwbayes.record import Record, write_record
 from tests.diagnosis.plants import CAUSES, bench
 from tests.measured import keep
-from tests.prediction.runs import covered, judge, problem_of
+from tests.prediction.runs import covered, judge, study_of
 
 SEEDS, GOOD = range(10, 30), 100
 
@@ -67,15 +66,19 @@ def shifted(record: Record, delay: float) -> Record:
     return replace(record, voltage=voltage)
 
 
-def followed(
-    config: Config, problem: Problem, cause: Explanation, kind: str, seed: int, folder: Path
-) -> Config:
+def followed(config: Config, cause: Explanation, kind: str, seed: int, folder: Path) -> Config:
     """Do what a fix says, in the files and in the config that is returned."""
     made = bench(kind, (6, seed))
     (record,) = config.records.values()
     records: Sequence[Record] = made.records
     if cause.spec is not None and "[model]" in cause.fix:
-        return with_model(config, cause.spec, problem.records, cause.stated)
+        stated = {name: ParameterConfig(**one.keys) for name, one in (cause.stated or {}).items()}
+        return config.model_copy(
+            update={
+                "model": config.model.with_spec(cause.spec),
+                "parameters": {**config.parameters, **stated},
+            }
+        )
     if "set outliers = true" in cause.fix:
         model = config.model.model_copy(update={"outliers": True})
         return config.model_copy(update={"model": model})
@@ -111,13 +114,13 @@ def study(kind: str, seed: int, folder: Path) -> SamplingResult:
     """Fit a plant, follow the leading cause's fix, if there is one, and predict the next record."""
     put(bench(kind, (6, seed)).records, folder)
     config = parse(CONFIG, "config")
-    problem = problem_of(config, folder)
+    study = study_of(config, folder)
     source = np.random.default_rng((6, seed))
-    point = pointfit.fit(problem.posterior, source)
-    found = likely_causes(explain_record(problem, "record", point.optima))
+    point = pointfit.fit(study.posterior, source)
+    found = likely_causes(explain_record(study, "record", point.optima))
     if found:
-        config = followed(config, problem, found[0], kind, seed, folder)
-    judged = judge(problem_of(config, folder), source, again=False)
+        config = followed(config, found[0], kind, seed, folder)
+    judged = judge(study_of(config, folder), source, again=False)
     return SamplingResult(
         tuple(cause.kind for cause in found),
         bool({cause.kind for cause in found} & CAUSES.get(kind, set())),

@@ -14,7 +14,7 @@ from bwbayes.diagnosis.validation import BandValidation
 from tests.diagnosis.plants import CAUSES, bench
 from tests.diagnosis.test_fixes import CONFIG, put
 from tests.measured import keep
-from tests.prediction.runs import covered, judge, problem_of
+from tests.prediction.runs import covered, judge, study_of
 
 SEEDS, GOOD = range(5), 100
 
@@ -22,7 +22,7 @@ SEEDS, GOOD = range(5), 100
 def fitted(kind: str, seed: int, folder: Path) -> tuple[BandValidation, float]:
     put(bench(kind, (7, seed)).records, folder)
     source = np.random.default_rng((7, seed))
-    judged = judge(problem_of(parse(CONFIG, "config"), folder), source)
+    judged = judge(study_of(parse(CONFIG, "config"), folder), source)
     return judged.validation["training"], covered(judged.bands["next"])
 
 

@@ -2,19 +2,21 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
-from bwbayes.app.running.predictions import Prediction, RivalsOf, predict_after, predict_another
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.drive_lock import drive_locks
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.rivals import Rival, families, fit_rivals
 from bwbayes.inference import map_estimate
+from bwbayes.inference.study import generator
 from bwbayes.model.spec import ModelSpec
 from bwbayes.prediction.bands import KINDS, LEVELS
 from bwbayes.record import Record
@@ -50,32 +52,34 @@ def measured(kind: str, voltage: FloatArray, rng: np.random.Generator) -> Record
     return replace(record, displacement=moved + STAND.sensor * rng.standard_normal(moved.size))
 
 
-def fitted(kind: str, folder: Path) -> tuple[Problem, FloatArray]:
-    """Return a problem and draws (draws, free) of Laplace's approximation."""
+def fitted(kind: str, folder: Path) -> Run:
+    """Return a run whose draws (draws, free) are those of Laplace's approximation."""
     rng = np.random.default_rng(54)
     for name, voltage in DRIVES.items():
         write_record(measured(kind, voltage, rng), folder / f"{name}.h5")
     problem = resolve_config(parse(CONFIG, "config"), folder)
-    posterior = problem.posterior
+    posterior = problem.study.posterior
     fit = climb(posterior, map_estimate.local_minima(posterior, rng, 1))
     drawn = rng.multivariate_normal(fit.coordinates, fit.covariance, 300, method="eigh")
     free, density = posterior.prior.constrain(drawn)
-    return problem, free[np.isfinite(density)]
+    return problem.with_cache(flat_draws=free[np.isfinite(density)])
 
 
 class Rivals:
     """The rivals of a problem's model, fitted once, if its error follows the drive."""
 
-    def __init__(self, problem: Problem, draws: FloatArray) -> None:
-        self.problem = problem
-        lock = drive_locks(problem.posterior, draws, generator(1, "drive lock"))["record"]
+    def __init__(self, problem: Run) -> None:
+        self.study = problem.study
+        lock = drive_locks(self.study.posterior, problem.flat_draws, generator(1, "drive lock"))[
+            "record"
+        ]
         self.locked = lock.locked
         self.fitted: tuple[Rival, ...] | None = None
 
     def __call__(self, of: str, _: object) -> tuple[Rival, ...] | None:
         """Return them, or None."""
         if self.locked and self.fitted is None:
-            self.fitted = fit_rivals(self.problem.study.for_record(of), generator(1, "rivals"))
+            self.fitted = fit_rivals(self.study.for_record(of), generator(1, "rivals"))
         return self.fitted
 
 
@@ -83,8 +87,9 @@ def agreeing(*_: object) -> tuple[Rival, ...]:
     return ()
 
 
-def predicted(problem: Problem, draws: FloatArray, name: str, rivals: RivalsOf) -> Prediction:
-    return predict_another(problem, draws, problem.validations[name], name, rivals)
+def predicted(problem: Run, name: str, rivals: Any) -> Prediction:
+    run = problem.with_cache(widening_rivals=rivals)
+    return predict_another(run, problem.study.validations[name], name)
 
 
 def require_wider(wide: Prediction, narrow: Prediction) -> None:
@@ -108,11 +113,11 @@ def require_wider(wide: Prediction, narrow: Prediction) -> None:
 
 def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None:
     """Like drives have not; forecasts have; the parameters' bands stay, a note says both widths."""
-    problem, draws = fitted("backlash", tmp_path)
-    rivals = Rivals(problem, draws)
-    assert predicted(problem, draws, "like", rivals).model_error_sd is None
+    problem = fitted("backlash", tmp_path)
+    rivals = Rivals(problem)
+    assert predicted(problem, "like", rivals).model_error_sd is None
     assert rivals.fitted is None
-    wide, narrow = (predicted(problem, draws, "unlike", found) for found in (rivals, agreeing))
+    wide, narrow = (predicted(problem, "unlike", found) for found in (rivals, agreeing))
     require_wider(wide, narrow)
     assert covered(wide) > covered(narrow)
     # The report has both.
@@ -124,11 +129,13 @@ def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None
     for bands in (wide, narrow):
         drawn = bands.plot().axes[4].get_legend_handles_labels()[1]
         assert ("sensor band without rivals" in drawn) is (bands is wide)
-    plan = problem.validations["unlike"].record
+    plan = problem.study.validations["unlike"].record
     assert plan is not None
     require_wider(
         *(
-            predict_after(problem, draws, plan.voltage, "later", "record", found)
+            predict_after(
+                problem.with_cache(widening_rivals=found), plan.voltage, "later", "record"
+            )
             for found in (rivals, agreeing)
         )
     )
@@ -136,10 +143,10 @@ def test_unlike_drives_of_a_wrong_model_have_wider_bands(tmp_path: Path) -> None
 
 def test_right_model_keeps_its_bands(tmp_path: Path) -> None:
     """No rival is fitted."""
-    problem, draws = fitted("good", tmp_path)
-    rivals = Rivals(problem, draws)
+    problem = fitted("good", tmp_path)
+    rivals = Rivals(problem)
     for name in ("like", "unlike"):
-        prediction = predicted(problem, draws, name, rivals)
+        prediction = predicted(problem, name, rivals)
         assert prediction.model_error_sd is None
         assert not any("follows the drive" in remark for remark in prediction.remarks)
     assert rivals.fitted is None

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bwbayes.app.problem.problem import Problem
 from bwbayes.arrays import FloatArray
+from bwbayes.inference.study import Study
 from bwbayes.record import Record, write_record
 from tests.measured import keep, measured
-from tests.prediction.runs import Judged, covered, judge, problem_of
+from tests.prediction.runs import Judged, covered, judge, study_of
 from tests.stand import Stand
 
 RATE = 100.0
@@ -104,14 +104,14 @@ SPOILT_KINDS = {
 
 def run(seed: tuple[int, int], folder: Path, kind: str = "good") -> Judged:
     """Simulate a record and another one, fit the first half of the first, and judge all."""
-    problem, generator = made(seed, folder, kind)
+    study, generator = made(seed, folder, kind)
     again = SPOILT_KINDS[kind][0] == "training" if kind in SPOILT_KINDS else True
-    return judge(problem, generator, again=again)
+    return judge(study, generator, again=again)
 
 
 def made(
     seed: tuple[int, int], folder: Path, kind: str = "good"
-) -> tuple[Problem, np.random.Generator]:
+) -> tuple[Study, np.random.Generator]:
     """Simulate a record and another one; return what is to be fitted, and the generator."""
     generator = np.random.default_rng(seed)
     stand = Stand(
@@ -142,7 +142,7 @@ def made(
         [validation.other]
         file = "another.h5"
     """
-    return problem_of(text, folder), generator
+    return study_of(text, folder), generator
 
 
 def right(told: Judged, where: str) -> bool:

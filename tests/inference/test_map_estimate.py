@@ -17,7 +17,7 @@ from tests.diagnosis.plants import bench
 from tests.diagnosis.test_fixes import CONFIG, put
 from tests.diagnosis.test_validation_end_to_end import made
 from tests.inference.problems import short_posterior
-from tests.prediction.runs import problem_of
+from tests.prediction.runs import study_of
 
 CASES = ("white", "discrepancy", "lag")
 
@@ -43,20 +43,20 @@ def test_least_squares_side_by_side_come_as_low_as_scipys(steps: bool) -> None:
     prior = posterior.prior
     draws = prior.unconstrain(prior.draw(np.random.default_rng(4), 100))
     center, spread = np.median(draws, axis=0), np.std(draws, axis=0)
-    problem = LeastSquares(posterior, center, spread, steps=steps)
+    study = LeastSquares(posterior, center, spread, steps=steps)
     starts = draws[:4]
 
     def residuals(physical: FloatArray) -> FloatArray:
         place = center.copy()
-        place[problem.physical] = physical
-        residual: FloatArray = problem.residuals(place[np.newaxis])[0]
+        place[study.physical] = physical
+        residual: FloatArray = study.residuals(place[np.newaxis])[0]
         return residual
 
     lowest = [
-        2 * least_squares(residuals, start, x_scale=spread[problem.physical], jac="3-point").cost
-        for start in starts[:, problem.physical]
+        2 * least_squares(residuals, start, x_scale=spread[study.physical], jac="3-point").cost
+        for start in starts[:, study.physical]
     ]
-    costs = problem.costs(problem.optima(starts))
+    costs = study.costs(study.optima(starts))
     assert np.min(costs) <= np.min(lowest) * (1 + 1e-6)
     # One may end in another valley.
     assert np.sum(costs <= np.array(lowest) * (1 + 1e-3)) >= 3
@@ -95,12 +95,12 @@ def test_both_modes_of_a_record_of_one_amplitude_are_seen(
     tmp_path: Path, number: int, least: float
 ) -> None:
     """Whatever the seed. Of the second, least squares sees one optimum between the two."""
-    problem, _ = made((7, number), tmp_path)
+    study, _ = made((7, number), tmp_path)
     for seed in range(4):
-        point = fit(problem.posterior, np.random.default_rng(seed))
-        free, _ = problem.posterior.prior.constrain(point.optima)
+        point = fit(study.posterior, np.random.default_rng(seed))
+        free, _ = study.posterior.prior.constrain(point.optima)
         np.testing.assert_allclose([0.71, 0.95], np.sort(free[:, 0]), atol=0.02)
-        assert least < min(mode_weights(problem.posterior, point)[1])
+        assert least < min(mode_weights(study.posterior, point)[1])
 
 
 def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_climb_along_which_hardly_anything_changes_comes_to_an_end(tmp_path: P
     Axes there are so unlike in length that nothing can be solved for.
     """
     put(bench("sign", (6, 25)).records, tmp_path)
-    posterior = problem_of(parse(CONFIG, "config"), tmp_path).posterior
+    posterior = study_of(parse(CONFIG, "config"), tmp_path).posterior
     point = fit(posterior, np.random.default_rng((6, 25)))
     assert point.log_density == pytest.approx(np.max(posterior.log_density(point.optima)))
 
@@ -128,7 +128,7 @@ def test_two_lags_in_a_row_have_a_mode_for_either_order(tmp_path: Path, seed: in
     put(slow, tmp_path)
     config = CONFIG.replace("from_rest = true\n", "train = [[1.0, 9.0]]\n")
     config += '[model]\ndynamics = "lag"\nnoise = "discrepancy"\nstages = ["sensor-lag"]\n'
-    posterior = problem_of(parse(config, "config"), tmp_path).posterior
+    posterior = study_of(parse(config, "config"), tmp_path).posterior
     point = fit(posterior, np.random.default_rng(seed))
     free, _ = posterior.prior.constrain(point.optima)
     lags = free[:, [posterior.names.index(name) for name in ("lag", "sensor_lag")]]

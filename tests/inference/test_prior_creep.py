@@ -15,10 +15,10 @@ from bwbayes.arrays import FloatArray
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.linear import Creep
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests import measured

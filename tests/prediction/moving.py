@@ -14,10 +14,10 @@ import numpy as np
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.registry import HYSTERESIS, STAGES, build_part
 from bwbayes.prediction.bands import KINDS, Bands, Kind
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from bwbayes.record.teststand import RingBender, true_values

@@ -13,15 +13,16 @@ import numpy as np
 from arviz_stats.base import array_stats  # not in an __all__
 
 from bwbayes.app.config.config import Config, parse
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.explaining import chosen_noise, explain_record
 from bwbayes.app.running.predictions import validate_predictions
+from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
-from bwbayes.diagnosis.validation import BandValidation, ValidationContext
+from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.sampling.proposals import StudentMixture
@@ -38,26 +39,24 @@ HEAVIEST = 10.0
 class Judged:
     """What a run says: draws (draws, free), bands and verdicts by name."""
 
-    problem: Problem
+    study: Study
     draws: FloatArray
     bands: Mapping[str, Bands]
     validation: Mapping[str, BandValidation]
 
     def column(self, name: str) -> FloatArray:
         """Return the draws of one parameter."""
-        return self.draws[:, self.problem.posterior.names.index(name)]
+        return self.draws[:, self.study.posterior.names.index(name)]
 
 
-def problem_of(config: str | Config, folder: Path) -> Problem:
+def study_of(config: str | Config, folder: Path) -> Study:
     """Resolve a config or its text, files in ``folder``; its noise is chosen as a run does it."""
     config = config if isinstance(config, Config) else parse(config, "config")
-    problem = resolve_config(config, folder)
+    run = resolve_config(config, folder)
     if config.model.noise != "auto":
-        return problem
-    point = pointfit.fit(problem.posterior, generator(config.seed, "point fit"))
-    noise, _ = chosen_noise(problem, point)
-    model = config.model.model_copy(update={"noise": noise})
-    return resolve_config(config.model_copy(update={"model": model}), folder)
+        return run.study
+    point = pointfit.fit(run.study.posterior, run.study.generator("point fit"))
+    return with_noise(run, chosen_noise(run.study, point)[0]).study
 
 
 def posterior_draws(
@@ -108,17 +107,17 @@ def _tried(
     return places, ratio
 
 
-def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) -> Judged:
+def judge(study: Study, source: np.random.Generator, *, again: bool = True) -> Judged:
     """Fit, predict all that the config names, and judge it.
 
     Without explanations (``again``) only the verdict on the training window is another one.
     """
-    posterior, record = problem.posterior, problem.record
+    posterior, record = study.posterior, study.record
     point, draws = posterior_draws(posterior, source)
     windows = {"training": posterior.single_record.training}
-    windows |= {name: v.windows for name, v in problem.validations.items() if v.windows}
+    windows |= {name: v.windows for name, v in study.validations.items() if v.windows}
     bands = predict_windows(posterior, draws, record, windows, source)
-    for name, other in problem.validations.items():
+    for name, other in study.validations.items():
         if other.record is not None:
             bands.append(
                 predict_record(
@@ -126,14 +125,14 @@ def judge(problem: Problem, source: np.random.Generator, *, again: bool = True) 
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
-    background = ValidationContext.of(posterior, draws)
-    validation = validate_predictions(problem, bands, background, {})
+    run = Run().with_cache(study=study, flat_draws=draws)
+    validation = validate_predictions(run, bands, {})
     if again:
         places = posterior.prior.unconstrain(best[np.newaxis])
         places = np.concatenate([places, point.optima])
-        found = explain_record(problem, "record", places)
-        validation = validate_predictions(problem, bands, background, {"record": found})
-    return Judged(problem, draws, {one.name: one for one in bands}, validation)
+        found = explain_record(study, "record", places)
+        validation = validate_predictions(run, bands, {"record": found})
+    return Judged(study, draws, {one.name: one for one in bands}, validation)
 
 
 def no_rivals(*_: object) -> None:

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import resolve_config
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import ValidationContext, validate_bands
 from bwbayes.inference import map_estimate as pointfit
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.prediction import correction as module
 from bwbayes.prediction.bands import Bands
 from bwbayes.prediction.correction import correct, residual_memory
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
 from tests.diagnosis import plants
@@ -183,7 +183,7 @@ def test_corrected_bands_of_two_hundred_failing_plants(tmp_path: Path) -> None:
         write_record(fitted, tmp_path / f"{tried}.h5")
         text = f'[record]\nfile = "{tried}.h5"\nfrom_rest = true\n{MODEL}'
         problem = resolve_config(parse(text, "config"), tmp_path)
-        posterior = problem.posterior
+        posterior = problem.study.posterior
         draws = laplace(posterior, rng)
         context = ValidationContext.of(posterior, draws)
         bands = predict_record(posterior, draws, failing, InitialConditions(), rng)

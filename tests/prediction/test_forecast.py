@@ -11,9 +11,9 @@ from scipy import stats
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.declaration import Distribution
 from bwbayes.prediction.bands import Bands
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import forecast, predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.inputs import Span
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.histories import choose_histories
-from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
+from bwbayes.prediction.initial_state import estimate_initial_states
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record.record import Record
 from tests.prediction.moving import RATE, Case, posterior_of_case

@@ -28,12 +28,13 @@ from scipy import stats
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import LEAD_IN_ALARM
 from bwbayes.inference.likelihood import Likelihood
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.operator import Operator
 from bwbayes.model.operators.extremum_memory import RemembersExtrema
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.prediction import initial_state
 from bwbayes.prediction.bands import LEVELS, Bands
-from bwbayes.prediction.initial_state import InitialConditions, estimate_initial_states
+from bwbayes.prediction.initial_state import estimate_initial_states
 from tests.measured import keep
 from tests.prediction.moving import (
     RATE,

@@ -13,10 +13,10 @@ from scipy.stats import norm
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.operators.bouc_wen import hysteresis
 from bwbayes.prediction.bands import LEVELS, Bands, Kind
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import INTERVAL, decaying_sine, short_posterior, truth

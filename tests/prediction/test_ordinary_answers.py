@@ -18,7 +18,7 @@ from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import BandValidation
 from bwbayes.record import write_record
 from tests.measured import keep
-from tests.prediction.runs import judge, problem_of
+from tests.prediction.runs import judge, study_of
 from tests.stand import Stand
 
 RATE, SECONDS, SEEDS = 200.0, 10.0, 40
@@ -62,7 +62,7 @@ def answers(seed: int, folder: Path, gain: float = 1.0) -> dict[str, BandValidat
         [validation.other]
         file = "another.h5"
     """
-    return dict(judge(problem_of(text, folder), generator, again=False).validation)
+    return dict(judge(study_of(text, folder), generator, again=False).validation)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.2])

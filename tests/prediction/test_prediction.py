@@ -8,9 +8,9 @@ import pytest
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
 from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import InitialConditions
 from bwbayes.model.actuator import Actuator
 from bwbayes.prediction.bands import Bands, Kind
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.prediction.prediction import predict_record, predict_windows
 from bwbayes.record.record import Record
 from tests.inference.problems import posterior_of

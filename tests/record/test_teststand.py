@@ -12,7 +12,8 @@ import pytest
 from scipy.linalg import expm
 
 from bwbayes.app.config.config import parse
-from bwbayes.app.problem.problem import Problem, resolve_config
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.model.actuator import Actuator
@@ -165,7 +166,7 @@ EVERY = {name: f"hysteresis = '{name}'\n" for name in HYSTERESIS} | {
 }
 
 
-def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -> Problem:
+def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -> Run:
     text = (
         f"[record]\nsignal = {SIGNAL}\n{record}"
         f"[stand]\ndiscrepancy = 'none'\nsample_rate = {RATE}\n"
@@ -174,10 +175,10 @@ def of(stand: str, model: str, folder: Path, more: str = "", record: str = "") -
     return resolve_config(parse(text, "config"), folder)
 
 
-def assert_reproduced(problem: Problem) -> None:
+def assert_reproduced(problem: Run) -> None:
     """Compute the record's truth by the fitted model from the true values and the output."""
-    posterior, true = problem.posterior, problem.config.truth
-    actuator, truth = posterior.likelihood.actuator, problem.record.truth
+    posterior, true = problem.study.posterior, problem.config.truth
+    actuator, truth = posterior.likelihood.actuator, problem.study.record.truth
     theta = np.array([[({"initial": 0.0} | true)[name] for name in actuator.parameters]])
     output = Amplifier().output(posterior.single_record.voltage, actuator.interval)
     (displacement,) = actuator.displacement(theta, output, from_rest="initial" not in true)
@@ -192,7 +193,7 @@ def test_the_model_reproduces_the_stands_record_with_the_stated_truth(
     stand = EVERY[parts]
     lag = "" if "dynamics" in stand else "dynamics = 'lag'\n"
     problem = of(stand + lag, stand + lag, tmp_path, MECHANICS * (parts == "second order"))
-    names = {p.name for p in problem.parameters} - {"initial"}
+    names = {p.name for p in problem.study.parameters} - {"initial"}
     assert names <= set(problem.config.truth)
     assert_reproduced(problem)
 

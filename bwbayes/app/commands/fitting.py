@@ -127,8 +127,8 @@ def run(
     # First of all: it loads what draws while this process loads what samples.
     with open_figure_worker(workers) as figure_worker:
         with working():
-            from bwbayes.app.problem.problem import resolve_config
             from bwbayes.app.running.folder import RunFolder
+            from bwbayes.app.study.resolve import resolve_config
             from bwbayes.report.report import Report, remarks_banner
             from bwbayes.report.run import priors_table
 
@@ -137,19 +137,21 @@ def run(
         path = out or Path("results") / config.stem
         chosen = chosen.searched(search)
         with working():
-            problem = resolve_config(chosen, config.parent)
-            folder = RunFolder.create(path, problem, overwrite)
+            resolved = resolve_config(chosen, config.parent)
+            folder = RunFolder.create(path, resolved, overwrite)
         with resumable(f"`bwbayes resume {path}`"):
             with working():
-                remarks = problem.remarks
+                remarks = resolved.record_remarks
             if not quiet:
                 # A proposed config has shown its remarks already.
                 banners = [] if is_proposal else remarks_banner(remarks)
-                report_fields: Any = {"banners": banners, "quantities": problem.quantities}
-                priors = priors_table(problem.posterior.prior)
+                report_fields: Any = {"banners": banners, "quantities": resolved.quantities}
+                priors = priors_table(resolved.study.posterior.prior)
                 show_report(Report(title="priors", blocks=[priors], **report_fields))
             options |= {"workers": workers, "figure_worker": figure_worker}
-            return finish(folder.path, quiet=quiet, problem=problem, **options)
+            return finish(
+                folder.path, quiet=quiet, run=resolved.with_cache(folder=folder), **options
+            )
 
 
 def resume(folder: Path, *, workers: int | None, quiet: bool, **options: Any) -> int:

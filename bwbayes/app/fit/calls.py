@@ -74,25 +74,26 @@ def fit(
         has not converged.
     """
     from bwbayes.app.jobs.fit_methods import console_of, folder_or_scratch, warn
-    from bwbayes.app.problem.problem import resolve_config
     from bwbayes.app.running import run
     from bwbayes.app.running.folder import RunFolder
+    from bwbayes.app.study.resolve import resolve_config
 
     config, where, records = _asked(record, keys, "fit")
     path, scratch = folder_or_scratch(folder, "run")
     console = console_of(progress)
-    problem = resolve_config(config, where, records)
-    say = problem.quantities.say
-    warn(map(say, problem.remarks), 3)
+    resolved = resolve_config(config, where, records)
+    say = resolved.quantities.say
+    warn(map(say, resolved.record_remarks), 3)
+    begun = RunFolder.create(path, resolved, overwrite)
     result = run.resume(
-        RunFolder.create(path, problem, overwrite),
+        begun,
         console,
         workers=workers,
         files=scratch is None,
         executor=executor,
-        problem=problem,
+        run=resolved.with_cache(folder=begun),
     )
-    warn([say(note) for note in result.notes if note not in problem.remarks], 3)
+    warn([say(note) for note in result.notes if note not in resolved.record_remarks], 3)
     return result.with_cache(_scratch=scratch)
 
 

@@ -11,10 +11,11 @@ Opening a run only reads files: a stage loads what it needs when it is computed.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
@@ -33,6 +34,7 @@ from bwbayes.watching import Watch, WatchSteps, parts, unwatched, watched
 if TYPE_CHECKING:
     import xarray
 
+    from bwbayes.app.config.config import Config
     from bwbayes.app.fit.plots import Plots
     from bwbayes.app.jobs.certificate import budget as budget_fit, certificate as certificate_fit
     from bwbayes.app.jobs.control import (
@@ -43,19 +45,20 @@ if TYPE_CHECKING:
     from bwbayes.app.jobs.design import design as design_fit
     from bwbayes.app.jobs.fit_methods import Scratch, fit_method
     from bwbayes.app.jobs.predict import predict as predict_record
-    from bwbayes.app.problem.problem import Problem
     from bwbayes.app.running.figure_worker import FigureWorker
     from bwbayes.app.running.predictions import Prediction
     from bwbayes.arrays import FloatArray
     from bwbayes.comparison.comparison import Comparison
     from bwbayes.diagnosis.consistency import Consistency
     from bwbayes.diagnosis.drive_lock import DriveLock
+    from bwbayes.diagnosis.finding import Finding
     from bwbayes.diagnosis.identifiability import InformationGain
     from bwbayes.diagnosis.innovations import Innovations
     from bwbayes.diagnosis.predictive_checks import PredictiveChecks
     from bwbayes.diagnosis.residual_analysis import Explanation
     from bwbayes.diagnosis.rivals import Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
+    from bwbayes.inference.study import Study
     from bwbayes.prediction.bands import Bands, Correction
     from bwbayes.prediction.budget import Budget
     from bwbayes.prediction.loops import Loops
@@ -65,6 +68,7 @@ if TYPE_CHECKING:
     from bwbayes.report.report import Report
     from bwbayes.report.result import Result
     from bwbayes.sampling.diagnostics import SamplingResult
+    from bwbayes.sampling.plan import SamplingPlan
 
 
 # By this a chain notes what noise on the voltages leaves unsure: a covariance, (free, free).
@@ -104,10 +108,8 @@ class Run(Shown):
 
     Parameters
     ----------
-    chain
-        The draws.
     folder
-        The run's folder.
+        The run's folder, if it has begun.
     seconds
         Wall time of the sampling.
     watch
@@ -120,8 +122,7 @@ class Run(Shown):
     Everything else is computed, and its libraries are loaded, when it is first asked for.
     """
 
-    chain: ChainFile
-    folder: RunFolder
+    folder: RunFolder = field(default_factory=lambda: RunFolder(Path(os.devnull)))
     seconds: float = 0.0
     watch: WatchSteps = unwatched
     _scratch: Scratch | None = None
@@ -133,8 +134,26 @@ class Run(Shown):
         return run
 
     @cached_property
-    def problem(self) -> Problem:
-        """The fitted problem: config in explicit numbers, record, priors.
+    def chain(self) -> ChainFile:
+        """The draws."""
+        return ChainFile.read(self.folder.chain)
+
+    @cached_property
+    def _resolved(self) -> Run:
+        """What the config and the records in its folder describe."""
+        from bwbayes.app.config.config import load
+        from bwbayes.app.study.resolve import resolve_config
+
+        return resolve_config(load(self.folder.config), self.folder.path)
+
+    @cached_property
+    def config(self) -> Config:
+        """Its config, in explicit numbers."""
+        return self._resolved.config
+
+    @cached_property
+    def study(self) -> Study:
+        """Model, records, priors, and what is held out.
 
         Raises
         ------
@@ -143,16 +162,52 @@ class Run(Shown):
         """
         from bwbayes.app.running.fingerprint import require_own
 
-        problem = self.folder.problem()
-        require_own(problem, self.folder.chain, self.chain.attributes())
-        return problem
+        study = self._resolved.study
+        if "chain" in vars(self):
+            require_own(self._resolved, self.folder.chain, self.chain.attributes())
+        return study
+
+    @cached_property
+    def plan(self) -> SamplingPlan:
+        """How it is sampled."""
+        from bwbayes.app.study.parameters import plan_of
+
+        return plan_of(self.config, self.study.posterior)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The fitted model and records, for people: one line each, by subject."""
+        from bwbayes.app.study.about import facts_of
+
+        return facts_of(self.study, self.config)
+
+    @cached_property
+    def findings(self) -> dict[str, tuple[Finding, ...]]:
+        """Issues of each fitted record that matter to the model."""
+        from bwbayes.app.study.about import findings_of
+
+        return findings_of(self.study)
+
+    @cached_property
+    def extrapolations(self) -> dict[str, list[Finding]]:
+        """In what the drive of each validation leaves the training data, by its name."""
+        from bwbayes.app.study.about import extrapolations_of
+
+        return extrapolations_of(self.study)
+
+    @cached_property
+    def record_remarks(self) -> tuple[str, ...]:
+        """Notes on its records, one line each."""
+        from bwbayes.app.study.about import record_remarks
+
+        return record_remarks(self.config, self.study, self.findings, self.extrapolations)
 
     @property
     def state(self) -> str:
-        """A digest of problem and chain as they are now."""
+        """A digest of study and chain as they are now."""
         from bwbayes.app.running.fingerprint import state_of
 
-        return state_of(self.problem, self.chain)
+        return state_of(self)
 
     @cached_property
     def kept(self) -> dict[str, Any]:
@@ -176,9 +231,9 @@ class Run(Shown):
         from bwbayes.app.running.workers import open_executor
         from bwbayes.sampling.sampler import sample
 
-        plan = replace(self.problem.plan, max_steps=self.chain.steps("sampling"))
+        plan = replace(self.plan, max_steps=self.chain.steps("sampling"))
         with open_executor(1) as pool:
-            return sample(self.problem.posterior, plan, self.chain, pool)
+            return sample(self.study.posterior, plan, self.chain, pool)
 
     @property
     def converged(self) -> bool:
@@ -189,7 +244,7 @@ class Run(Shown):
     def more_steps(self) -> int:
         """Twice the steps that the sampling had, or all it needs."""
         needed = np.nan_to_num(self.outcome.check.steps_needed, posinf=0.0)
-        return max(2 * self.problem.config.sampling.steps, int(needed))
+        return max(2 * self.config.sampling.steps, int(needed))
 
     @property
     def resuming(self) -> str:
@@ -213,7 +268,7 @@ class Run(Shown):
     @cached_property
     def _draws(self) -> FloatArray:
         """The draws in their own units, wider by what noise on the voltages leaves unsure."""
-        posterior, noted = self.problem.posterior, self.chain.attributes().get(VOLTAGE_NOISE)
+        posterior, noted = self.study.posterior, self.chain.attributes().get(VOLTAGE_NOISE)
         if noted is None:
             return draws(posterior, self.chain)
         covariances = self.chain.point.covariance, np.array(json.loads(str(noted)))
@@ -221,10 +276,10 @@ class Run(Shown):
 
     @cached_property
     def sampled(self) -> Result:
-        """The draws, and what the problem says of them, before anything is computed of them."""
+        """The draws, and what the study says of them, before anything is computed of them."""
         from bwbayes.report.result import Result
 
-        problem, chain, plan = self.problem, self.chain, self.problem.plan
+        study, chain, plan = self.study, self.chain, self.plan
         steps = ", ".join(f"{chain.steps(phase)} steps of {phase}" for phase in PHASES)
         accepted = {
             phase: ", ".join(f"{n} {count / p:.0%}" for n, (p, count) in chain.moves(phase).items())
@@ -233,27 +288,26 @@ class Run(Shown):
         facts = {
             "sampling": f"{plan.ensembles} ensembles of {plan.walkers} walkers; {steps}",
             "accepted": "; ".join(f"{phase}: {text}" for phase, text in accepted.items() if text),
-            "engine": problem.posterior.engine,
+            "engine": study.engine,
         }
         return Result(
-            name=problem.config.name or "run",
+            name=self.config.name or "run",
             outcome=self.outcome,
-            parameters=problem.parameters,
-            draws=problem.true_draws(self._draws),
+            parameters=study.parameters,
+            draws=study.true_draws(self._draws),
             log_density=log_densities(chain),
             moves=chain.moves("sampling"),
-            facts=problem.facts | facts,
-            truth=problem.config.truth,
-            quantities=problem.quantities,
+            facts=self.facts | facts,
+            truth=self.config.truth,
+            quantities=study.quantities,
         )
 
     @cached_property
     def subset(self) -> FloatArray:
         """Draws (draws, free) that are enough to simulate with."""
-        from bwbayes.app.problem.records import generator
         from bwbayes.prediction.prediction import thin_draws
 
-        return thin_draws(self.flat_draws, generator(self.problem.config.seed, "draws"))
+        return thin_draws(self.flat_draws, self.study.generator("draws"))
 
     @property
     def best(self) -> FloatArray:
@@ -265,18 +319,18 @@ class Run(Shown):
         """Facts about the fit that the validation of bands needs."""
         from bwbayes.diagnosis.validation import ValidationContext
 
-        return ValidationContext.of(self.problem.posterior, self.flat_draws)
+        return ValidationContext.of(self.study.posterior, self.flat_draws)
 
     @RunStage
     def step_responses(self, _: Watch) -> dict[str, StepResponse]:
         """Return the responses to the steps among what was predicted, by name."""
         from bwbayes.prediction.steps import measure_steps
 
-        records = self.problem.others
-        if len(self.problem.records) > 1:
-            records = {**self.problem.records, **records}
-        scales = self.problem.scales(len(self.subset))
-        return measure_steps(self.problem.posterior, self.subset, records, scales)
+        records = self.study.others
+        if len(self.study.records) > 1:
+            records = {**self.study.records, **records}
+        scales = self.study.scales(len(self.subset))
+        return measure_steps(self.study.posterior, self.subset, records, scales)
 
     @RunStage
     def predictions(self, watch: Watch) -> tuple[Bands, ...]:
@@ -286,8 +340,7 @@ class Run(Shown):
         """
         from bwbayes.app.running.predictions import correct_failed, predictions
 
-        bands = predictions(self.problem, self.flat_draws, self.widening_rivals, watch)
-        return correct_failed(self.problem, bands, self.background)
+        return correct_failed(self, predictions(self, watch))
 
     @RunStage
     def scores(self, watch: Watch) -> dict[str, Scores]:
@@ -305,10 +358,10 @@ class Run(Shown):
         """Return the innovation of each reading at the most probable draw, by record."""
         from bwbayes.diagnosis.innovations import innovations
 
-        records = self.problem.records
+        records = self.study.records
         return {
             name: innovations(single, theta[0], records[name].start)
-            for name, single, theta in watched([*self.problem.posterior.each(self.best)], watch)
+            for name, single, theta in watched([*self.study.posterior.each(self.best)], watch)
         }
 
     @RunStage
@@ -316,32 +369,31 @@ class Run(Shown):
         """Return how each of several records agrees with the others, by record."""
         from bwbayes.diagnosis.consistency import agreements
 
-        starts = {name: record.start for name, record in self.problem.records.items()}
-        return agreements(self.problem.posterior, self.chain.point, starts, watch)
+        starts = {name: record.start for name, record in self.study.records.items()}
+        return agreements(self.study.posterior, self.chain.point, starts, watch)
 
     @RunStage
     def loops(self, watch: Watch) -> Loops:
         """Return the major and a minor loop and the initial curve."""
         from bwbayes.prediction.loops import measure_loops
 
-        scales = self.problem.scales(len(self.subset))
-        return measure_loops(self.problem.posterior, self.subset, watch, scales)
+        scales = self.study.scales(len(self.subset))
+        return measure_loops(self.study.posterior, self.subset, watch, scales)
 
     @RunStage
     def uncertainty_budgets(self, _: Watch) -> tuple[Budget, ...]:
         """Return which source has which share of what is not known of the main quantities."""
         from bwbayes.app.running.budgeting import run_budgets
 
-        return run_budgets(self.problem, self.subset[::2], self.predictions)
+        return run_budgets(self)
 
     @RunStage
     def drive_locks(self, _: Watch) -> dict[str, DriveLock]:
         """Return whether what the model misses follows the drive, by record."""
-        from bwbayes.app.problem.records import generator
         from bwbayes.diagnosis.drive_lock import drive_locks
 
-        source = generator(self.problem.config.seed, "drive lock")
-        return drive_locks(self.problem.posterior, self.subset, source)
+        source = self.study.generator("drive lock")
+        return drive_locks(self.study.posterior, self.subset, source)
 
     def rivals(self, of: str, watch: Watch = unwatched) -> tuple[Rival, ...]:
         """Return rivals of the model on a training record, by its name.
@@ -349,15 +401,14 @@ class Run(Shown):
         They are fitted when first needed, and kept in the folder. ``watch`` is called with the
         share that is done.
         """
-        from bwbayes.app.problem.records import generator
         from bwbayes.app.running.fingerprint import fingerprint, load, save
         from bwbayes.diagnosis.rivals import fit_rivals
 
-        problem, path, state = self.problem, self.folder.rivals, fingerprint(self.problem)
+        study, path, state = self.study, self.folder.rivals, fingerprint(self)
         fitted = load(path, state) or {}
         if of not in fitted:
-            rng = generator(problem.config.seed, f"rivals of {problem.records[of].sha256}")
-            fitted[of] = fit_rivals(problem.study.for_record(of), rng, watch)
+            rng = study.generator(f"rivals of {study.records[of].sha256}")
+            fitted[of] = fit_rivals(study.for_record(of), rng, watch)
             # A process that predicts elsewhere may have no right to write to the folder.
             with suppress(OSError):
                 save(path, state, fitted)
@@ -376,13 +427,13 @@ class Run(Shown):
         from bwbayes.inference.map_estimate import distinct
 
         # The search for stages ended with all of this.
-        if searched := load(self.folder.search, fingerprint(self.problem)):
+        if searched := load(self.folder.search, fingerprint(self)):
             return searched
-        best = self.problem.posterior.prior.unconstrain(self.best)
+        best = self.study.posterior.prior.unconstrain(self.best)
         modes = distinct([*best, *self.chain.point.optima], self.chain.point.covariance)
         return {
-            name: explain_record(self.problem, name, modes, of_record)
-            for name, of_record in parts([*self.problem.records], watch)
+            name: explain_record(self.study, name, modes, of_record)
+            for name, of_record in parts([*self.study.records], watch)
         }
 
     @always
@@ -392,22 +443,18 @@ class Run(Shown):
 
         if not self.converged:
             return {}
-        return validate_predictions(
-            self.problem, self.predictions, self.background, self.explanations
-        )
+        return validate_predictions(self, self.predictions, self.explanations)
 
     @cached_property
     def _check_source(self) -> np.random.Generator:
-        from bwbayes.app.problem.records import generator
-
-        return generator(self.problem.config.seed, "checks")
+        return self.study.generator("checks")
 
     @RunStage
     def information_gain(self, watch: Watch) -> InformationGain:
         """Return information gained from the data: prior against posterior."""
         from bwbayes.diagnosis.identifiability import information_gain
 
-        prior, sampled = self.problem.posterior.prior, self.sampled
+        prior, sampled = self.study.posterior.prior, self.sampled
         source = self._check_source
         return information_gain(prior, self._draws, sampled.log_density, source, watch)
 
@@ -417,10 +464,10 @@ class Run(Shown):
         from bwbayes.diagnosis.predictive_checks import check_predictions
 
         _ = self.information_gain  # first: it draws from the same source
-        posterior, subset, source = self.problem.posterior, self.subset, self._check_source
+        posterior, subset, source = self.study.posterior, self.subset, self._check_source
         return {
             name: check_predictions(posterior, subset, source, name, of_record)
-            for name, of_record in parts([*self.problem.records], watch)
+            for name, of_record in parts([*self.study.records], watch)
         }
 
     @always
@@ -462,12 +509,12 @@ class Run(Shown):
     @property
     def name(self) -> str:
         """The name of its config, or else of its operator."""
-        return self.problem.config.name or self.problem.config.model.hysteresis
+        return self.config.name or self.config.model.hysteresis
 
     @property
     def quantities(self) -> Quantities:  # type: ignore[override]
         """Quantities of its records, in whose words it is shown."""
-        return self.problem.quantities
+        return self.study.quantities
 
     @cached_property
     def standing(self) -> ValidationSummary:
@@ -486,7 +533,7 @@ class Run(Shown):
         """Whether all bands hold on their readings; None if that is inconclusive anywhere."""
         return self.standing.passed if self.converged else None
 
-    holds, verdicts = Renamed("passed"), Renamed("validation")
+    holds, verdicts, problem = Renamed("passed"), Renamed("validation"), Renamed("study")
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -501,7 +548,7 @@ class Run(Shown):
     @property
     def log_likelihood(self) -> FloatArray:
         """The log likelihood of each draw, nats, (steps, ensembles, walkers)."""
-        posterior, log_density = self.problem.posterior, log_densities(self.chain)
+        posterior, log_density = self.study.posterior, log_densities(self.chain)
         sampled = draws(posterior, self.chain).reshape(-1, len(posterior.names))
         _, log_prior = posterior.prior.constrain(posterior.prior.unconstrain(sampled))
         return log_density - log_prior.reshape(log_density.shape)
@@ -513,11 +560,11 @@ class Run(Shown):
         from bwbayes.report.result import summary
 
         numbers = summary(self.result) | {
-            "seed": self.problem.config.seed,
+            "seed": self.config.seed,
             "go_on": None if self.converged else self.resuming,
             "wall_s": self.seconds,
-            "versions": versions(self.problem.posterior.engine),
-            "data_sha256": self.problem.sha256,
+            "versions": versions(self.study.engine),
+            "data_sha256": self.study.sha256,
             "calibration": self.calibration,
         }
         rendered: dict[str, object] = self.quantities.rendered(numbers)
@@ -537,7 +584,7 @@ class Run(Shown):
         """The draws as arviz has them, an xarray.DataTree; its ``converged`` is 1 or 0."""
         from bwbayes.report.outputs import posterior_tree
 
-        return posterior_tree(self.sampled, self.log_likelihood, self.problem.records)
+        return posterior_tree(self.sampled, self.log_likelihood, self.study.records)
 
     @property
     def draws(self) -> xarray.Dataset:
@@ -596,11 +643,12 @@ class Run(Shown):
         """
         import xarray as xr
 
-        if len(self.problem.records) > 1:
+        study = self.study
+        if len(study.records) > 1:
             raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
-        record = self.problem.record
+        record = study.record
         values = np.full(record.samples, np.nan)
-        for name, windows in self.problem.windows(*self.problem.records).items():
+        for name, windows in study.windows(*study.records).items():
             span = slice(windows[0].start, windows[-1].stop)
             residuals = self.bands[name].residuals
             values[span] = np.where(np.isfinite(residuals), residuals, values[span])
@@ -664,11 +712,9 @@ class Run(Shown):
         """Its name, how it ended, and for which drives."""
         from bwbayes.report.run import drives_like
 
-        name = self.problem.config.name or ", ".join(
-            r.origin for r in self.problem.records.values()
-        )
+        name = self.config.name or ", ".join(r.origin for r in self.study.records.values())
         if self.converged:
-            scope = f" {drives_like(self.problem.facts)}" if self.standing.passed else ""
+            scope = f" {drives_like(self.facts)}" if self.standing.passed else ""
             return f"{name}: converged, validation {self.standing.status}{scope}"
         return f"{name}: {self._unconverged}"
 
@@ -694,4 +740,4 @@ def open_finished(folder: RunFolder) -> Run:
     chain = ChainFile.read(folder.chain)
     if chain.blocks("sampling") == 0:
         raise InputError(f"{folder.path}: no draws yet; resume with {folder.resuming}")
-    return Run(chain, folder, folder.numbers().get("wall_s", 0.0))
+    return Run(folder, folder.numbers().get("wall_s", 0.0)).with_cache(chain=chain)

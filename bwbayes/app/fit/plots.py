@@ -57,10 +57,9 @@ class Plots:
 
     def record(self, kind: str = "time", name: str | None = None) -> Figure:
         """Draw a training record: along "time", as a "loop", or its "drive"'s spectrum."""
-        problem = self._fit.problem
-        name, record = _named(problem.records, name)
-        training = problem.posterior.for_record(name).single_record.training
-        shown = record_pictures(record, training, problem.findings[name])
+        study = self._fit.study
+        name, record = _named(study.records, name)
+        shown = record_pictures(record, study.training[name], self._fit.findings[name])
         return self._styled(_named(shown, kind)[1].draw)
 
     def loop(self, *names: str) -> Figure:

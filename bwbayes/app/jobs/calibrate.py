@@ -24,15 +24,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, PositiveInt, TypeAdapter
 from rich.console import Console
 
-from bwbayes.app.config.config import Config, dump, load
+from bwbayes.app.config.config import Config, dump
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.fingerprint import versions
-from bwbayes.app.running.folder import CalibrationFolder
+from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.app.running.progress import StepProgress, batch
 from bwbayes.app.running.run import redraw
 from bwbayes.app.running.workers import one_thread
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.calibration.evaluation import Calibration, evaluate_calibration
 from bwbayes.calibration.replicates import (
     RANKED,
@@ -68,33 +67,34 @@ def start(
 
     Raises InputError: the config, its records or the folder cannot be used.
     """
-    problem = resolve_config(config, where)
-    experiment(problem)
-    request = _Request(replicates=count or 500, of=_identity(problem))
+    run = resolve_config(config, where)
+    experiment(run)
+    request = _Request(replicates=count or 500, of=_identity(run))
     line = f"{request.model_dump_json()}\n".encode()
-    return CalibrationFolder.create(out, problem, overwrite, line)
+    return CalibrationFolder.create(out, run, overwrite, line)
 
 
-def experiment(problem: Problem) -> CalibrationSetup:
-    """Return what the replicates of a problem have in common.
+def experiment(run: Run) -> CalibrationSetup:
+    """Return what the replicates of a run have in common.
 
     Held out are the validation windows of its own record; other records are made again with each
     replicate's truth, at the times and with the voltage that they have. Refused (InputError) are a
     voltage that shows no loop, and a prior that leaves hardly anything.
     """
+    study = run.study
     # Refused is a prior of which no draw is possible.
-    problem.posterior.prior.draw(np.random.default_rng(0), 64)
+    study.posterior.prior.draw(np.random.default_rng(0), 64)
     windows = {
         record: [*chain(*held_out.values())]
-        for record in problem.records
-        if (held_out := problem.held_out(record))
+        for record in study.records
+        if (held_out := study.held_out(record))
     }
     others = {
         name: OtherRecord(replace(v.record, instruments=EXACT), v.start, v.judged, v.of)
-        for name, v in problem.validations.items()
+        for name, v in study.validations.items()
         if v.record is not None
     }
-    return CalibrationSetup(problem.posterior, problem.plan, windows, others)
+    return CalibrationSetup(study.posterior, run.plan, windows, others)
 
 
 def resume(
@@ -122,9 +122,9 @@ def resume(
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem = resolve_config(load(folder.config), folder.path)
-        common, identity = experiment(problem), _identity(problem)
-        return _finish(folder, problem, common, identity, console, replicates, workers, executor)
+        run = Run(folder)
+        common, identity = experiment(run), _identity(run)
+        return _finish(run, common, identity, console, replicates, workers, executor)
 
 
 def calibrate(
@@ -143,12 +143,12 @@ def calibrate(
     replicates; ``overwrite`` begins anew. Report and summary of the run are written again.
     """
     fit.require_converged()
-    problem, folder, plan = fit.problem, fit.folder.calibration, fit.problem.plan
-    flat = draws(problem.posterior, fit.chain).reshape(-1, len(problem.posterior.names))
-    flat = thin_draws(flat, generator(problem.config.seed, "truths"))
+    posterior, folder = fit.study.posterior, fit.folder.calibration
+    flat = draws(posterior, fit.chain).reshape(-1, len(posterior.names))
+    flat = thin_draws(flat, fit.study.generator("truths"))
     # A rank among 199 draws needs no more.
-    plan = replace(plan, ess=min(plan.ess, 2.0 * RANKED))
-    common = CalibrationSetup(problem.posterior, plan, around=Sampled(flat, fit.chain.point))
+    plan = replace(fit.plan, ess=min(fit.plan.ess, 2.0 * RANKED))
+    common = CalibrationSetup(posterior, plan, around=Sampled(flat, fit.chain.point))
     with fit.folder.locked(), one_thread():
         if overwrite or not folder.replicates.exists():
             shutil.rmtree(folder.path, ignore_errors=True)
@@ -156,7 +156,7 @@ def calibrate(
             request = _Request(replicates=replicates or 200, of=fit.state)
             _append(folder, request.model_dump_json())
         calibration = _finish(
-            folder, problem, common, fit.state, console, replicates, workers, executor
+            fit.with_cache(folder=folder), common, fit.state, console, replicates, workers, executor
         )
     with StepProgress(console, "writing the run's report ...") as watch:
         redraw(fit.folder, watch)
@@ -164,8 +164,7 @@ def calibrate(
 
 
 def _finish(
-    folder: CalibrationFolder,
-    problem: Problem,
+    run: Run,
     common: CalibrationSetup,
     identity: str,
     console: Console,
@@ -173,8 +172,8 @@ def _finish(
     workers: int | None,
     executor: str | Executor | None,
 ) -> Calibration:
-    """Make the missing replicates of a problem, judge all, and write the files of a folder."""
-    seed, plan = problem.config.seed, common.plan
+    """Make the missing replicates, judge all, and write the files of the run's folder."""
+    folder, study, seed, plan = run.folder, run.study, run.study.seed, common.plan
     requested, entries = _read(folder, common, identity)
     if replicates not in (None, requested):
         requested = replicates or requested
@@ -199,20 +198,20 @@ def _finish(
         _append(folder, json.dumps(result.entry))
     with StepProgress(console, "judging and drawing ...") as watch:
         ordered = [entries[number] for number in sorted(entries)]
-        packages = versions(problem.posterior.engine)
+        packages = versions(study.engine)
         truths = "the prior's draws"
         if common.around is not None:
             truths = "draws of the posterior; each record is fitted together with the run's own "
             truths += "readings"
         calibration = replace(
-            evaluate_calibration(ordered, generator(seed, "ranks")),
-            name=problem.config.name or "calibration",
-            parameters=problem.parameters,
-            quantities=problem.quantities,
+            evaluate_calibration(ordered, study.generator("ranks")),
+            name=run.config.name or "calibration",
+            parameters=study.parameters,
+            quantities=study.quantities,
             facts=[
-                *problem.facts.items(),
+                *run.facts.items(),
                 ("truths", truths),
-                ("held out", ", ".join(common.bands and problem.validations) or "nothing"),
+                ("held out", ", ".join(common.bands and study.validations) or "nothing"),
                 (
                     "sampling",
                     f"{plan.ensembles} ensembles of {plan.walkers} walkers, to ESS "
@@ -221,7 +220,7 @@ def _finish(
             ],
             provenance={
                 "seed": seed,
-                "data_sha256": problem.sha256,
+                "data_sha256": study.sha256,
                 "versions": packages,
                 "of": identity,
             },
@@ -237,12 +236,12 @@ def _finish(
     return calibration
 
 
-def _identity(problem: Problem) -> str:
+def _identity(run: Run) -> str:
     """Return a digest of everything that replicates depend on."""
-    return sha256((dump(problem.config) + problem.sha256).encode()).hexdigest()
+    return sha256((dump(run.config) + run.study.sha256).encode()).hexdigest()
 
 
-def _append(folder: CalibrationFolder, line: str) -> None:
+def _append(folder: RunFolder, line: str) -> None:
     """Write a line so that it survives a crash."""
     with folder.replicates.open("ab") as file:
         file.write(f"{line}\n".encode())
@@ -251,7 +250,7 @@ def _append(folder: CalibrationFolder, line: str) -> None:
 
 
 def _read(
-    folder: CalibrationFolder, common: CalibrationSetup, identity: str
+    folder: RunFolder, common: CalibrationSetup, identity: str
 ) -> tuple[int, dict[int, Entry]]:
     """Read how many replicates were requested, and those that are written; cut off half a line."""
     content = folder.replicates.read_bytes()

@@ -27,18 +27,18 @@ from rich.console import Console
 from bwbayes.app.config.config import dump, parse, read_toml, validated_config
 from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.fit.fitted import Run, open_finished
-from bwbayes.app.problem.column_options import column_options_from
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import Validation, generator
 from bwbayes.app.running.fingerprint import fingerprint
 from bwbayes.app.running.folder import ENDED, CampaignFolder, Origin, RunFolder, ended
 from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
+from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import ExitStatus, InputError, InputWarning, one_line
+from bwbayes.inference.study import InitialConditions, Validation, generator
 from bwbayes.population.population import (
     FEWEST,
     Population,
@@ -48,7 +48,6 @@ from bwbayes.population.population import (
     population,
     specimen_of,
 )
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record, read_record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import SUFFIXES
@@ -267,17 +266,18 @@ class Campaign(Product):
             There is no population, or the record cannot be used.
         """
         first = self.fit(self.population.names[0])
-        problem = first.problem
+        study = first.study
         if not isinstance(record, Record):
-            options = column_options_from(
-                record, next(iter(problem.config.records.values())).read_as
-            )
+            options = column_options_from(record, next(iter(first.config.records.values())).read_as)
             record = read_record(record, need_displacement=False, **options)
-        source = generator(problem.config.seed, "next specimen")
-        draws = next_specimen(self.population, problem.posterior, first.flat_draws, source)
-        start, like = InitialConditions(from_rest, True, lead_in), next(iter(problem.records))
+        source = study.generator("next specimen")
+        draws = next_specimen(self.population, study.posterior, first.flat_draws, source)
+        start, like = InitialConditions(from_rest, True, lead_in), next(iter(study.records))
         other = Validation((), record, start, of=like)
-        return predict_another(problem, draws, other, "next specimen", first.widening_rivals)
+        specimen = Run(first.folder).with_cache(
+            config=first.config, study=study, flat_draws=draws, drive_locks=first.drive_locks
+        )
+        return predict_another(specimen, other, "next specimen")
 
     def plot(self) -> Figure:
         """Draw each parameter's intervals side by side, with the population.
@@ -547,14 +547,13 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
         warnings.simplefilter("ignore", InputWarning)
         try:
             digests = campaign.digests(file)
-            folder, problem = _run_folder(file, campaign)
-            files = origin.pictures
-            fit = resume_run(folder, console, workers=1, files=files, problem=problem)
+            begun, files = _begun_run(file, campaign), origin.pictures
+            fit = resume_run(begun.folder, console, workers=1, files=files, run=begun)
             if not origin.pictures:
-                write_summary(folder.summary, fit.numbers)
+                write_summary(fit.folder.summary, fit.numbers)
             if fit.converged:
-                source = generator(fit.problem.config.seed, "specimen")
-                specimen = specimen_of(file.stem, fit.problem.posterior, fit.flat_draws, source)
+                source = fit.study.generator("specimen")
+                specimen = specimen_of(file.stem, fit.study.posterior, fit.flat_draws, source)
                 specimen.save(run / SPECIMEN)
             (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
             return file, "" if fit.converged else "not converged", ""
@@ -578,7 +577,7 @@ def _doing(campaign: CampaignFolder) -> str:
     return ""
 
 
-def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Problem]:
+def _begun_run(file: Path, campaign: CampaignFolder) -> Run:
     """Return a record's run as it stands, if it is of this record and config; a new one if not."""
     origin = campaign.origin()
     where = Path(origin.where)
@@ -591,21 +590,20 @@ def _run_folder(file: Path, campaign: CampaignFolder) -> tuple[RunFolder, Proble
         config = proposal.config
     # All have the same model.
     model = config.model.model_copy(update={"search": "none"})
-    problem = resolve_config(config.model_copy(update={"name": file.stem, "model": model}), where)
+    run = resolve_config(config.model_copy(update={"name": file.stem, "model": model}), where)
     path = campaign.run(file.stem)
     if path.exists():
         try:
-            existing = RunFolder.open(path)
             # A target or budget that was changed by `bwbayes resume` is kept.
-            problem_found = existing.problem()
-            expected = problem.with_noise(problem_found.config.model.noise)
-            same_posterior = fingerprint(problem_found) == fingerprint(expected)
-            if same_posterior and problem_found.digests == problem.digests:
-                return existing, problem_found
+            existing = Run(RunFolder.open(path))
+            expected = with_noise(run, existing.config.model.noise)
+            same_posterior = fingerprint(existing) == fingerprint(expected)
+            if same_posterior and existing.study.digests == run.study.digests:
+                return existing
         except (InputError, OSError):
             pass  # half a folder, or one of an earlier version
         shutil.rmtree(path, ignore_errors=True)
-    return RunFolder.create(path, problem, overwrite=False), problem
+    return run.with_cache(folder=RunFolder.create(path, run))
 
 
 def _estimate(draws: FloatArray, *, percent: bool = False) -> str:

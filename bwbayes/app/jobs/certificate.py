@@ -179,7 +179,7 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
     bwbayes certificate results/ring_bender
     """
     watch("certificate", 0.0)
-    result, problem, stated = fit.result, fit.problem, fit.problem.config.certificate
+    result, study, stated = fit.result, fit.study, fit.config.certificate
     entries = {
         "certificate": stated.number,
         "laboratory": stated.laboratory,
@@ -187,9 +187,9 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
         "conditions": stated.conditions,
         "instruments": "; ".join(stated.instruments) or None,
     }
-    facts = problem.facts
+    facts = fit.facts
     pairs = {subject: text or "not stated" for subject, text in entries.items()}
-    instruments = problem.record.instruments.facts
+    instruments = study.record.instruments.facts
     for subject in ("sensor scale", "monitor scale"):
         pairs[subject] = instruments.get(subject, "taken as exact: no uncertainty is stated")
     if "sensor linearity" in instruments:
@@ -208,7 +208,7 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
         else f"none to rely on: validation {fit.standing.status}",
         "other temperatures, loads, mounts and later aging are not covered",
     ]
-    software = {"software": f"bwbayes {version('bwbayes')}", "data, SHA-256": problem.sha256}
+    software = {"software": f"bwbayes {version('bwbayes')}", "data, SHA-256": study.sha256}
     for path in (fit.folder.config, fit.folder.backend):
         software[f"{path.name}, SHA-256"] = sha256(path.read_bytes()).hexdigest()
     return Certificate(
@@ -226,7 +226,7 @@ def certificate(fit: Run, *, watch: WatchSteps = unwatched) -> Certificate:
 
 def _equations(fit: Run) -> list[str]:
     """Return what the parts of the model say of themselves: their equations."""
-    actuator = fit.problem.posterior.datasets[0].actuator
+    actuator = fit.study.posterior.datasets[0].actuator
     parts = [actuator.hysteresis, actuator.nonlinearity, actuator.filter, actuator.creep]
     equations = []
     for part in filter(None, [*parts, *actuator.stages]):
@@ -235,13 +235,13 @@ def _equations(fit: Run) -> list[str]:
         )
         formulas = [line.strip().rstrip(",.") for line in lines if line.startswith("    ")]
         equations.append("; ".join([first.rstrip("."), *formulas]))
-    return [*equations, f"noise: {fit.problem.config.model.noise}"]
+    return [*equations, f"noise: {fit.config.model.noise}"]
 
 
 def _estimates(fit: Run) -> list[dict[str, Any]]:
     """Return the actuator's free parameters, the major loop's measures, and the displacement."""
     actuators = {p.name for p in fit.result.free if p.declared.scope == "actuator"}
-    physical = actuators & {*fit.problem.posterior.table.physical}
+    physical = actuators & {*fit.study.posterior.table.physical}
     estimates = [
         {"name": p.name, **fit.result.estimates[p.name]}
         for p in fit.result.free

@@ -13,10 +13,9 @@ from pathlib import Path
 from markupsafe import Markup
 
 from bwbayes.app.config.config import Config
-from bwbayes.app.problem.problem import resolve_config
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import choose_model, explain_record
 from bwbayes.app.running.remarks import lines
+from bwbayes.app.study.resolve import resolve_config
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
@@ -34,42 +33,37 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     """
     from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415  # slow to load
 
-    problem, point, steps, explained = choose_model(resolve_config(config, folder), watch)
-    posterior, seed = problem.posterior, config.seed
+    run, point, steps, explained = choose_model(resolve_config(config, folder), watch)
+    study, posterior = run.study, run.study.posterior
     free, _ = posterior.prior.constrain(point.mode[None])
-    likely = conflict.around(posterior.prior, point, generator(seed, "around"))
+    likely = conflict.around(posterior.prior, point, study.generator("around"))
     # The findings are remarks too, but here they come with what to do.
-    shown = {f"{name}: {issue}" for name, issues in problem.findings.items() for issue in issues}
-    remarks = [remark for remark in problem.remarks if remark not in shown]
-    remarks += map(str, conflict.conflicts(posterior.prior, likely, problem.defaults))
+    shown = {f"{name}: {issue}" for name, issues in run.findings.items() for issue in issues}
+    remarks = [remark for remark in run.record_remarks if remark not in shown]
+    remarks += map(str, conflict.conflicts(posterior.prior, likely, study.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
     if explained is None:
         explaining = partial(watch, "explanations")
-        explained = {
-            n: explain_record(problem, n, point.optima, explaining) for n in problem.records
-        }
+        explained = {n: explain_record(study, n, point.optima, explaining) for n in study.records}
     for explanations in explained.values():
         remarks += lines(explanations)
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)
-        for issues in problem.findings.values()
+        for issues in run.findings.values()
         for finding in issues
     ]
     nothing = "the record by itself shows no transient, spike, jump, clipping, drift or the like"
     title = "No issues of the record" if remarks else "No issues found"
-    several = len(problem.records) > 1
-    about = [
-        fact for subject, fact in problem.facts.items() if subject.startswith(("record", "start"))
-    ]
+    several = len(study.records) > 1
+    about = [fact for subject, fact in run.facts.items() if subject.startswith(("record", "start"))]
     about += steps
     pictures: list[Picture] = []
-    for name, record in problem.records.items():
-        training = problem.posterior.for_record(name).single_record.training
-        issues = problem.findings[name]
-        drawn = record_pictures(record, training, issues, name if several else "")
+    for name, record in study.records.items():
+        of, issues = name if several else "", run.findings[name]
+        drawn = record_pictures(record, study.training[name], issues, of)
         pictures += drawn.values()
-    name = problem.config.name or problem.record.origin
+    name = config.name or study.record.origin
     priors = priors_table(posterior.prior, dict(zip(posterior.names, free[0], strict=True)))
     meaning = Markup(
         "The MAP estimate is the most probable set of parameters, without intervals; these take "
@@ -77,7 +71,7 @@ def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched
     )
     report = Report(
         title=f"{name}, check",
-        quantities=problem.quantities,
+        quantities=study.quantities,
         heading=f"Check: {name}",
         about="; ".join(about),
         banners=[

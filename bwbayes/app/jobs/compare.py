@@ -24,18 +24,17 @@ from rich.console import Console
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ModelConfig
 from bwbayes.app.fit.fitted import Run, open_finished
-from bwbayes.app.problem.parameters import with_model
-from bwbayes.app.problem.problem import Problem, resolve_config
-from bwbayes.app.problem.records import generator, join_records, training_records
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.predictions import predictions
 from bwbayes.app.running.progress import ProgressLine, StepProgress, batch
 from bwbayes.app.running.run import begin, resume
 from bwbayes.app.running.workers import one_thread, open_executor
+from bwbayes.app.study.resolve import resolve_models, with_noise
 from bwbayes.comparison.comparison import Candidate, Comparison, recommend
 from bwbayes.comparison.evidence import bands_part, evidence, leave_future_out, screening_evidence
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError, InputWarning
+from bwbayes.inference.study import Study
 from bwbayes.model.operators.no_hysteresis import NoHysteresis
 from bwbayes.prediction.scores import score
 from bwbayes.record import Record
@@ -85,19 +84,19 @@ def compare(
     console = console or Console(quiet=True)
     first, *others = fits
     for name in others:
-        _require_same(f"compare: {first} and {name}", fits[first].problem, fits[name].problem)
+        _require_same(f"compare: {first} and {name}", fits[first].study, fits[name].study)
     candidates = []
     for name, fit in fits.items():
         with (
             StepProgress(console, f"judging {name} ...") as watch,
             one_thread(),
-            open_executor(workers, fit.problem.posterior.engine, executor) as pool,
+            open_executor(workers, fit.study.engine, executor) as pool,
         ):
             candidate = _candidate(name, fit, pool, watch, future=future)
             standing = fit.standing if fit.converged else None
         candidates.append(replace(candidate, standing=standing))
     with ProgressLine(console, "comparing ..."):
-        return _comparison(fits[first].problem, candidates)
+        return _comparison(fits[first], candidates)
 
 
 def compare_models(
@@ -131,12 +130,10 @@ def compare_models(
     """
     folders: dict[str, RunFolder] = {}
     with ProgressLine(console, f"reading records for {len(models)} models ...", announced=False):
-        _, wholes = join_records(config, training_records(config, where, in_memory or {})[0])
-        for name, model in models.items():
-            named = config.model_copy(update={"name": name, "model": model})
-            problem = resolve_config(with_model(named, model.spec, wholes), where, in_memory)
+        runs = resolve_models(config, where, models, in_memory or {})
+        for name, run in runs.items():
             folder = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.")
-            folders[name] = _folder(out / folder, problem, overwrite)
+            folders[name] = _folder(out / folder, run, overwrite)
     count = min(workers or os.cpu_count() or 1, len(models))
     with one_thread(), open_executor(count, executor=executor) as pool:
         together: dict[str, Any] = {
@@ -154,27 +151,27 @@ def compare_models(
             for name, candidate in candidates.items()
         }
         within_reach = np.max([*criteria.values()], axis=0) - reach
-        runs = [
+        sampled = [
             (name, folders[name], future)
             for name, values in criteria.items()
             if not screen or folders[name].numbers() or np.any(values >= within_reach)
         ]
-        for candidate in batch(_sampled, runs, kind="models sampled", **together):
+        for candidate in batch(_sampled, sampled, kind="models sampled", **together):
             candidates[candidate.name] = candidate
             console.print(f"{candidate.name}: {candidate.stop_reason}", highlight=False)
         with ProgressLine(console, "comparing ..."):
-            problem = next(iter(folders.values())).problem()
-            comparison = _comparison(problem, [candidates[name] for name in folders])
+            run = next(iter(runs.values()))
+            comparison = _comparison(run, [candidates[name] for name in folders])
         best = comparison.recommended
         if best is None or comparison[best].standing is not None:
             return comparison
         with ProgressLine(console, f"validating {best} ..."):
             standing = pool.submit(_standing, folders[best], files).result()
             candidates[best] = replace(candidates[best], standing=standing)
-            return _comparison(problem, [candidates[name] for name in folders])
+            return _comparison(run, [candidates[name] for name in folders])
 
 
-def _require_same(pair: str, first: Problem, other: Problem) -> None:
+def _require_same(pair: str, first: Study, other: Study) -> None:
     """Refuse a fit that is not about the same readings as another."""
     if first.sha256 != other.sha256:
         raise InputError(
@@ -182,13 +179,13 @@ def _require_same(pair: str, first: Problem, other: Problem) -> None:
             "record, with the same readings left out"
         )
     windows, held_out = [], []
-    for problem in (first, other):
-        windows.append([dataset.training for dataset in problem.posterior.datasets])
-        starts = {name: replace(v.start, hold=None) for name, v in problem.validations.items()}
+    for study in (first, other):
+        windows.append([*study.training.values()])
+        starts = {name: replace(v.start, hold=None) for name, v in study.validations.items()}
         held_out.append(
             {
                 (name, v.windows, v.record and v.record.sha256, starts[name], v.judged, v.of)
-                for name, v in problem.validations.items()
+                for name, v in study.validations.items()
             }
         )
     if windows[0] != windows[1]:
@@ -199,49 +196,43 @@ def _require_same(pair: str, first: Problem, other: Problem) -> None:
         )
 
 
-def _comparison(problem: Problem, candidates: Sequence[Candidate]) -> Comparison:
-    """Compare models of the same readings; ``problem`` is that of any of them."""
+def _comparison(run: Run, candidates: Sequence[Candidate]) -> Comparison:
+    """Compare models of the same readings; ``run`` is that of any of them."""
     facts = [(model.name, model.model) for model in candidates]
     about = ("record", "fitted")
-    facts += [item for item in problem.facts.items() if item[0].partition(" ")[0] in about]
+    facts += [item for item in run.facts.items() if item[0].partition(" ")[0] in about]
     facts.append(("readings fitted", str(candidates[0].readings)))
-    facts.append(("held out", ", ".join(problem.validations) or "nothing"))
-    return recommend(candidates, facts).said_in(problem.quantities)
+    facts.append(("held out", ", ".join(run.study.validations) or "nothing"))
+    return recommend(candidates, facts).said_in(run.quantities)
 
 
 def _candidate(
     name: str, fit: Run, pool: Executor, watch: WatchSteps = unwatched, *, future: bool
 ) -> Candidate:
     """Work out all that a comparison knows of a fit, but for its validation."""
-    problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
-    plain = _description(name, problem, fit.outcome.stop_reason, converged=fit.converged)
+    study, posterior = fit.study, fit.study.posterior
+    plain = _description(name, study, fit.outcome.stop_reason, converged=fit.converged)
     if not fit.converged:
         return plain
     sampled, density = draws(posterior, fit.chain), log_densities(fit.chain)
     flat = fit.flat_draws
     bands = [
         prediction
-        for prediction in predictions(
-            problem,
-            flat,
-            fit.widening_rivals,
-            partial(watch, f"{name}: predictions"),
-            training=False,
-        )
+        for prediction in predictions(fit, partial(watch, f"{name}: predictions"), training=False)
         if prediction.measured is not None
     ]
-    windows = {record: problem.held_out(record) for record in problem.records}
-    rng = generator(seed, "future")
+    windows = {record: study.held_out(record) for record in study.records}
+    rng = study.generator("future")
 
     def of_this(step: str, share: float) -> None:
         watch(f"{name}: {step}", share)
 
     parts = leave_future_out(
-        posterior, problem.plan, flat, windows, rng, pool, future=future, watch=of_this
+        posterior, fit.plan, flat, windows, rng, pool, future=future, watch=of_this
     )
     for prediction in bands:
         scores = bands_part(prediction)
-        if scores is not None and problem.validations[prediction.name].record is not None:
+        if scores is not None and study.validations[prediction.name].record is not None:
             parts[prediction.name] = scores
     extent = max(dataset.extent for dataset in posterior.datasets)
     return replace(
@@ -253,18 +244,18 @@ def _candidate(
             posterior,
             sampled,
             density,
-            generator(seed, "evidence"),
+            study.generator("evidence"),
             partial(of_this, "evidence"),
         ),
     )
 
 
-def _description(name: str, problem: Problem, stop_reason: str, *, converged: bool) -> Candidate:
+def _description(name: str, study: Study, stop_reason: str, *, converged: bool) -> Candidate:
     """Say what a model is, and how its sampling ended."""
-    posterior = problem.posterior
+    posterior = study.posterior
     return Candidate(
         name,
-        f"{problem.study.spec}, {problem.config.model.noise} noise",
+        f"{study.spec}, {study.spec.noise} noise",
         converged,
         stop_reason,
         posterior.prior.dimensions,
@@ -275,11 +266,11 @@ def _description(name: str, problem: Problem, stop_reason: str, *, converged: bo
 
 def _screened(name: str, folder: RunFolder) -> Candidate:
     """Say what a model is worth by its MAP estimate."""
-    problem, point = begin(folder)
-    rng = generator(problem.config.seed, "evidence")
+    run = begin(folder)
+    study, rng = run.study, run.study.generator("evidence")
     return replace(
-        _description(name, problem, "only screened", converged=False),
-        evidence=screening_evidence(problem.posterior, point, rng),
+        _description(name, study, "only screened", converged=False),
+        evidence=screening_evidence(study.posterior, run.chain.point, rng),
         screened=True,
     )
 
@@ -289,7 +280,7 @@ def _sampled(name: str, folder: RunFolder, future: bool) -> Candidate:
     is_finished = bool(folder.numbers())
     quiet = Console(quiet=True)
     fit = open_finished(folder) if is_finished else resume(folder, quiet, workers=1, predict=False)
-    with open_executor(1, fit.problem.posterior.engine) as pool:
+    with open_executor(1, fit.study.engine) as pool:
         result = _candidate(name, fit, pool, future=future)
     return replace(result, standing=fit.standing) if is_finished else result
 
@@ -302,16 +293,17 @@ def _standing(folder: RunFolder, files: bool) -> ValidationSummary:
         return resume(folder, Console(quiet=True), workers=1, files=files).standing
 
 
-def _folder(path: Path, problem: Problem, overwrite: bool) -> RunFolder:
+def _folder(path: Path, run: Run, overwrite: bool) -> RunFolder:
     """Make a model's folder, or take the one that is there, if it is the same run's."""
     if path.exists() and not overwrite:
         folder = RunFolder.open(path)
-        stored = folder.problem()
-        expected = problem.with_noise(stored.config.model.noise)
+        stored = Run(folder)
+        expected = with_noise(run, stored.config.model.noise)
         # A config has no more of its records than their ranges and names.
-        if stored.config != expected.config or stored.digests != expected.digests:
+        same_digests = stored.study.digests == expected.study.digests
+        if stored.config != expected.config or not same_digests:
             raise InputError(
                 f"{path}: holds another run; choose another folder, or give `overwrite=True`"
             )
         return folder
-    return RunFolder.create(path, problem, overwrite)
+    return RunFolder.create(path, run, overwrite)

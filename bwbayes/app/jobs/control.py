@@ -21,8 +21,7 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import amplifier_limits
-from bwbayes.app.problem.column_options import column_options_from
-from bwbayes.app.problem.records import generator
+from bwbayes.app.study.column_options import column_options_from
 from bwbayes.control.compensation import Compensation, compensate as compensated
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.loop import LoopNoise, Robustness, Stand
@@ -138,16 +137,16 @@ def compensate(
 
         bwbayes compensate results/ring_bender sine --amplitude 40 --frequency 1 --from-rest
     """
-    problem, seed = fit.problem, fit.problem.config.seed
+    study = fit.study
     limits = amplifier_limits(
-        problem, voltage, slew, current, capacitance, beyond_training=beyond_training
+        study, voltage, slew, current, capacitance, beyond_training=beyond_training
     )
     shape = {"amplitude": amplitude, "frequency": frequency, "middle": middle, "periods": periods}
     options = shape | {"levels": levels, "interval": interval, "smoothed": smoothed}
     options = {name: value for name, value in options.items() if value is not None}
-    read_as = next(iter(problem.config.records.values())).read_as
-    desired = _reference(reference, problem.record.interval, options, read_as, reading)
-    alone = next(iter(problem.posterior.each(fit.flat_draws)))
+    read_as = next(iter(fit.config.records.values())).read_as
+    desired = _reference(reference, study.record.interval, options, read_as, reading)
+    alone = next(iter(study.posterior.each(fit.flat_draws)))
     command_from = partial(
         compensated,
         alone.posterior,
@@ -157,12 +156,12 @@ def compensate(
         limits=limits,
         nearest=nearest,
         limit=limit,
-        instruments=problem.record.instruments,
+        instruments=study.record.instruments,
     )
-    draws, source = thin_draws(alone.draws, generator(seed, "draws")), f"compensate {desired.name}"
+    draws, source = thin_draws(alone.draws, study.generator("draws")), f"compensate {desired.name}"
     compensation = command_from(
         draws=draws,
-        generator=generator(seed, source),
+        generator=study.generator(source),
         from_rest=from_rest,
         watch=partial(watch, "predicted error"),
     )
@@ -172,7 +171,7 @@ def compensate(
         # A voltage that exists from some states need not exist from rest.
         with suppress(InputError):
             rested = command_from(
-                draws=draws[::4], generator=generator(seed, source), from_rest=True
+                draws=draws[::4], generator=study.generator(source), from_rest=True
             )
             remarks += _from_rest_remark(compensation, rested)
     if compensation.shortfall:
@@ -309,14 +308,14 @@ def export(
 
         bwbayes export results/ring_bender --rate 1000
     """
-    problem, posterior = fit.problem, fit.problem.posterior
+    study, posterior = fit.study, fit.study.posterior
     dataset, theta = posterior.datasets[0], posterior.prior.theta(fit.flat_draws)
     theta = dataset.table.actuator(posterior.table.of(theta, dataset.name))
     actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
     sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
-    name = problem.config.name or problem.record.origin
+    name = fit.config.name or study.record.origin
     limits = amplifier_limits(
-        problem, voltage, slew, current, capacitance, beyond_training=beyond_training
+        study, voltage, slew, current, capacitance, beyond_training=beyond_training
     )
     model = replace(
         exported(name, actuator, theta.mean(axis=0), limits, sds), standing=fit.standing
@@ -402,9 +401,9 @@ def track(
         raise InputError(f"delay: {delay} samples; give 0 to 100")
     if draws < 2:
         raise InputError(f"draws: {draws} is too few for an uncertainty estimate; use at least 2")
-    problem, posterior, seed = fit.problem, fit.problem.posterior, fit.problem.config.seed
+    study, posterior = fit.study, fit.study.posterior
     dataset = posterior.datasets[0]
-    free = thin_draws(fit.flat_draws, generator(seed, "draws"))
+    free = fit.subset
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.for_record(dataset.name)
     parameters = alone.noise_of_new(theta[:draws])
@@ -412,13 +411,13 @@ def track(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
         LoopNoise(dataset.noise, parameters),
-        Stand(amplifier_limits(problem, voltage, beyond_training=beyond_training).span, delay),
-        generator(seed, "track"),
+        Stand(amplifier_limits(study, voltage, beyond_training=beyond_training).span, delay),
+        study.generator("track"),
         robustness=Robustness(gain_margin, phase_margin),
         frequencies=frequencies or None,
         amplitude=amplitude,
         all_theta=dataset.table.actuator(theta),
         watch=watch,
     )
-    name = problem.config.name or problem.record.origin
+    name = fit.config.name or study.record.origin
     return replace(tracking, standing=fit.standing, name=name)

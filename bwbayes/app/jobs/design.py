@@ -21,8 +21,8 @@ from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import fitted_voltages
-from bwbayes.app.problem.column_options import column_options_from
-from bwbayes.app.problem.records import generator, sampled_waveform
+from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.records import sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Design, DesignScore, RivalDesign, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.extrapolation import PART
@@ -108,13 +108,13 @@ def design(
     """
     if (target is None) is not validate:
         raise InputError("design: give either a parameter, a drive or `validate=True`")
-    problem = fit.problem
+    study = fit.study
     # Several records all tell of the actuator; the new one is to be like the one whose voltage
     # turns most.
-    records = problem.records
+    records = study.records
     record = max(records, key=lambda name: turning_points(records[name].path.voltage).size)
-    measured, posterior = records[record], problem.posterior.for_record(record)
-    low, high = voltage or fitted_voltages(problem)
+    measured, posterior = records[record], study.posterior.for_record(record)
+    low, high = voltage or fitted_voltages(study)
     seconds = measured.duration
     if validate:
         # A short record, of ten periods, and as fast as the record's drive.
@@ -124,21 +124,21 @@ def design(
         slew = fast if slew is None else slew
     amplifier = Limits(low, high, np.inf if slew is None else slew, current, capacitance)
     signals = candidates_of(candidates, measured, amplifier, seconds)
-    flat = problem.posterior.select_draws(fit.flat_draws, record)
-    rng, ranking = generator(problem.config.seed, "design"), partial(watch, "candidates")
+    flat = study.posterior.select_draws(fit.flat_draws, record)
+    rng, ranking = study.generator("design"), partial(watch, "candidates")
     parameter, drive = None, None
     kind: type[Design] = Design
     scores: Sequence[DesignScore]
     if validate:
-        kind, study = RivalDesign, problem.study.for_record(record)
+        kind, alone = RivalDesign, study.for_record(record)
         rivals = fit.rivals(record, partial(watch, "rivals"))
-        scores = rank_by_rivals(posterior, flat, study, rivals, signals, amplifier, rng, ranking)
+        scores = rank_by_rivals(posterior, flat, alone, rivals, signals, amplifier, rng, ranking)
     else:
         quantity: str | FloatArray
         if isinstance(target, str):
             quantity = parameter = target
         elif isinstance(target, Path):
-            read_as = problem.config.records[record].read_as
+            read_as = fit.config.records[record].read_as
             quantity, drive = _drive(target, measured.interval, read_as, reading), str(target)
         else:
             quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"

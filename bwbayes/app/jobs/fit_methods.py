@@ -21,8 +21,8 @@ import numpy as np
 from rich.console import Console
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.problem import Problem
 from bwbayes.errors import InputError, InputWarning, suggestion
+from bwbayes.inference.study import Study
 from bwbayes.model.inputs import Limits, Span
 from bwbayes.report.report import Shown
 
@@ -58,14 +58,14 @@ def fit_method[**P, R](
     return method
 
 
-def fitted_voltages(problem: Problem) -> Span:
+def fitted_voltages(study: Study) -> Span:
     """Return the lowest and the highest voltage that were fitted, V."""
-    fitted = [edge for record in problem.records.values() for edge in record.range_voltage]
+    fitted = [edge for record in study.records.values() for edge in record.range_voltage]
     return Span(min(fitted), max(fitted))
 
 
 def amplifier_limits(
-    problem: Problem,
+    study: Study,
     voltage: tuple[float, float] | None,
     slew: float | None = None,
     current: float | None = None,
@@ -78,7 +78,7 @@ def amplifier_limits(
     Raises InputError: they are not two voltages, the lower one first; they go beyond those fitted
     and 0 V, which has to be allowed; a limit that is not positive, a current without a capacitance.
     """
-    fitted = fitted_voltages(problem)
+    fitted = fitted_voltages(study)
     trained = Span(min(fitted.low, 0.0), max(fitted.high, 0.0))
     low, high = voltage or trained
     if not (np.isfinite([low, high]).all() and low < high):

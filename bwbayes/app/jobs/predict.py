@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 
 from bwbayes.app.fit.fitted import Run
-from bwbayes.app.problem.column_options import column_options_from
-from bwbayes.app.problem.records import Validation
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
+from bwbayes.app.study.column_options import column_options_from
 from bwbayes.errors import InputError, path_text, suggestion
-from bwbayes.prediction.initial_state import InitialConditions
+from bwbayes.inference.study import InitialConditions, Validation
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_named
@@ -109,14 +108,14 @@ def predict(
         raise InputError(
             f"predict: a lead-in of {lead_in:g} s is not a positive length of time; give another"
         )
-    problem, watching, hints = fit.problem, partial(watch, "predictions"), list[str]()
+    study, watching, hints = fit.study, partial(watch, "predictions"), list[str]()
     held_out = fit.predictions if fit.standing.passed is False else ()
-    of = of or next(iter(problem.records))
-    if of not in problem.records:
-        hint = suggestion(of, problem.records)
+    of = of or next(iter(study.records))
+    if of not in study.records:
+        hint = suggestion(of, study.records)
         raise InputError(f"predict: no training record {of!r}; {hint}")
     if signal is not None:
-        name, interval = name or signal, problem.records[of].interval
+        name, interval = name or signal, study.records[of].interval
         voltage = named_signal(signal).sample(1 / interval)[1]
         if after and window is not None:
             raise InputError(
@@ -124,9 +123,7 @@ def predict(
                 "predicted whole"
             )
         if after:
-            prediction = predict_after(
-                problem, fit.flat_draws, voltage, name, of, fit.widening_rivals, watching, held_out
-            )
+            prediction = predict_after(fit, voltage, name, of, watching, held_out)
             return replace(prediction, run_validation=fit.standing)
         record = Record(voltage, None, interval=interval, origin=f"{signal} signal")
     elif not isinstance(record, Record | str | Path):
@@ -138,7 +135,7 @@ def predict(
         name = name or path_text(Path(record).stem)
         file = Path(record)
         reading = {"table": table, "displacement_file": displacement_file, **(reading or {})}
-        reading_options = column_options_from(file, problem.config.records[of].read_as, reading)
+        reading_options = column_options_from(file, fit.config.records[of].read_as, reading)
         voltage_is = reading_options.pop("voltage_is", None)
         naming = Naming.stated(**reading_options)
         record = read_named(file, naming, voltage_is, need_displacement=False)
@@ -147,23 +144,15 @@ def predict(
                 f"{file}: has no displacement that is recognized, so the bands are not validated; "
                 "if a column is one, say --column displacement=NAME"
             )
-    record = record.like(problem.records[of])
-    record = record.without_values(problem.config.records[of].missing or ())
-    hold = problem.config.model.hold
+    record = record.like(study.records[of])
+    record = record.without_values(fit.config.records[of].missing or ())
+    hold = fit.config.model.hold
     declared_hold = None if hold == "auto" else hold
     start = InitialConditions(
         from_rest, estimate_offset, lead_in, lead_in_start, declared_hold, after
     )
     other = Validation((), record, start, window, of)
-    prediction = predict_another(
-        problem,
-        fit.flat_draws,
-        other,
-        name or "prediction",
-        fit.widening_rivals,
-        watching,
-        held_out,
-    )
+    prediction = predict_another(fit, other, name or "prediction", watching, held_out)
     is_said = any("--from-rest" in remark for remark in prediction.remarks)
     if record.displacement is None and not (from_rest or after or is_said):
         width = prediction.upper["sensor", 95] - prediction.lower["sensor", 95]

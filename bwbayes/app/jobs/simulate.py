@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from bwbayes.app.problem.records import generator
 from bwbayes.errors import InputError, refuse_unwritable
+from bwbayes.inference.study import generator
 from bwbayes.record import write_record
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Sine, Waveform, signal as named

@@ -7,12 +7,9 @@ window, or else the training one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.problem.records import generator
+from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.predictions import reaching
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.posterior import Posterior
@@ -29,25 +26,22 @@ from bwbayes.prediction.initial_state import (
 PIECE = 400
 
 
-def run_budgets(
-    problem: Problem, draws: FloatArray, predictions: Sequence[Bands]
-) -> tuple[Budget, ...]:
-    """Return the budgets of a run from draws (draws, free) as the readings have them."""
-    posterior, instruments = problem.posterior, problem.record.instruments
+def run_budgets(run: Run) -> tuple[Budget, ...]:
+    """Return the budgets of a run from half of its draws as the readings have them."""
+    study, draws, predictions = run.study, run.subset[::2], run.predictions
+    posterior, instruments = study.posterior, study.record.instruments
     shown = next((bands for bands in predictions if not bands.training), predictions[0])
     name = next(
         (name for name in ("d", *posterior.names) if _is_actuators(posterior, name)),
         posterior.names[0],
     )
-    unit = next(p.unit for p in problem.parameters if p.name == name)
+    unit = next(p.unit for p in study.parameters if p.name == name)
     quantities = [
         Measurand(name, unit, draws[:, posterior.names.index(name)]),
         loop_width(posterior, draws),
-        _displacement(problem, draws, shown),
+        _displacement(run, draws, shown),
     ]
-    return uncertainty_budgets(
-        posterior, draws, quantities, instruments, problem.scales(len(draws))
-    )
+    return uncertainty_budgets(posterior, draws, quantities, instruments, study.scales(len(draws)))
 
 
 def _is_actuators(posterior: Posterior, name: str) -> bool:
@@ -57,29 +51,30 @@ def _is_actuators(posterior: Posterior, name: str) -> bool:
     return physical and free[name].declared.scope == "actuator"
 
 
-def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Measurand:
+def _displacement(run: Run, draws: FloatArray, bands: Bands) -> Measurand:
     """Return the displacement beyond the sensor's zero at the highest voltage of some bands."""
+    study = run.study
     at = int(np.argmax(np.where(bands.scored(bands.mean), bands.voltage, -np.inf)))
-    added, validation = dict[str, float](), problem.validations.get(bands.name)
+    added, validation = dict[str, float](), study.validations.get(bands.name)
     if validation is not None and validation.record is not None:
         record, of = validation.record, validation.of
-        beyond = problem.extrapolations[bands.name]
-        rng = generator(problem.config.seed, f"budget {record.sha256}")
+        beyond = run.extrapolations[bands.name]
+        rng = study.generator(f"budget {record.sha256}")
 
         def begun(posterior: Posterior, own_draws: FloatArray) -> InitialStates:
             theta = posterior.prior.theta(own_draws)
             return estimate_initial_states(posterior, theta, record, validation.start, rng)
 
-        alone = problem.posterior.for_record(of)
-        own_draws = problem.posterior.select_draws(draws, of)
+        alone = study.posterior.for_record(of)
+        own_draws = study.posterior.select_draws(draws, of)
         states = begun(alone, own_draws)
-        reached = reaching(problem, draws, of, record, beyond)
+        reached = reaching(study, draws, of, record, beyond)
     else:
-        of = next(name for name in problem.records if bands.name in problem.windows(name))
-        record = problem.records[of]
-        alone = problem.posterior.for_record(of)
-        own_draws = problem.posterior.select_draws(draws, of)
-        rng = generator(problem.config.seed, f"budget {record.sha256}")
+        of = next(name for name in study.records if bands.name in study.windows(name))
+        record = study.records[of]
+        alone = study.posterior.for_record(of)
+        own_draws = study.posterior.select_draws(draws, of)
+        rng = study.generator(f"budget {record.sha256}")
         states = training_initial_states(alone, alone.prior.theta(own_draws), rng)
         reached = None
     sample = int(np.argmin(np.abs(record.time - bands.time[at])))
@@ -100,6 +95,6 @@ def _displacement(problem: Problem, draws: FloatArray, bands: Bands) -> Measuran
     slow, _ = dataset.noise.marginal_sd(alone.noise_of_new(alone.prior.theta(own_draws)))
     added[budget.MODEL] = float(np.mean(slow**2)) + (bands.model_error_sd or 0.0) ** 2
     added[budget.STATE] = float(np.mean(states.offset_sd**2))
-    added[budget.CURVE] = problem.record.instruments.linearity_sd(dataset.extent) ** 2
+    added[budget.CURVE] = study.record.instruments.linearity_sd(dataset.extent) ** 2
     name = f"displacement at {bands.voltage[at]:.3g} V ({bands.name}, {bands.time[at]:.4g} s)"
     return Measurand(name, "um", displacement, added, budget.STATE, states.rows)

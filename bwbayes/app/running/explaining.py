@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.problem.records import generator
+from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.resolve import with_model
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.explanations import TIED, explain, followed_causes, likely_causes
 from bwbayes.diagnosis.finding import TELLING_DRIVE
@@ -31,6 +31,8 @@ from bwbayes.inference import map_estimate
 from bwbayes.inference.engine import stopwatch
 from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.noise import NOISES
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Study
 from bwbayes.shown import rounded
 from bwbayes.watching import Watch, WatchSteps, part, parts, unwatched
 
@@ -41,7 +43,7 @@ MAX_DISCREPANCY = 0.25
 
 
 def explain_record(
-    problem: Problem,
+    study: Study,
     name: str,
     places: FloatArray,
     watch: Watch = unwatched,
@@ -51,38 +53,38 @@ def explain_record(
     ``places`` are the posterior's modes (modes, free), coordinates; ``watch`` is called with the
     share that is done.
     """
-    return explain(_scene(problem, name, places), watch)
+    return explain(_scene(study, name, places), watch)
 
 
-def _scene(problem: Problem, name: str, places: FloatArray) -> ResidualAnalysis:
+def _scene(study: Study, name: str, places: FloatArray) -> ResidualAnalysis:
     """Return a training record as explanations see it."""
-    posterior, record = problem.posterior, problem.records[name]
+    posterior, record = study.posterior, study.records[name]
     return ResidualAnalysis.of(
         posterior.for_record(name),
         posterior.select_draws(places, name),
-        generator(problem.config.seed, f"explanations {record.sha256}"),
-        problem.study.for_record(name),
-        [window for windows in problem.held_out(name).values() for window in windows],
+        study.generator(f"explanations {record.sha256}"),
+        study.for_record(name),
+        [window for windows in study.held_out(name).values() for window in windows],
         record.start,
-        alone=len(problem.records) == 1,
+        alone=len(study.records) == 1,
     )
 
 
-def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched) -> tuple[str, str]:
-    """Return the noise of a problem whose ``noise`` is ``auto``, and a line that says why.
+def chosen_noise(study: Study, point: MAPEstimate, watch: Watch = unwatched) -> tuple[str, str]:
+    """Return the noise of a study whose ``noise`` is ``auto``, and a line that says why.
 
     Its posterior, of which ``point`` is the MAP estimate, has the rough discrepancy. White noise is
     always compared; any other has nothing to gain where the innovations are white already. A sensor
     whose noise has heavy tails or grows stays one beside each. The evidence of several records is
     the sum of what each has alone. ``watch`` is called with the share that is done.
     """
-    default, posterior = "discrepancy", problem.posterior
-    sensor = problem.study.spec.noise.split(" + ")[1:]
+    default, posterior = "discrepancy", study.posterior
+    sensor = study.spec.noise.split(" + ")[1:]
     rough = {
         name: climb(
             posterior.for_record(name), posterior.select_draws(point.optima, name), watch=of_record
         )
-        for name, of_record in parts([*problem.records], part(watch, 0.0, 1 / len(NOISES)))
+        for name, of_record in parts([*study.records], part(watch, 0.0, 1 / len(NOISES)))
     }
     evidence = {default: sum(fit.log_evidence for fit in rough.values())}
     # Innovations less likely than this by chance may be explained by another noise.
@@ -92,8 +94,8 @@ def chosen_noise(problem: Problem, point: MAPEstimate, watch: Watch = unwatched)
     candidates = {*evidence, "student", "paced"}
     others = [n for n in NOISES if n not in candidates and (n == "white" or p < colored)]
     for noise, of_noise in parts(others, part(watch, 1 / len(NOISES), 1.0)):
-        spec = replace(problem.study.spec, noise=_beside(noise, sensor))
-        other = problem.study.with_model(spec).posterior
+        spec = replace(study.spec, noise=_beside(noise, sensor))
+        other = study.with_model(spec).posterior
         # Parameters that only the other noise has start at their priors' medians.
         named = dict(zip(posterior.names, point.optima.T, strict=True))
         nothing = np.zeros(len(point.optima))
@@ -132,46 +134,42 @@ def _beside(noise: str, sensor: Sequence[str]) -> str:
 
 
 class ChosenModel(NamedTuple):
-    """A problem with the model that its records have evidence for, and its MAP estimate.
+    """A run with the model that its records have evidence for, and its MAP estimate.
 
     ``steps`` say what was chosen, a line each; ``explanations`` are what would still explain each
     record's readings better, by its name, or None if that was not looked for to the end.
     """
 
-    problem: Problem
+    run: Run
     point: MAPEstimate
     steps: tuple[str, ...]
     explanations: dict[str, tuple[Explanation, ...]] | None
 
 
-def choose_model(problem: Problem, watch: WatchSteps = unwatched) -> ChosenModel:
-    """Choose what a problem's config leaves open: further stages first, then the noise.
+def choose_model(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
+    """Choose what a run's config leaves open: further stages first, then the noise.
 
     A config that names both is left as it is. ``watch`` is called with the name of a step and the
     share of it that is done.
     """
-    searched = search_stages(problem, watch)
-    if problem.config.model.noise != "auto":
+    searched = search_stages(run, watch)
+    if run.config.model.noise != "auto":
         return searched
-    problem, point = searched.problem, searched.point
-    noise, why = chosen_noise(problem, point, partial(watch, "noise model"))
-    spec, explanations = replace(problem.study.spec, noise=noise), searched.explanations
-    chosen = problem.with_model(spec, noise=noise)
-    if chosen.posterior is not problem.posterior:
-        point, explanations = (
-            _fit_point(chosen, partial(watch, f"MAP estimate, {noise} noise")),
-            None,
-        )
+    run, point, explanations = searched.run, searched.point, searched.explanations
+    noise, why = chosen_noise(run.study, point, partial(watch, "noise model"))
+    chosen = with_model(run, replace(run.study.spec, noise=noise), noise=noise)
+    if chosen.study is not run.study:
+        point = _fit_point(chosen.study, partial(watch, f"MAP estimate, {noise} noise"))
+        explanations = None
     return ChosenModel(chosen, point, (*searched.steps, why), explanations)
 
 
-def _fit_point(problem: Problem, watch: Watch) -> MAPEstimate:
-    source = generator(problem.config.seed, "point fit")
-    return map_estimate.fit(problem.posterior, source, watch)
+def _fit_point(study: Study, watch: Watch) -> MAPEstimate:
+    return map_estimate.fit(study.posterior, study.generator("point fit"), watch)
 
 
-def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenModel:
-    """Give a problem whose ``stages`` are ``auto`` all the stages that pay.
+def search_stages(run: Run, watch: WatchSteps = unwatched) -> ChosenModel:
+    """Give a run whose ``stages`` are ``auto`` all the stages that pay.
 
     Each round fits the model, explains its readings better in every way there is, and takes the
     stage that leads; then it leaves out again what was added and is not needed any more. No stage
@@ -182,21 +180,21 @@ def search_stages(problem: Problem, watch: WatchSteps = unwatched) -> ChosenMode
     says so (``unexplained``), and the run is inconclusive. With fewer, the error may be a
     disturbance, and that is a remark.
     """
-    with stopwatch(problem.posterior.engine) as clock:
-        return _search(problem, clock, watch)
+    with stopwatch(run.study.engine) as clock:
+        return _search(run, clock, watch)
 
 
-def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> ChosenModel:
+def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenModel:
     """Search as :func:`search_stages`; ``clock`` tells the time, s, since the search began."""
-    seconds = problem.config.model.search_seconds
-    point = _fit_point(problem, partial(watch, "MAP estimate"))
-    if not seconds or len(problem.records) > 1:
-        return ChosenModel(problem, point, (), None)
-    (name,) = problem.records
+    seconds = run.config.model.search_seconds
+    point = _fit_point(run.study, partial(watch, "MAP estimate"))
+    if not seconds or len(run.study.records) > 1:
+        return ChosenModel(run, point, (), None)
+    (name,) = run.study.records
     notes, steps = dict[str, str](), list[str]()
     while True:
         step = partial(watch, f"stages, round {len(steps) + 1}")
-        scene = _scene(problem, name, point.optima)
+        scene = _scene(run.study, name, point.optima)
         explanations = explain(scene, step, lambda: clock() > seconds)
         is_over = clock() > seconds
         # The last one has just been weighed.
@@ -209,7 +207,7 @@ def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> 
             note = f"left out again: {chosen.kind}"
         elif parts and all(cause.spec is not None for cause in followed_causes(explanations)):
             # A tie goes to a stage before another hold, then to the fewest parameters.
-            chosen, chain = min(parts, key=partial(_size, problem)), problem.study.spec.chain
+            chosen, chain = min(parts, key=partial(_size, run.study)), run.study.spec.chain
             assert chosen.spec is not None
             added = next((stage for stage in chosen.spec.chain if stage not in chain), chosen.kind)
             gain = f"{' or '.join(cause.text for cause in parts)} ({chosen.worth})"
@@ -218,8 +216,8 @@ def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> 
             break
         steps.append(f"{note}, {clock():.0f} s")
         assert chosen.spec is not None
-        problem = problem.with_model(chosen.spec, chosen.stated)
-        point = _fit_point(problem, partial(watch, "MAP estimate"))
+        run = with_model(run, chosen.spec, chosen.stated)
+        point = _fit_point(run.study, partial(watch, "MAP estimate"))
         if is_over:
             break
     for refused in likely_causes(models):
@@ -228,7 +226,7 @@ def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> 
     if is_over:
         steps.append(f"the search for stages ended after {seconds:g} s, before it was complete")
     remarks, unexplained = [*notes.values()], None
-    discrepancy = _relative_discrepancy(problem, point)
+    discrepancy = _relative_discrepancy(run.study.posterior, point)
     if len(notes) >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
         unexplained = float(f"{discrepancy:.2g}")
     elif len(notes) > MAX_STAGES or (notes and discrepancy > MAX_DISCREPANCY):
@@ -237,23 +235,22 @@ def _search(problem: Problem, clock: Callable[[], float], watch: WatchSteps) -> 
             f"{discrepancy:.2g} times the sensor's noise, with {len(notes)} added; a drive unlike "
             f"the training record's may be missed. Fix: {TELLING_DRIVE}."
         )
-    spec = problem.study.spec
-    problem = problem.with_model(
-        spec, remarks=remarks, stages=spec.keys["stages"], unexplained=unexplained
+    spec = run.study.spec
+    run = with_model(
+        run, spec, remarks=remarks, stages=spec.keys["stages"], unexplained=unexplained
     )
-    return ChosenModel(problem, point, tuple(steps), None if is_over else {name: explanations})
+    return ChosenModel(run, point, tuple(steps), None if is_over else {name: explanations})
 
 
-def _size(problem: Problem, cause: Explanation) -> tuple[bool, int]:
+def _size(study: Study, cause: Explanation) -> tuple[bool, int]:
     """Return whether the model of a cause has the same stages, and how many free parameters."""
     assert cause.spec is not None
-    spec, study = problem.study.spec, problem.study.with_model(cause.spec, cause.stated)
-    return cause.spec.chain == spec.chain, study.posterior.prior.dimensions
+    other = study.with_model(cause.spec, cause.stated)
+    return cause.spec.chain == study.spec.chain, other.posterior.prior.dimensions
 
 
-def _relative_discrepancy(problem: Problem, point: MAPEstimate) -> float:
+def _relative_discrepancy(posterior: Posterior, point: MAPEstimate) -> float:
     """Return the sd of the discrepancy at a MAP estimate, in sds of the sensor; 0 without one."""
-    posterior = problem.posterior
     theta = posterior.prior.theta(posterior.prior.constrain(point.mode[np.newaxis])[0])
     discrepancy, sensor = posterior.single_record.noise.marginal_sd(
         posterior.single_record.table.noise(theta)

@@ -32,45 +32,44 @@ from numpy.typing import NDArray
 
 from bwbayes.app.config.config import dump
 from bwbayes.app.config.settings import CertificateConfig
-from bwbayes.app.problem.problem import Problem
+from bwbayes.app.fit.fitted import Run
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine
 from bwbayes.inference.parameters import COORDINATES
 from bwbayes.inference.state_space import Noise
 from bwbayes.record.io.formats import draft_of
-from bwbayes.sampling.storage import ChainFile
 
 
-def fingerprint(problem: Problem) -> str:
-    """Return what a chain notes of a problem as JSON: its posterior, and how it is sampled."""
-    plan = problem.plan
+def fingerprint(run: Run) -> str:
+    """Return what a chain notes of its run as JSON: the posterior, and how it is sampled."""
+    plan = run.plan
     return json.dumps(
         {
             "coordinates": COORDINATES,
-            "seed": problem.config.seed,
+            "seed": run.study.seed,
             "sampling.ensembles": plan.ensembles,
             "sampling.walkers": plan.walkers,
             "sampling.block": plan.block,
-            **problem.study.keys,
+            **run.study.keys,
         }
     )
 
 
-def require_own(problem: Problem, chain: Path, attributes: Mapping[str, str | int]) -> None:
+def require_own(run: Run, chain: Path, attributes: Mapping[str, str | int]) -> None:
     """Refuse a ``chain`` of another posterior than a folder's config and records describe.
 
     ``attributes`` are what the chain notes: the readings' digest, and its fingerprint.
 
     Raises InputError: they differ, and the text says in what; or the chain has no fingerprint.
     """
-    if attributes.get("data_sha256") != problem.sha256:
+    if attributes.get("data_sha256") != run.study.sha256:
         raise InputError(f"{chain}: belongs to another record; undo the edit or start a new run")
     if "posterior" not in attributes:
         raise InputError(
             f"{chain}: does not say which priors and settings it was sampled with; start a new run"
         )
     before: dict[str, object] = json.loads(str(attributes["posterior"]))
-    now: dict[str, object] = json.loads(fingerprint(problem))
+    now: dict[str, object] = json.loads(fingerprint(run))
     differing = [key for key in before | now if before.get(key) != now.get(key)]
     if differing:
         first, *others = differing
@@ -96,15 +95,15 @@ def _shown(value: object) -> str:
     return "not set" if value is None else str(value)
 
 
-def state_of(problem: Problem, chain: ChainFile) -> str:
+def state_of(run: Run) -> str:
     """Return a digest of all that a result depends on."""
     depends = (
         # A certificate's statements about the measurement may be written afterwards.
-        dump(problem.config.model_copy(update={"certificate": CertificateConfig()})),
-        problem.digests,
-        versions(problem.posterior.engine),
-        chain.attributes(),
-        chain.steps("sampling"),
+        dump(run.config.model_copy(update={"certificate": CertificateConfig()})),
+        run.study.digests,
+        versions(run.study.engine),
+        run.chain.attributes(),
+        run.chain.steps("sampling"),
     )
     return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 

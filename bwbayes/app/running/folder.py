@@ -22,7 +22,7 @@ from bwbayes.errors import InputError, refuse_unwritable
 from bwbayes.quantities import Quantities
 
 if TYPE_CHECKING:
-    from bwbayes.app.problem.problem import Problem
+    from bwbayes.app.fit.fitted import Run
 
 
 class FileOf:
@@ -159,10 +159,8 @@ class RunFolder(Folder):
     replicates = FileOf("replicates.jsonl")  # of a calibration alone
 
     @classmethod
-    def create(
-        cls, path: Path, problem: Problem, overwrite: bool = False, mark: bytes = b""
-    ) -> Self:
-        """Make a new folder, whole or not at all; ``mark`` goes into a calibration's file.
+    def create(cls, path: Path, run: Run, overwrite: bool = False, mark: bytes = b"") -> Self:
+        """Make a new folder for a run, whole or not at all; ``mark`` is of a calibration's file.
 
         Raises InputError: it exists and ``overwrite`` is not given, it is not a run's, or cannot be
         written.
@@ -171,9 +169,9 @@ class RunFolder(Folder):
         from bwbayes.record import write_record
 
         with cls.drafted(path, overwrite) as draft:
-            for name, record in {**problem.records, **problem.others}.items():
+            for name, record in {**run.study.records, **run.study.others}.items():
                 write_record(record, draft.path / f"records/{name}.h5")
-            draft.config.write_text(dump(problem.config), encoding="utf-8")
+            draft.config.write_text(dump(run.config), encoding="utf-8")
             if mark:
                 draft.replicates.write_bytes(mark)
         return cls(path)
@@ -182,13 +180,6 @@ class RunFolder(Folder):
     def calibration(self) -> CalibrationFolder:
         """The files of the calibration around its posterior, if there was one."""
         return CalibrationFolder(self.path / "calibration")
-
-    def problem(self) -> Problem:
-        """Return what its config and records say."""
-        from bwbayes.app.config.config import load
-        from bwbayes.app.problem.problem import resolve_config
-
-        return resolve_config(load(self.config), self.path)
 
     def numbers(self) -> dict[str, Any]:
         """Return the numbers of its summary; none as long as it is not finished.

@@ -9,7 +9,7 @@ gets the same bands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise, zip_longest
 from pathlib import Path
@@ -17,8 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.problem.records import Validation, generator
+from bwbayes.app.fit.fitted import Run
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import beyond_training, unexcited
 from bwbayes.diagnosis.finding import Finding
@@ -26,13 +25,14 @@ from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.diagnosis.rivals import Rival, disagreement
 from bwbayes.diagnosis.validation import (
     BandValidation,
-    ValidationContext,
     ValidationSummary,
     validate_bands,
 )
 from bwbayes.errors import ExitStatus, InputError, Renamed, refuse_unwritable
 from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.prior_creep import add_prior_creep
+from bwbayes.inference.study import Study, Validation
+from bwbayes.model.spec import ModelSpec
 
 # The fields that Prediction inherits are read where it stands.
 from bwbayes.prediction.bands import Bands, Correction, Kind, LeadIn  # noqa: F401
@@ -42,7 +42,6 @@ from bwbayes.prediction.prediction import (
     forecast,
     predict_record,
     predict_windows,
-    thin_draws,
 )
 from bwbayes.prediction.scores import Scores, score
 from bwbayes.record.io.grid import clock
@@ -61,11 +60,6 @@ from bwbayes.report.report import (
 )
 from bwbayes.report.run import correction_texts, rivals_table, scores_table
 from bwbayes.watching import Watch, part, unwatched
-
-type RivalsOf = Callable[[str, Watch], Sequence[Rival] | None]
-"""Rivals of the model on a training record, by its name; None unless its error follows the drive.
-
-The call takes a watch, because the rivals may have to be fitted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,51 +205,41 @@ class Prediction(Product, Bands):
 
 
 def predict_another(
-    problem: Problem,
-    flat: FloatArray,
+    run: Run,
     other: Validation,
     name: str,
-    rivals: RivalsOf,
     watch: Watch = unwatched,
     held_out: Iterable[Bands] = (),
 ) -> Prediction:
     """Predict another record, or a planned voltage without a measurement, and judge it.
 
-    ``flat`` are the draws of what was fitted, (draws, free), parameters in their own units, of
-    which a thousand are used. The ``other`` record may have any sampling interval; ``name`` is that
-    of the bands, and ``rivals`` returns those of a training record. ``watch`` is called with the
-    share that is done. The correction of a drive like it is that of the run's ``held_out`` bands.
+    The ``other`` record may have any sampling interval; ``name`` is that of the bands. ``watch`` is
+    called with the share that is done. The correction of a drive like it is that of the run's
+    ``held_out`` bands.
 
     Raises InputError: a lead-in or window that does not fit into the record.
     """
     assert other.record is not None
     watch(0.0)
-    posterior = problem.posterior
-    path = other.record.path
-    beyond = beyond_training(posterior, other.record.inputs)
-    subset = thin_draws(flat, generator(problem.config.seed, "draws"))
-    bands = _of_another(problem, subset, other, name, beyond, rivals, part(watch, 0.0, 0.8))
-    background = ValidationContext.of(posterior, flat)
-    verdict = validate_bands(bands, background, beyond=beyond)
-    scores = None if verdict is None else score(bands, background.extent)
-    from_rest_note = _from_rest_remark(problem, subset, other, bands, beyond, rivals)
+    beyond = beyond_training(run.study.posterior, other.record.inputs)
+    bands = _of_another(run, run.subset, other, name, beyond, part(watch, 0.0, 0.8))
+    verdict = validate_bands(bands, run.background, beyond=beyond)
+    scores = None if verdict is None else score(bands, run.background.extent)
+    from_rest_note = _from_rest_remark(run, other, bands, beyond)
     watch(1.0)
-    noise = path.remark or planned_noise(other.record)
-    held = _held_lead_in_remark(problem, other, bands)
+    noise = other.record.path.remark or planned_noise(other.record)
+    held = _held_lead_in_remark(run.study.spec, other, bands)
     notes = (noise, from_rest_note, held, *_notes(bands, beyond))
     remarks = tuple(note for note in notes if note)
     if verdict is None or not verdict.passed:
-        bands = replace(bands, correction=_of_drives_alike(problem, held_out, beyond))
+        bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
     return Prediction(**vars(bands), scores=scores, validation=verdict, remarks=remarks)
 
 
-def correct_failed(
-    problem: Problem, bands: Iterable[Bands], background: ValidationContext
-) -> tuple[Bands, ...]:
+def correct_failed(run: Run, bands: Sequence[Bands]) -> tuple[Bands, ...]:
     """Return bands, those of held-out readings that fail validation with their correction."""
-    bands = tuple(bands)
     held_out = [predicted for predicted in bands if not predicted.training]
-    validation = validate_predictions(problem, held_out, background, {})
+    validation = validate_predictions(run, held_out, {})
     failed = {name for name, verdict in validation.items() if verdict.passed is False}
     return tuple(
         replace(predicted, correction=correct(predicted)) if predicted.name in failed else predicted
@@ -264,7 +248,7 @@ def correct_failed(
 
 
 def _of_drives_alike(
-    problem: Problem, held_out: Iterable[Bands], beyond: Iterable[Finding]
+    run: Run, held_out: Iterable[Bands], beyond: Iterable[Finding]
 ) -> Correction | None:
     """Return the widest correction of held-out bands whose drive leaves training in the same ways.
 
@@ -275,7 +259,7 @@ def _of_drives_alike(
         (bands.correction.factor, bands.correction)
         for bands in held_out
         if bands.correction is not None and bands.correction.factor is not None
-        if {finding.kind for finding in problem.extrapolations.get(bands.name, ())} == ways
+        if {finding.kind for finding in run.extrapolations.get(bands.name, ())} == ways
     ]
     return max(alike, key=lambda pair: pair[0], default=(0.0, None))[1]
 
@@ -299,14 +283,7 @@ def planned_noise(record: Record) -> str:
     )
 
 
-def _from_rest_remark(
-    problem: Problem,
-    draws: FloatArray,
-    other: Validation,
-    bands: Bands,
-    beyond: Iterable[Finding],
-    rivals: RivalsOf,
-) -> str:
+def _from_rest_remark(run: Run, other: Validation, bands: Bands, beyond: Iterable[Finding]) -> str:
     """Say what it would change to declare a record from rest.
 
     The text is empty if the record cannot start so, or if width and coverage stay the same to a
@@ -317,7 +294,7 @@ def _from_rest_remark(
     if start.from_rest or start.after or not record.starts_at_zero:
         return ""
     rested = replace(other, start=replace(start, from_rest=True))
-    declared = _of_another(problem, draws[::4], rested, bands.name, beyond, rivals)
+    declared = _of_another(run, run.subset[::4], rested, bands.name, beyond)
     scored = slice(max(bands.scored_from, declared.scored_from), None)
     widths, shares = [], []
     for predicted in (bands, declared):
@@ -337,14 +314,14 @@ def _from_rest_remark(
     )
 
 
-def _held_lead_in_remark(problem: Problem, other: Validation, bands: Bands) -> str:
+def _held_lead_in_remark(spec: ModelSpec, other: Validation, bands: Bands) -> str:
     """Say that a lead-in whose voltage stays where it is tells little, where it is to tell a state.
 
     A twentieth of the range is hardly a motion; one of a quarter shows by how much loops open.
     """
     record, lead = other.record, bands.lead_in
     assert record is not None
-    is_known = other.start.from_rest or problem.config.model.hysteresis == "linear"
+    is_known = other.start.from_rest or spec.operator.name == "linear"
     if lead is None or is_known or not other.start.estimate_offset:
         return ""
     voltage, extent = record.path.voltage, float(np.ptp(record.path.voltage))
@@ -361,12 +338,10 @@ def _held_lead_in_remark(problem: Problem, other: Validation, bands: Bands) -> s
 
 
 def predict_after(
-    problem: Problem,
-    flat: FloatArray,
+    run: Run,
     voltage: FloatArray,
     name: str,
     of: str,
-    rivals: RivalsOf,
     watch: Watch = unwatched,
     held_out: Iterable[Bands] = (),
 ) -> Prediction:
@@ -376,136 +351,121 @@ def predict_after(
     in :func:`predict_another`; see :func:`~bwbayes.prediction.prediction.forecast`.
     """
     watch(0.0)
-    seed, record = problem.config.seed, problem.records[of]
+    study, record = run.study, run.study.records[of]
     longer, after = continued(record, voltage), slice(record.samples, None)
-    beyond = beyond_training(problem.posterior, longer.inputs, after)
-    subset = thin_draws(flat, generator(seed, "draws"))
+    beyond = beyond_training(study.posterior, longer.inputs, after)
     planned = Record(voltage, None, interval=record.interval)
-    source = generator(seed, f"forecast {planned.sha256}")
-    alone, own_draws = reaching(problem, subset, of, longer, beyond)
+    source = study.generator(f"forecast {planned.sha256}")
+    alone, own_draws = reaching(study, run.subset, of, longer, beyond)
 
-    error, fitted_rivals = None, _rivals(rivals, of, beyond, part(watch, 0.0, 0.5))
-    if fitted_rivals is not None:
-        rng = generator(seed, f"rivals {planned.sha256}")
+    error, rivals = None, _widening_rivals(run, of, beyond, part(watch, 0.0, 0.5))
+    if rivals is not None:
+        rng = study.generator(f"rivals {planned.sha256}")
 
         def follow(posterior: Posterior, draws: FloatArray) -> Bands:
             return forecast(posterior, draws, record, voltage, rng)
 
-        study = problem.study.for_record(of)
-        error = disagreement(alone, own_draws, study, fitted_rivals, follow, rng)
+        error = disagreement(alone, own_draws, study.for_record(of), rivals, follow, rng)
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     bands = forecast(alone, own_draws, record, voltage, source, name, predicting, error)
-    bands = replace(bands, correction=_of_drives_alike(problem, held_out, beyond))
+    bands = replace(bands, correction=_of_drives_alike(run, held_out, beyond))
     return Prediction(**vars(bands), remarks=_notes(bands, beyond))
 
 
-def predictions(
-    problem: Problem,
-    flat: FloatArray,
-    rivals: RivalsOf,
-    watch: Watch = unwatched,
-    *,
-    training: bool = True,
-) -> tuple[Bands, ...]:
-    """Predict everything held out, and the ``training`` windows of all records, from flat draws.
+def predictions(run: Run, watch: Watch = unwatched, *, training: bool = True) -> tuple[Bands, ...]:
+    """Predict everything held out, and the ``training`` windows of all records.
 
-    ``rivals`` returns those of a training record. ``watch`` is called with the share that is done.
+    ``watch`` is called with the share that is done.
     """
-    posterior, seed = problem.posterior, problem.config.seed
-    subset = thin_draws(flat, generator(seed, "draws"))
-    bands: list[Bands] = []
-    samples = [r.samples for r in (*problem.records.values(), *problem.others.values())]
+    study, bands = run.study, list[Bands]()
+    samples = [r.samples for r in (*study.records.values(), *study.others.values())]
     shares = np.cumsum([0, *samples]) / sum(samples)
     watches = (part(watch, *edges) for edges in pairwise(shares.tolist()))
-    for name, alone, own_draws in posterior.each(subset):
+    for name, alone, own_draws in study.posterior.each(run.subset):
         predicting = next(watches)
-        windows = problem.windows(name) if training else problem.held_out(name)
+        windows = study.windows(name) if training else study.held_out(name)
         if windows:
-            record = problem.records[name]
+            record = study.records[name]
             # By content: the same record under another name gets the same bands.
-            source = generator(seed, f"predict {record.sha256}")
+            source = study.generator(f"predict {record.sha256}")
             bands += predict_windows(alone, own_draws, record, windows, source, predicting)
-    for name, held_out in problem.validations.items():
+    for name, held_out in study.validations.items():
         if held_out.record is not None:
-            beyond = problem.extrapolations[name]
-            predicting = next(watches)
-            bands.append(_of_another(problem, subset, held_out, name, beyond, rivals, predicting))
+            beyond, predicting = run.extrapolations[name], next(watches)
+            bands.append(_of_another(run, run.subset, held_out, name, beyond, predicting))
     watch(1.0)
     return tuple(bands)
 
 
 def _of_another(
-    problem: Problem,
+    run: Run,
     draws: FloatArray,
     other: Validation,
     name: str,
     beyond: Iterable[Finding],
-    rivals: RivalsOf,
     watch: Watch = unwatched,
 ) -> Bands:
     """Return the bands of a record that was not fitted, from the draws of one that was."""
-    record = other.record
+    study, record = run.study, other.record
     assert record is not None
-    alone, own_draws = reaching(problem, draws, other.of, record, beyond)
-    error, fitted_rivals = None, _rivals(rivals, other.of, beyond, part(watch, 0.0, 0.5))
-    if fitted_rivals is not None:
-        rng = generator(problem.config.seed, f"rivals {record.sha256}")
+    alone, own_draws = reaching(study, draws, other.of, record, beyond)
+    error, rivals = None, _widening_rivals(run, other.of, beyond, part(watch, 0.0, 0.5))
+    if rivals is not None:
+        rng = study.generator(f"rivals {record.sha256}")
 
         def predict(posterior: Posterior, draws: FloatArray) -> Bands:
             return predict_record(posterior, draws, record, other.start, rng)
 
-        study = problem.study.for_record(other.of)
-        error = disagreement(alone, own_draws, study, fitted_rivals, predict, rng)
-    source = generator(problem.config.seed, f"predict {record.sha256}")
+        error = disagreement(alone, own_draws, study.for_record(other.of), rivals, predict, rng)
+    source = study.generator(f"predict {record.sha256}")
     predicting = part(watch, 0.0 if error is None else 0.5, 1.0)
     return predict_record(
         alone, own_draws, record, other.start, source, name, other.judged, predicting, error
     )
 
 
-def _rivals(
-    rivals: RivalsOf, of: str, beyond: Iterable[Finding], watch: Watch
+def _widening_rivals(
+    run: Run, of: str, beyond: Iterable[Finding], watch: Watch
 ) -> Sequence[Rival] | None:
     """Return the rivals that widen the bands of a drive; None of a drive like those of training."""
-    return rivals(of, watch) if beyond else None
+    return run.widening_rivals(of, watch) if beyond else None
 
 
 def reaching(
-    problem: Problem, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
+    study: Study, draws: FloatArray, of: str, record: Record, beyond: Iterable[Finding]
 ) -> tuple[Posterior, FloatArray]:
     """Return posterior and draws of a training record, to predict another record.
 
     They have creep where that is slower or longer than what was fitted, so that the band grows with
     what the training did not show.
     """
-    posterior = problem.posterior
+    posterior = study.posterior
     if any(finding.kind in ("slow", "duration") for finding in beyond):
-        source = generator(problem.config.seed, f"creep {record.sha256}")
+        source = study.generator(f"creep {record.sha256}")
         posterior, draws = add_prior_creep(posterior, draws, record.duration, source)
     return posterior.for_record(of), posterior.select_draws(draws, of)
 
 
 def validate_predictions(
-    problem: Problem,
+    run: Run,
     bands: Iterable[Bands],
-    background: ValidationContext,
     explanations: Mapping[str, Sequence[Explanation]],
 ) -> dict[str, BandValidation]:
     """Validate all bands that have readings, by name.
 
     ``explanations`` are by the name of the training record.
     """
-    records = {window: name for name in problem.records for window in problem.windows(name)}
+    study = run.study
+    records = {window: name for name in study.records for window in study.windows(name)}
     validation = {}
     for predicted in bands:
         explained = explanations.get(records[predicted.name], ()) if predicted.training else ()
-        beyond = problem.extrapolations.get(predicted.name, ())
         verdict = validate_bands(
             predicted,
-            background,
+            run.background,
             explanations=explained,
-            beyond=beyond,
-            unexplained=problem.config.model.unexplained,
+            beyond=run.extrapolations.get(predicted.name, ()),
+            unexplained=run.config.model.unexplained,
         )
         if verdict is not None:
             validation[predicted.name] = verdict

@@ -21,23 +21,23 @@ def run_remarks(run: Run, watch: Watch = unwatched) -> list[str]:
 
     ``watch`` is called with the share that is done.
     """
-    problem, posterior = run.problem, run.problem.posterior
+    study, posterior = run.study, run.study.posterior
     now = fingerprint.versions(posterior.engine)
     looked_at = counted(3, watch)
     remarks = [
         *version_remarks(run.chain.attributes().get("versions"), now),
-        *problem.remarks,
+        *run.record_remarks,
         *run.outcome.remarks,
     ]
     looked_at(1)
-    remarks += map(str, conflicts(posterior.prior, run.flat_draws, problem.defaults))
+    remarks += map(str, conflicts(posterior.prior, run.flat_draws, study.defaults))
     looked_at(1)
     remarks += map(str, undetermined(posterior, run.chain.point))
     looked_at(1)
     if not run.converged:
         return remarks
     remarks += map(str, disagreements(run.consistency))
-    of = {name: f"{name}: " if len(problem.records) > 1 else "" for name in problem.records}
+    of = {name: f"{name}: " if len(study.records) > 1 else "" for name in study.records}
     for name, whitened in run.innovations.items():
         remarks += [f"{of[name]}{finding}" for finding in departures(whitened)]
     for name, lock in run.drive_locks.items():

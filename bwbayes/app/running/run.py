@@ -20,8 +20,6 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump, load, parse
 from bwbayes.app.fit.fitted import VOLTAGE_NOISE, Run, open_finished
-from bwbayes.app.problem.problem import Problem
-from bwbayes.app.problem.records import generator
 from bwbayes.app.running.explaining import choose_model
 from bwbayes.app.running.figure_worker import FigureWorker
 from bwbayes.app.running.fingerprint import fingerprint, require_own, save, versions
@@ -30,7 +28,6 @@ from bwbayes.app.running.progress import Progress, ProgressLine, StepProgress
 from bwbayes.app.running.workers import one_thread, open_executor
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import Engine, resolve_engine
-from bwbayes.inference.map_estimate import MAPEstimate
 from bwbayes.inference.voltage_noise import path_covariance
 from bwbayes.record.io.formats import draft_of
 from bwbayes.report.outputs import render, write_bands, write_summary
@@ -40,14 +37,13 @@ from bwbayes.sampling.storage import ChainFile
 from bwbayes.watching import WatchSteps, part, unwatched
 
 
-def begin(folder: RunFolder) -> tuple[Problem, MAPEstimate]:
-    """Return a run's problem and its MAP estimate, which is worked out if it is not there yet.
+def begin(folder: RunFolder) -> Run:
+    """Return a run with its MAP estimate, which is worked out if it is not there yet.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     with folder.locked(), one_thread():
-        problem, chain = _open_chain(folder, folder.problem(), Console(quiet=True))
-        return problem, chain.point
+        return _open_chain(Run(folder), Console(quiet=True))
 
 
 def resume(
@@ -62,7 +58,7 @@ def resume(
     files: bool = True,
     executor: str | Executor | None = None,
     figure_worker: FigureWorker | None = None,
-    problem: Problem | None = None,
+    run: Run | None = None,
     answer: Callable[[Run], None] | None = None,
 ) -> Run:
     """Finish a run, from wherever it stands; progress goes to the console.
@@ -71,15 +67,15 @@ def resume(
     result does not depend on them. ``ess``, ``steps`` and ``engine`` are a new target, budget or
     engine; another engine has the same posterior, but from here on not the same bits. Unless it is
     to ``predict``, it ends with the sampling. ``files`` are what a run leaves besides its config,
-    records and chain; the ``figure_worker``, if any, draws them. The ``problem`` is the folder's,
-    if it is known already. ``answer`` is called with the fit before its files are written.
+    records and chain; the ``figure_worker``, if any, draws them. The ``run`` is the folder's, if it
+    is known already. ``answer`` is called with the fit before its files are written.
 
     Raises InputError: the folder's files do not fit together, or another process is writing them.
     """
     start_time = time.monotonic()
     figure_worker = figure_worker or FigureWorker()
     with folder.locked(), one_thread():
-        config = problem.config if problem else load(folder.config)
+        config = run.config if run else load(folder.config)
         targets = {"ess": ess, "steps": steps, "engine": engine}
         targets = {name: value for name, value in targets.items() if value is not None}
         sampling = config.sampling.model_copy(update=targets)
@@ -88,16 +84,16 @@ def resume(
             if targets:
                 _rewrite(folder, config.model_copy(update={"sampling": sampling}))
             with ProgressLine(console, "reading the run ...", announced=False):
-                problem = problem or folder.problem()
-            figure_worker.warm_up(problem.posterior)
-            problem, chain = _open_chain(folder, problem, console, engine)
-            plan = problem.plan
-            fit = Run(chain, folder).with_cache(problem=problem)
+                fit = run or Run(folder)
+                posterior = fit.study.posterior
+            figure_worker.warm_up(posterior)
+            fit = _open_chain(fit, console, engine)
+            plan, chain = fit.plan, fit.chain
             with Progress(console, plan) as progress:
                 if not fit.kept:
                     # It is written last, as the sign that all is done; now there is more to do.
                     folder.summary.unlink(missing_ok=True)
-                outcome = sample(problem.posterior, plan, chain, pool, progress)
+                outcome = sample(fit.study.posterior, plan, chain, pool, progress)
         models = sum(chain.steps(phase) for phase in PHASES) * plan.ensembles * plan.walkers
         ess = outcome.check.lowest_ess
         console.print(
@@ -133,44 +129,43 @@ def redraw(folder: RunFolder, watch: WatchSteps = unwatched) -> Run:
     return fit
 
 
-def _open_chain(
-    folder: RunFolder, problem: Problem, console: Console, requested: Engine | None = None
-) -> tuple[Problem, ChainFile]:
-    """Open the run's chain where it stands, or start it with a point fit; its problem first."""
+def _open_chain(run: Run, console: Console, requested: Engine | None = None) -> Run:
+    """Return a run with its chain open where it stands, or started with a point fit."""
+    folder = run.folder
     if not folder.chain.exists():
-        config_before = problem.config
+        config_before = run.config
         with StepProgress(console, "choosing the model ...") as watch:
-            problem, point, steps, explanations = choose_model(problem, watch)
-            posterior, config = problem.posterior, problem.config
-            paths = {name: record.path for name, record in problem.records.items()}
+            run, point, steps, explanations = choose_model(run, watch)
+            study, posterior = run.study, run.study.posterior
+            paths = {name: record.path for name, record in study.records.items()}
             unsure: dict[str, str] = {}
             if any(path.noise_sd for path in paths.values()):
-                source = generator(config.seed, "voltage noise")
+                source = study.generator("voltage noise")
                 watch_noise = partial(watch, "noise on the voltage")
                 covariance = path_covariance(posterior, paths, point, source, watch_noise)
                 unsure = {VOLTAGE_NOISE: json.dumps(covariance.tolist())}
-        for step in map(problem.quantities.say, steps):
+        for step in map(study.quantities.say, steps):
             console.print(step, highlight=False, soft_wrap=True)
-        if config != config_before:
-            _rewrite(folder, config)
+        if run.config != config_before:
+            _rewrite(folder, run.config)
         if explanations is not None:
-            save(folder.search, fingerprint(problem), explanations)
+            save(folder.search, fingerprint(run), explanations)
         attributes: dict[str, str | int] = {
-            "config": dump(config),
-            "data_sha256": problem.sha256,
-            "posterior": fingerprint(problem),
+            "config": dump(run.config),
+            "data_sha256": study.sha256,
+            "posterior": fingerprint(run),
             "versions": json.dumps(versions(posterior.engine)),
             "engine": posterior.engine,
             "platform": platform.platform(),
-            "seed": config.seed,
+            "seed": study.seed,
             "parameters": json.dumps(posterior.names),
             **unsure,
         }
-        first = init_chain(posterior, point, problem.plan, generator(config.seed, "sampling"))
-        chain = ChainFile.create(folder.chain, first, point, problem.plan.block, attributes)
-        return problem, chain
-    chain = ChainFile.resume(folder.chain, lambda noted: require_own(problem, folder.chain, noted))
-    first_engine, now = chain.attributes()["engine"], problem.posterior.engine
+        first = init_chain(posterior, point, run.plan, study.generator("sampling"))
+        chain = ChainFile.create(folder.chain, first, point, run.plan.block, attributes)
+        return run.with_cache(folder=folder, chain=chain)
+    chain = ChainFile.resume(folder.chain, lambda noted: require_own(run, folder.chain, noted))
+    first_engine, now = chain.attributes()["engine"], run.study.engine
     if first_engine != now:
         if requested is None:
             raise InputError(
@@ -178,7 +173,7 @@ def _open_chain(
                 f'engine = "{first_engine}" in {folder.config}, or resume with `engine="{now}"`'
             )
         console.print(f"resuming with the {now} engine a chain begun with {first_engine}")
-    return problem, chain
+    return run.with_cache(chain=chain)
 
 
 def _rewrite(folder: RunFolder, config: Config) -> None:
@@ -193,7 +188,7 @@ def copy_run(fit: Run, path: Path, overwrite: bool) -> RunFolder:
 
     Raises InputError: the folder exists and ``overwrite`` is not given, or it cannot be written.
     """
-    folder = RunFolder.create(path, fit.problem, overwrite)
+    folder = RunFolder.create(path, fit, overwrite)
     with folder.locked():
         shutil.copytree(fit.folder.chain, folder.chain)
         shutil.copyfile(fit.folder.backend, folder.backend)

@@ -9,8 +9,8 @@ together before anything else is done with them, and the fit is that of the whol
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -18,43 +18,22 @@ from typing import Any
 import numpy as np
 
 from bwbayes.app.config.config import ALONE, Config
-from bwbayes.app.config.settings import RecordConfig, SignalConfig, ValidationConfig
-from bwbayes.app.problem.parameters import stand_of
-from bwbayes.diagnosis.finding import Finding
-from bwbayes.diagnosis.record_checks import UNTOLD, inspect
+from bwbayes.app.config.settings import (
+    ModelConfig,
+    RecordConfig,
+    SignalConfig,
+    ValidationConfig,
+)
+from bwbayes.app.study.parameters import stand_of
 from bwbayes.errors import ColumnsError, InputError, InputWarning, suggestion
-from bwbayes.inference.study import place_of
+from bwbayes.inference.study import InitialConditions, Slices, Validation, generator, place_of
 from bwbayes.model.registry import STAGES
-from bwbayes.prediction.initial_state import InitialConditions
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_named
 from bwbayes.record.record import Window
 from bwbayes.record.teststand import VirtualTestStand
 from bwbayes.record.waveforms import Decay, Sine, Staircase, Triangle, Waveform, signal
-
-type Slices = tuple[slice, ...]
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Held-out data: windows (slices) of a training record, or another record and its start.
-
-    ``judged`` is the window in s of another record that is judged, if not all of it. ``of`` is the
-    training record that the windows are of, or whose own parameters another record takes where
-    nothing tells its own.
-    """
-
-    windows: Slices = ()
-    record: Record | None = None
-    start: InitialConditions = field(default_factory=InitialConditions)
-    judged: tuple[float, float] | None = None
-    of: str = "record"
-
-
-def generator(seed: int, purpose: str) -> np.random.Generator:
-    """Return the generator of one purpose of a run: each has a stream of its own."""
-    return np.random.default_rng([seed, *purpose.encode()])
 
 
 def sampled_waveform(drive: str | SignalConfig) -> Waveform:
@@ -117,11 +96,8 @@ def training_records(
     return records, stand
 
 
-def without_clock(config: Config, records: Mapping[str, Record]) -> tuple[Config, list[str]]:
-    """Leave out of a config's model what needs a clock, if its records have none, and say so.
-
-    Raises InputError: records of different quantities.
-    """
+def require_alike(records: Mapping[str, Record]) -> None:
+    """Raise an InputError if records are of different quantities or instruments."""
     first = next(iter(records.values()))
     for name, record in records.items():
         if record.quantities != first.quantities:
@@ -135,18 +111,15 @@ def without_clock(config: Config, records: Mapping[str, Record]) -> tuple[Config
                 f"{place_of(name)}: states other uncertainties of its units than the first record; "
                 "records are fitted together by the same instruments: state the same of all"
             )
-    if first.quantities.has_clock:
-        return config, []
-    model, stages = config.model, config.model.stages
+
+
+def without_clock(model: ModelConfig) -> ModelConfig:
+    """Return a model without what needs a clock, of records that have none."""
+    stages = model.stages
     if stages != "auto":
         stages = [name for name in stages if name in STAGES and STAGES[name]().rate_independent]
     changes = {"dynamics": "none", "creep": False, "creep_growth": False, "noise": "white"}
-    changed = model.model_copy(update={**changes, "stages": stages})
-    remark = (
-        "the record has no time, so it is taken as rate independent: dynamics, creep, stages that "
-        "need a clock and the model error's correlation time are left out"
-    )
-    return config.model_copy(update={"model": changed}), [remark]
+    return model.model_copy(update={**changes, "stages": stages})
 
 
 def _require_usable(record: Record, where: str) -> None:
@@ -395,36 +368,3 @@ def _windows_of(config: Config, name: str, record: Record) -> tuple[Slices, dict
             cuts.append(cut)
         slices[key] = tuple(cuts)
     return slices.pop(""), slices
-
-
-def findings_of(record: Record, windows: Sequence[slice]) -> tuple[Finding, ...]:
-    """Return what is wrong with a record, but for places that no window looks at."""
-    # Borders that differ by less than half a sample are the same.
-    times = [
-        record.start + record.interval * np.array([w.start + 0.5, w.stop - 0.5]) for w in windows
-    ]
-    return tuple(
-        finding
-        for finding in inspect(record)
-        if any(finding.start < stop and start < finding.stop for start, stop in times)
-    )
-
-
-def unlike(name: str, record: Record) -> Iterator[str]:
-    """Yield what is wrong with a record that is predicted."""
-    for finding in inspect(record):
-        fix = finding.fix
-        if finding.kind == "switch-on transient":  # nothing here is fitted
-            fix = f"lead_in_start = {record.clock(finding.stop)} under [validation.{name}]"
-        if finding.kind not in UNTOLD:
-            yield f"{name}: {replace(finding, fix=fix)}"
-
-
-def set_aside(times: Sequence[float], record: Record) -> str:
-    """Say which readings were set aside as outliers, the first ten by their times."""
-    if not times:
-        return "no reading is an isolated outlier: none was set aside"
-    listed = ", ".join(record.clock(time) for time in times[:10])
-    more = f" and {len(times) - 10} more" if len(times) > 10 else ""
-    plural = "s" if len(times) > 1 else ""
-    return f"{len(times)} reading{plural} set aside as isolated outliers, at {listed} s{more}"

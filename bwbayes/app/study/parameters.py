@@ -1,49 +1,44 @@
-"""A config as a study: its model, parameters and stand, and back to explicit words and numbers."""
+"""A config as a study: its model, parameters, stand and sampling."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from bwbayes.app.config.config import Config
 from bwbayes.app.config.settings import ParameterConfig
 from bwbayes.errors import InputError
 from bwbayes.inference.engine import resolve_engine
-from bwbayes.inference.parameters import Parameter
-from bwbayes.inference.study import (
-    Stated,
-    Study,
-    TrainingRecord,
-    declarations_of,
-    extent_of,
-)
+from bwbayes.inference.posterior import Posterior
+from bwbayes.inference.study import Slices, Stated, Study, Validation, extent_of
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.declaration import Distribution
 from bwbayes.model.operators.bouc_wen import BoucWen
-from bwbayes.model.spec import ModelSpec
-from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.record.teststand import VirtualTestStand
+from bwbayes.sampling.plan import SamplingPlan, best_ahead, best_ensembles_per_task, best_tries
 
 
 def study_of(
-    config: Config, records: Mapping[str, Record], training: Mapping[str, tuple[slice, ...]]
+    config: Config,
+    records: Mapping[str, Record],
+    training: Mapping[str, Slices] | None = None,
+    validations: Mapping[str, Validation] | None = None,
 ) -> Study:
-    """Return what a config fits to these records, of which the ``training`` windows are fitted.
+    """Return what a config fits to these records, in ``training`` windows, and holds against them.
 
     Raises InputError: a prior that is none.
     """
     return Study(
         config.model.spec,
-        {
-            name: TrainingRecord(record, training[name], config.records[name].from_rest)
-            for name, record in records.items()
-        },
+        records,
+        training or {},
+        frozenset(name for name in records if config.records[name].from_rest),
         {name: _stated(name, parameter) for name, parameter in config.parameters.items()},
         tuple(config.model.per_record),
         tuple(config.model.shared),
         resolve_engine(config.sampling.engine),
+        validations or {},
+        config.seed,
     )
 
 
@@ -59,48 +54,6 @@ def _stated(name: str, parameter: ParameterConfig) -> Stated:
             raise InputError(f"parameters.{name}.prior: {error}") from None
     others = parameter.model_dump(exclude={"prior"})
     return Stated(prior, **others)
-
-
-def with_model(
-    config: Config,
-    spec: ModelSpec,
-    records: Mapping[str, Record],
-    added: Mapping[str, Stated] | None = None,
-) -> Config:
-    """Return a config with another model, and of what it says of parameters what that has too.
-
-    ``added`` is stated of parameters that the config says nothing of.
-    """
-    study = study_of(config, records, dict.fromkeys(records, ())).with_model(spec, added)
-    declared = {declaration.name for declaration in declarations_of(study.spec, study.extent)}
-    scopes = {"per_record": [*study.per_record], "shared": [*study.shared]}
-    return config.model_copy(
-        update={
-            "model": config.model.with_spec(spec).model_copy(update=scopes),
-            "parameters": {
-                name: ParameterConfig(**stated.keys) for name, stated in study.stated.items()
-            },
-            "truth": {
-                name: value
-                for name, value in config.truth.items()
-                if name.partition("[")[0] in declared
-            },
-        }
-    )
-
-
-def as_config(parameter: Parameter, quantities: Quantities) -> ParameterConfig:
-    """Write a parameter as a config does, in explicit numbers and the quantities' units."""
-    stated = Stated(
-        parameter.prior,
-        parameter.fixed,
-        parameter.lower if np.isfinite(parameter.lower) else None,
-        parameter.upper if np.isfinite(parameter.upper) else None,
-        quantities.say(parameter.unit),
-        parameter.label,
-        parameter.description,
-    )
-    return ParameterConfig(**stated.keys)
 
 
 def stand_of(config: Config, training: Sequence[Record]) -> VirtualTestStand:
@@ -134,3 +87,34 @@ def recoverable(stand: VirtualTestStand, fitted: Actuator) -> dict[str, float]:
     if fitted.creep and stand.actuator.creep and fitted.creep.times != stand.actuator.creep.times:
         other |= {declared.name for declared in fitted.creep.parameters}
     return {name: value for name, value in stand.parameters().items() if name not in other}
+
+
+def plan_of(config: Config, posterior: Posterior) -> SamplingPlan:
+    """Return how a posterior is sampled.
+
+    Raises InputError: too few walkers.
+    """
+    settings, prior = config.sampling, posterior.prior
+    fewest = 2 * prior.dimensions
+    # Halves of an ensemble fill the compiled engine's lanes; with six more than the fewest
+    # complementary halves span all directions.
+    common = 64 if posterior.engine == "numba" else 32
+    walkers = settings.walkers or max(fewest + 6, common)
+    if walkers < fewest:
+        raise InputError(
+            f"sampling.walkers: {walkers} are too few for {prior.dimensions} free parameters; "
+            f"use at least {fewest}"
+        )
+    samples = sum(dataset.readings.samples for dataset in posterior.datasets)
+    readings = sum(len(data.readings.values) for data in posterior.datasets)
+    return SamplingPlan(
+        ess=settings.ess,
+        ensembles=settings.ensembles,
+        walkers=walkers,
+        block=settings.block,
+        max_steps=settings.steps,
+        max_pilot_steps=settings.pilot_steps,
+        ensembles_per_task=best_ensembles_per_task(settings.ensembles, walkers, samples),
+        tries=best_tries(walkers, readings),
+        ahead=best_ahead(walkers, samples),
+    )
