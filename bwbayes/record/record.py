@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -65,6 +65,8 @@ class Record(Inputs):
         sample: the time stamp of time zero.
     instruments : Instruments
         Uncertainties of the scales of sensor and voltage monitor.
+    read_as : dict
+        Names in the file that it was read from: of its ``columns`` by quantity, ``all_columns``.
 
     Raises
     ------
@@ -87,6 +89,7 @@ class Record(Inputs):
     truth: FloatArray | None = None
     time_offset: float = 0.0
     instruments: Instruments = EXACT
+    read_as: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         samples = np.size(self.voltage)

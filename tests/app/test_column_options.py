@@ -64,6 +64,13 @@ def readable(path: Path, **options: Any) -> Record:
         return read_record(path, need_displacement=False, **options)
 
 
+def read_as(source: RecordConfig, folder: Path) -> Record:
+    """Read a config's record."""
+    assert source.file is not None
+    stated = source.columns, source.units, source.fs
+    return readable(folder / source.file, columns=stated[0], units=stated[1], fs=stated[2])
+
+
 @given(kinds(), st.booleans())
 def test_a_second_file_of_the_same_columns_is_read_as_the_first(
     kind: tuple[list[str], list[str], RecordConfig], planned: bool
@@ -73,7 +80,7 @@ def test_a_second_file_of_the_same_columns_is_read_as_the_first(
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         written(folder / "first.csv", names, quantities, 1.0)
-        noted = record_naming(source, folder)
+        noted = record_naming(source, read_as(source, folder))
         kept = [i for i, q in enumerate(quantities) if q in ("time", "voltage") or not planned]
         second = folder / "second.csv"
         written(second, [names[i] for i in kept], [quantities[i] for i in kept], 3.0)
@@ -106,9 +113,10 @@ def test_a_file_of_other_columns_is_read_by_itself(
         written(folder / "first.csv", names, quantities, 1.0)
         second = folder / "second.csv"
         written(second, ["time_s", "voltage_V", "displacement_um"], [*QUANTITIES], 3.0)
-        assert {} == column_options_from(second, record_naming(source, folder))
+        record = read_as(source, folder)
+        assert {} == column_options_from(second, record_naming(source, record))
         assert {} == column_options_from(second, None)
-        assert record_naming(RecordConfig(file="first.csv"), folder) is None
+        assert record_naming(RecordConfig(file="first.csv"), record) is None
 
 
 def test_a_run_keeps_how_its_record_was_read(tmp_path: Path) -> None:

@@ -264,12 +264,12 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
     text = '[record]\nfile = "record.h5"\n'
     whole = of(text, tmp_path)
     (finding,) = whole.findings["record"]
-    assert f"record: {finding}" in whole.remarks
+    assert f"record: {finding}" in whole.record_remarks
     later = of(f"{text}train = [[{finding.stop + 0.01}, 5.0]]\n", tmp_path)
     assert () == later.findings["record"]
     (remark,) = of(
         f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
-    ).remarks
+    ).record_remarks
     assert remark.startswith("a: switch-on transient: the displacement starts ")
     assert f". Fix: lead_in_start = {finding.stop:.3g} under [validation.a]" in remark
 

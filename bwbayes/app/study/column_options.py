@@ -13,20 +13,17 @@ from typing import Any
 
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.errors import InputWarning
+from bwbayes.quantities import Quantities
+from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_source
-from bwbayes.record.io.recognition import series_named
-from bwbayes.record.io.series import Source
 
 # Options by which another file of the same columns is read, too.
 KEPT = ("units", "fs", "voltage_is", "input", "output", "linearity")
 
 
-def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
-    """Return what to note of how a record's file, relative to ``folder``, was read, if anything.
-
-    Raises InputError: the file cannot be read.
-    """
+def record_naming(source: RecordConfig, record: Record) -> dict[str, Any] | None:
+    """Return what to note of how a record was read from its file, if anything."""
     stated = {
         key: getattr(source, key)
         for key in (*KEPT, "columns", "covariates")
@@ -34,14 +31,14 @@ def record_naming(source: RecordConfig, folder: Path) -> dict[str, Any] | None:
     }
     if not stated or source.file is None:
         return None
-    content = _content(folder / source.file, source.table)
+    by_key, names = Quantities.of(source.input, source.output).by_key, record.read_as["columns"]
+    quantities = {key: by_key.get(key.casefold(), key) for key in source.columns or {}}
     columns = {
-        q: series_named(content, c, q).name
-        for q, c in (source.columns or {}).items()
-        if q != "displacement" or source.displacement_file is None
+        key: names[quantity]
+        for key, quantity in quantities.items()
+        if quantity != "displacement" or source.displacement_file is None
     }
-    names = [item.name for item in content.series]
-    return {**stated, "columns": columns, "all_columns": names}
+    return {**stated, "columns": columns, "all_columns": record.read_as["all_columns"]}
 
 
 def column_options_from(
@@ -62,7 +59,10 @@ def column_options_from(
     as_stated = {key: noted[key] for key in ("input", "output") if key in noted} | as_stated
     if as_stated.keys() & {"columns", "units", "fs"}:
         return as_stated
-    names = {item.name for item in _content(Path(path), as_stated.get("table")).series}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # said where the record is read
+        content = read_source(Path(path), as_stated.get("table"))
+    names = {series.name for series in content.series}
     if not names <= {*noted.get("all_columns", ())}:
         return as_stated
     columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
@@ -70,9 +70,3 @@ def column_options_from(
     further = Naming(covariates=noted.get("covariates", ())).covariate_columns
     options["covariates"] = {name: column for name, column in further.items() if column in names}
     return options | as_stated | {"columns": columns}
-
-
-def _content(path: Path, table: int | str | None) -> Source:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # said where the record is read
-        return read_source(path, table)

@@ -107,7 +107,7 @@ def _read(
         name: source.model_copy(
             update={
                 "read_as": source.read_as
-                or (None if name in in_memory else record_naming(source, folder))
+                or (None if name in in_memory else record_naming(source, fitted[name]))
             }
         )
         for name, source in config.records.items()

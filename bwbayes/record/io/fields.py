@@ -44,6 +44,10 @@ def record_fields(
     Raises InputError: for the first problem, in one line.
     Warns InputWarning: if samples are missing, or times scatter.
     """
+    read_as = {
+        "columns": {name: column.name for name, column in table.columns.items()},
+        "all_columns": [series.name for series in table.source.series],
+    }
     table = align_clocks(table)
     _check_lengths(table)
     table = _without_empty_ends(table)
@@ -94,6 +98,7 @@ def record_fields(
         "voltage_is": kind,
         "quantities": table.quantities,
         "instruments": noted.updated(table.naming.instruments),
+        "read_as": read_as,
         "origin": table.notes.get("origin") or path_text(table.source.path.name),
         "time_offset": grid.time_offset + float(table.notes.get("time_offset_s", 0.0)),
     }
