@@ -30,6 +30,7 @@ from bwbayes.errors import (
 if TYPE_CHECKING:
     from bwbayes.app.config.config import Config
     from bwbayes.app.config.proposal import ConfigProposal
+    from bwbayes.record import Record
 
 type Reading = dict[str, Any]
 """How a record's file is read, as keyword arguments of ``read_record``."""
@@ -82,13 +83,13 @@ def check(
     --------
     bwbayes check runs/measured_stack.toml --record my_record.csv
     """
-    chosen, _ = _config_or_proposal(config, record, reading, "check", quiet=True)
+    chosen, in_memory = _config_or_proposal(config, record, reading, "check", quiet=True)
     chosen = chosen.searched(search)
     out = out or Path("results") / f"{config.stem}-check"
     with working() as watch:
         from bwbayes.app.jobs.check import check as check_config
 
-        checked = check_config(chosen, config.parent, out, watch)
+        checked = check_config(chosen, config.parent, out, watch, in_memory)
     show_report(checked)
     click.echo(f"report: {out / 'check.html'}")
     return 0
@@ -132,19 +133,19 @@ def run(
             from bwbayes.report.report import Report, remarks_banner
             from bwbayes.report.run import priors_table
 
-        chosen, is_proposal = _config_or_proposal(config, record, reading, "run", quiet=quiet)
+        chosen, in_memory = _config_or_proposal(config, record, reading, "run", quiet=quiet)
         chosen = chosen.renamed(path_text(config.stem), seed)
         path = out or Path("results") / config.stem
         chosen = chosen.searched(search)
         with working():
-            resolved = resolve_config(chosen, config.parent)
+            resolved = resolve_config(chosen, config.parent, in_memory)
             folder = RunFolder.create(path, resolved, overwrite)
         with resumable(f"`bwbayes resume {path}`"):
             with working():
                 remarks = resolved.record_remarks
             if not quiet:
                 # A proposed config has shown its remarks already.
-                banners = [] if is_proposal else remarks_banner(remarks)
+                banners = [] if in_memory else remarks_banner(remarks)
                 report_fields: Any = {"banners": banners, "quantities": resolved.quantities}
                 priors = priors_table(resolved.study.posterior.prior)
                 show_report(Report(title="priors", blocks=[priors], **report_fields))
@@ -187,18 +188,18 @@ def report(folder: Path) -> int:
 
 def _config_or_proposal(
     path: Path, record: Path | None, reading: Reading, command: str, *, quiet: bool
-) -> tuple[Config, bool]:
+) -> tuple[Config, dict[str, Record]]:
     """Read a config; or propose one where the file is a record, and show what is wrong with it.
 
-    Return the config, of another record if there is one, and whether it is a proposal. Records that
-    only ``check`` can use are refused.
+    Return the config, of another record if there is one, and what was read for a proposal. Records
+    that only ``check`` can use are refused.
     """
-    from bwbayes.app.config.config import is_config, load
+    from bwbayes.app.config.config import ALONE, is_config, load
 
     if is_config(path):
         config = load(path)
         refuse_beside_config(path, reading)
-        return config if record is None else config.with_record(record), False
+        return config if record is None else config.with_record(record), {}
     try:
         proposal = _proposed(path, path.parent, reading)
     except NoNumbersError:
@@ -226,7 +227,9 @@ def _config_or_proposal(
             proposal,
             f"training on {train} s, holding out {held_out}; save this config with `{init}`",
         )
-    return config if record is None else config.with_record(record), True
+    if record is not None:
+        return config.with_record(record), {}
+    return config, {ALONE: proposal.record}
 
 
 def _proposed(path: Path, where: Path, reading: Reading) -> ConfigProposal:

@@ -124,7 +124,12 @@ class Config(ConfigTable):
                 f"record: the config has several ({names}), and another one cannot stand for all "
                 "of them; change their files there"
             )
-        changes = {"file": str(file.resolve()), "displacement_file": None, "signal": None}
+        changes = {
+            "file": str(file.resolve()),
+            "displacement_file": None,
+            "signal": None,
+            "remarks": None,
+        }
         source = self.record.model_copy(update=changes)
         return self.model_copy(update={"record": source})
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from bwbayes.app.config.config import Config, parse
+from bwbayes.app.config.config import ALONE, Config, parse
 from bwbayes.arrays import BoolArray, FloatArray
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.record_checks import inspect, isolated_outliers
@@ -40,8 +40,9 @@ from bwbayes.record.io.grid import decimals_of
 class ConfigProposal:
     """A config for a record, and what was seen of the record.
 
-    ``text`` is the config in TOML with comments, ``config`` what it says. ``findings`` are what is
-    wrong with the record, ``remarks`` what was said when it was read.
+    ``text`` is the config in TOML with comments, ``config`` what it says, and the remarks on the
+    record. ``findings`` are what is wrong with the record, ``remarks`` what was said when it was
+    read. Whoever goes on with the ``config`` need not read the ``record`` again.
     """
 
     text: str
@@ -89,7 +90,10 @@ def draft_config(path: Path, where: Path, naming: Naming | None = None) -> Confi
         for finding in inspect(record)
     )
     text = _text(path, where, table.naming, record, findings)
-    return ConfigProposal(text, parse(text, str(path)), record, findings, remarks)
+    config = parse(text, str(path))
+    source = config.records[ALONE].model_copy(update={"remarks": [*remarks] or None})
+    proposed = config.model_copy(update={"record": source})
+    return ConfigProposal(text, proposed, record, findings, remarks)
 
 
 def _text(

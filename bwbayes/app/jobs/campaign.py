@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from rich.console import Console
 
-from bwbayes.app.config.config import dump, parse, read_toml, validated_config
+from bwbayes.app.config.config import ALONE, dump, parse, read_toml, validated_config
 from bwbayes.app.config.proposal import draft_config
 from bwbayes.app.fit.fitted import Run, open_finished
 from bwbayes.app.running.fingerprint import fingerprint
@@ -582,15 +582,16 @@ def _begun_run(file: Path, campaign: CampaignFolder) -> Run:
     origin = campaign.origin()
     where = Path(origin.where)
     if text := campaign.config.read_text(encoding="utf-8"):
-        config = parse(text, "campaign.toml").with_record(file)
+        config, in_memory = parse(text, "campaign.toml").with_record(file), {}
     else:
         proposal = draft_config(file, where, Naming.stated(**origin.reading))
         if proposal.blocking_issue is not None:
             raise InputError(f"{file}: {proposal.blocking_issue.error}")
-        config = proposal.config
+        config, in_memory = proposal.config, {ALONE: proposal.record}
     # All have the same model.
     model = config.model.model_copy(update={"search": "none"})
-    run = resolve_config(config.model_copy(update={"name": file.stem, "model": model}), where)
+    config = config.model_copy(update={"name": file.stem, "model": model})
+    run = resolve_config(config, where, in_memory)
     path = campaign.run(file.stem)
     if path.exists():
         try:

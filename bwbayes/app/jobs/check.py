@@ -7,6 +7,7 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -17,23 +18,30 @@ from bwbayes.app.running.explaining import choose_model, explain_record
 from bwbayes.app.running.remarks import lines
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.diagnosis import conflict, identifiability
+from bwbayes.record import Record
 from bwbayes.report.outputs import save
 from bwbayes.report.report import Banner, Picture, Report, Section, Text, remarks_banner
 from bwbayes.report.run import priors_table
 from bwbayes.watching import WatchSteps, unwatched
 
 
-def check(config: Config, folder: Path, out: Path, watch: WatchSteps = unwatched) -> Report:
+def check(
+    config: Config,
+    folder: Path,
+    out: Path,
+    watch: WatchSteps = unwatched,
+    in_memory: Mapping[str, Record] | None = None,
+) -> Report:
     """Check a config and its record, fit a point, write ``out/check.html``; return its report.
 
-    The config's files are relative to `folder`; an existing page is replaced. ``watch`` is called
-    with the name of a step and the share of it that is done.
+    The config's files are relative to `folder`, but for records in memory; an existing page is
+    replaced. ``watch`` is called with the name of a step and the share of it that is done.
 
     Raises InputError: the config or its record cannot be used.
     """
     from bwbayes.report.figures.series import record_pictures  # noqa: PLC0415  # slow to load
 
-    run, point, steps, explained = choose_model(resolve_config(config, folder), watch)
+    run, point, steps, explained = choose_model(resolve_config(config, folder, in_memory), watch)
     study, posterior = run.study, run.study.posterior
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, study.generator("around"))

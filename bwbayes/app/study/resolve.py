@@ -105,10 +105,7 @@ def _read(
     remarks += [str(w.message) for w in caught if issubclass(w.category, InputWarning)]
     noted = {
         name: source.model_copy(
-            update={
-                "read_as": source.read_as
-                or (None if name in in_memory else record_naming(source, fitted[name]))
-            }
+            update={"read_as": source.read_as or record_naming(source, fitted[name])}
         )
         for name, source in config.records.items()
     }
