@@ -247,7 +247,8 @@ def inside(table: pd.DataFrame, lower: str, upper: str) -> float:
 
 def test_corrected_band_stands_beside_the_failed_one(failed: Path) -> None:
     fit = bw.open_run(failed)
-    correction = fit.corrections["held-out"]
+    correction = fit.bands["held-out"].correction
+    assert correction is not None
     assert correction.factor == pytest.approx(5, rel=0.5)
     assert correction.blocks >= 20
     numbers = json.loads((failed / "summary.json").read_text())["validation"]
@@ -285,7 +286,7 @@ def test_predictions_of_drives_alike_have_it_and_others_do_not(
 
 
 def test_nothing_is_shown_of_a_run_that_passed(run: Path, fit: bw.Run) -> None:
-    assert fit.corrections == {}
+    assert all(bands.correction is None for bands in fit.predictions)
     assert "corrected" not in (run / "report.html").read_text(encoding="utf-8")
     assert "correct" not in (run / "bands.csv").read_text().partition("\n")[0]
     assert '"correction"' not in (run / "summary.json").read_text()

@@ -14,6 +14,7 @@ from bwbayes.app.config.config import parse
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.study import resolve as resolve_module
+from bwbayes.app.study.about import findings_of
 from bwbayes.app.study.records import windows_of
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.errors import InputError
@@ -252,10 +253,10 @@ def test_a_model_without_hysteresis_needs_no_loops(tmp_path: Path) -> None:
     error = np.random.default_rng(1).normal(0, 0.005, voltage.size)
     write_record(Record(voltage, 0.1 * voltage + error, interval=1e-3), tmp_path / "record.h5")
     text = '[record]\nfile = "record.h5"\n'
-    kinds = [finding.kind for finding in of(text, tmp_path).findings["record"]]
+    kinds = [finding.kind for finding in findings_of(of(text, tmp_path).study)["record"]]
     assert ["one amplitude", "no hysteresis"] == kinds
     linear = of(f'{text}[model]\nhysteresis = "linear"\n', tmp_path)
-    assert () == linear.findings["record"]
+    assert () == findings_of(linear.study)["record"]
 
 
 def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -> None:
@@ -263,10 +264,10 @@ def test_findings_of_a_record_are_remarks_where_a_window_looks(tmp_path: Path) -
     write_record(transient, tmp_path / "record.h5")
     text = '[record]\nfile = "record.h5"\n'
     whole = of(text, tmp_path)
-    (finding,) = whole.findings["record"]
+    (finding,) = findings_of(whole.study)["record"]
     assert f"record: {finding}" in whole.record_remarks
     later = of(f"{text}train = [[{finding.stop + 0.01}, 5.0]]\n", tmp_path)
-    assert () == later.findings["record"]
+    assert () == findings_of(later.study)["record"]
     (remark,) = of(
         f"{text}start = {finding.stop}\n[validation.a]\nfile = 'record.h5'", tmp_path
     ).record_remarks

@@ -12,6 +12,7 @@ from click.testing import CliRunner, Result
 from bwbayes.app.commands import cli
 from bwbayes.app.config.config import load, parse
 from bwbayes.app.config.proposal import ConfigProposal, draft_config
+from bwbayes.app.study.about import findings_of
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -210,7 +211,7 @@ def test_a_reversed_sign_is_turned_by_its_unit(
     problem = resolve_config(load(path.with_suffix(".toml")), path.parent)
     assert problem.study.record.displacement is not None
     np.testing.assert_allclose(problem.study.record.displacement, record.displacement, atol=1e-6)  # type: ignore[arg-type]
-    assert () == problem.findings["record"]
+    assert () == findings_of(problem.study)["record"]
 
 
 def test_init_writes_the_config_beside_the_record_and_replaces_none(write: Write) -> None:
@@ -243,7 +244,7 @@ def test_the_shorter_side_of_a_jump_is_neither_fitted_nor_held_out(write: Write)
     windows = [*(proposal.config.records["record"].train or ())]
     windows += proposal.config.validation["held_out"].window or ()
     assert max(stop for _, stop in windows) <= time + 1e-9
-    assert () == resolve_config(proposal.config, path.parent).findings["record"]
+    assert () == findings_of(resolve_config(proposal.config, path.parent).study)["record"]
 
 
 def test_readings_that_are_clipped_are_missing(write: Write) -> None:
@@ -259,7 +260,7 @@ def test_readings_that_are_clipped_are_missing(write: Write) -> None:
     assert limits == pytest.approx(source.missing)
     again = f'{proposal.text}\n[validation.again]\nfile = "{path.name}"\n'
     problem = resolve_config(parse(again, str(path)), path.parent)
-    assert () == problem.findings["record"]
+    assert () == findings_of(problem.study)["record"]
     another = problem.study.validations["again"].record
     assert another is not None
     for record in (problem.study.record, another):

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial, wraps
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
+from bwbayes.app.fit.stage import RunStage, always
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.verbs import VERBS
 from bwbayes.errors import InputError, NotConvergedError, Renamed
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from bwbayes.diagnosis.rivals import Rival
     from bwbayes.diagnosis.validation import BandValidation, ValidationContext, ValidationSummary
     from bwbayes.inference.study import Study
-    from bwbayes.prediction.bands import Bands, Correction
+    from bwbayes.prediction.bands import Bands
     from bwbayes.prediction.budget import Budget
     from bwbayes.prediction.loops import Loops
     from bwbayes.prediction.scores import Scores
@@ -73,33 +73,6 @@ if TYPE_CHECKING:
 
 # By this a chain notes what noise on the voltages leaves unsure: a covariance, (free, free).
 VOLTAGE_NOISE = "voltage_noise_covariance"
-
-
-class RunStage[T](cached_property[T]):
-    """A stage of a run, from the function that computes it, of the run and a watch.
-
-    A result that an earlier process has kept is not computed again. Asking for a stage without
-    convergence raises a NotConvergedError, unless the stage is there ``always``.
-    """
-
-    def __init__(self, compute: Callable[[Any, Watch], T], *, always: bool = False) -> None:
-        self.compute, self.always = compute, always
-
-        @wraps(compute)
-        def stage(run: Run) -> Any:
-            if not always:
-                run.require_converged()
-            name = compute.__name__
-            if name in run.kept:
-                return run.kept[name]
-            return self.compute(run, partial(run.watch, name.replace("_", " ")))
-
-        super().__init__(stage)
-
-
-def always[T](compute: Callable[[Any, Watch], T]) -> RunStage[T]:
-    """Make a stage that is there without convergence, too."""
-    return RunStage(compute, always=True)
 
 
 @dataclass(eq=False, repr=False)
@@ -119,7 +92,6 @@ class Run(Shown):
     -----
     Without convergence nothing is said of an interval: whatever would need one raises
     :class:`bwbayes.NotConvergedError`. The draws stay, and :meth:`resume` continues them.
-    Everything else is computed, and its libraries are loaded, when it is first asked for.
     """
 
     folder: RunFolder = field(default_factory=lambda: RunFolder(Path(os.devnull)))
@@ -182,13 +154,6 @@ class Run(Shown):
         return facts_of(self.study, self.config)
 
     @cached_property
-    def findings(self) -> dict[str, tuple[Finding, ...]]:
-        """Issues of each fitted record that matter to the model."""
-        from bwbayes.app.study.about import findings_of
-
-        return findings_of(self.study)
-
-    @cached_property
     def extrapolations(self) -> dict[str, list[Finding]]:
         """In what the drive of each validation leaves the training data, by its name."""
         from bwbayes.app.study.about import extrapolations_of
@@ -200,7 +165,7 @@ class Run(Shown):
         """Notes on its records, one line each."""
         from bwbayes.app.study.about import record_remarks
 
-        return record_remarks(self.config, self.study, self.findings, self.extrapolations)
+        return record_remarks(self.config, self.study, self.extrapolations)
 
     @property
     def state(self) -> str:
@@ -629,12 +594,6 @@ class Run(Shown):
         }
 
     @property
-    def corrections(self) -> dict[str, Correction]:
-        """How much wider bands that failed validation have to be, by the bands' name."""
-        corrections = ((bands.name, bands.correction) for bands in self.predictions)
-        return {name: correction for name, correction in corrections if correction is not None}
-
-    @property
     def residuals(self) -> xarray.DataArray:
         """Readings less the mean along the training record, (time,), um.
 
@@ -643,10 +602,9 @@ class Run(Shown):
         """
         import xarray as xr
 
-        study = self.study
+        study, record = self.study, self.study.record
         if len(study.records) > 1:
             raise InputError("residuals: of several records; take fit.bands[NAME].residuals")
-        record = study.record
         values = np.full(record.samples, np.nan)
         for name, windows in study.windows(*study.records).items():
             span = slice(windows[0].start, windows[-1].stop)
@@ -725,7 +683,6 @@ class Run(Shown):
         return run_report(self.result, self.numbers)
 
 
-# In their order.
 STAGES = {name: stage for name, stage in vars(Run).items() if isinstance(stage, RunStage)}
 
 for verb in VERBS:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bwbayes.app.fit.fitted import Run
+from bwbayes.app.study.about import findings_of
 from bwbayes.control.loop import CONTROLLERS
 from bwbayes.control.tracking import Tracking
 from bwbayes.errors import InputError, suggestion
@@ -59,7 +60,7 @@ class Plots:
         """Draw a training record: along "time", as a "loop", or its "drive"'s spectrum."""
         study = self._fit.study
         name, record = _named(study.records, name)
-        shown = record_pictures(record, study.training[name], self._fit.findings[name])
+        shown = record_pictures(record, study.training[name], findings_of(study)[name])
         return self._styled(_named(shown, kind)[1].draw)
 
     def loop(self, *names: str) -> Figure:

@@ -16,6 +16,7 @@ from markupsafe import Markup
 from bwbayes.app.config.config import Config
 from bwbayes.app.running.explaining import choose_model, explain_record
 from bwbayes.app.running.remarks import lines
+from bwbayes.app.study.about import findings_of
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.diagnosis import conflict, identifiability
 from bwbayes.record import Record
@@ -46,7 +47,8 @@ def check(
     free, _ = posterior.prior.constrain(point.mode[None])
     likely = conflict.around(posterior.prior, point, study.generator("around"))
     # The findings are remarks too, but here they come with what to do.
-    shown = {f"{name}: {issue}" for name, issues in run.findings.items() for issue in issues}
+    findings = findings_of(study)
+    shown = {f"{name}: {issue}" for name, issues in findings.items() for issue in issues}
     remarks = [remark for remark in run.record_remarks if remark not in shown]
     remarks += map(str, conflict.conflicts(posterior.prior, likely, study.defaults))
     remarks += map(str, identifiability.undetermined(posterior, point))
@@ -58,7 +60,7 @@ def check(
     item = Markup("<b>{}</b>: {}. Fix: <code>{}</code>")
     problems = [
         item.format(finding.kind, finding.text, finding.fix)
-        for issues in run.findings.values()
+        for issues in findings.values()
         for finding in issues
     ]
     nothing = "the record by itself shows no transient, spike, jump, clipping, drift or the like"
@@ -68,7 +70,7 @@ def check(
     about += steps
     pictures: list[Picture] = []
     for name, record in study.records.items():
-        of, issues = name if several else "", run.findings[name]
+        of, issues = name if several else "", findings[name]
         drawn = record_pictures(record, study.training[name], issues, of)
         pictures += drawn.values()
     name = config.name or study.record.origin

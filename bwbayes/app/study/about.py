@@ -102,7 +102,6 @@ def findings_of(study: Study) -> dict[str, tuple[Finding, ...]]:
 def record_remarks(
     config: Config,
     study: Study,
-    findings: Mapping[str, Sequence[Finding]],
     extrapolations: Mapping[str, Sequence[Finding]],
 ) -> tuple[str, ...]:
     """Return notes on the records of a study, one line each."""
@@ -110,7 +109,9 @@ def record_remarks(
     remarks = [text for source in sources.values() for text in source.remarks or ()]
     measured = {**study.records, **study.others}
     remarks += [f"{n}: {r.path.remark}" for n, r in measured.items() if r.path.remark]
-    remarks += [f"{name}: {finding}" for name, all_ in findings.items() for finding in all_]
+    remarks += [
+        f"{name}: {finding}" for name, all_ in findings_of(study).items() for finding in all_
+    ]
     remarks += [text for name, other in study.others.items() for text in _unlike(name, other)]
     remarks += [
         (f"{name}: " if len(study.records) > 1 else "") + _set_aside(source.outliers, record)
