@@ -143,7 +143,7 @@ def test_other_readings_are_refused(
     fits: tuple[Run, Run], record: Record, keys: dict[str, Any], line: str
 ) -> None:
     config, records = config_of(record, KEYS | keys)
-    other = fits[1].with_cache(problem=resolve_config(config, Path(), records))
+    other = fits[1].with_cache(study=resolve_config(config, Path(), records).study)
     with pytest.raises(InputError, match=line):
         fits[0].compare(other)
 
