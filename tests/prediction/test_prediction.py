@@ -48,7 +48,7 @@ def posterior(record: Record) -> Posterior:
         {"exponent": 1.0},
         from_rest=True,
     )
-    return whole.altered(training=(slice(0, 600),))
+    return replace(whole.altered(training=(slice(0, 600),)), engine="numba")
 
 
 @pytest.fixture(scope="module")
