@@ -1,4 +1,4 @@
-"""What all tests share: forty examples, no deadline, and in CI the same examples each time.
+"""What all tests share: twenty examples, no deadline, and in CI the same examples each time.
 
 Elsewhere hypothesis looks for new ones in every run, and keeps those that fail for the next.
 The tests of the whole come first: they take longest, and no worker shall end with one alone. Before
@@ -27,7 +27,7 @@ gc.set_threshold(50_000)
 os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])
 
 settings.register_profile(
-    "busy", deadline=None, max_examples=40, derandomize=os.environ.get(VARIABLE) == REQUIRED
+    "busy", deadline=None, max_examples=20, derandomize=os.environ.get(VARIABLE) == REQUIRED
 )
 settings.load_profile("busy")
 

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from bokeh.models import ColumnDataSource
-from hypothesis import given, settings
+from hypothesis import given
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
@@ -180,7 +180,6 @@ def test_ranks_of_independent_draws_keep_inside_the_gray_band() -> None:
     np.testing.assert_allclose(np.ones(bins), heights[0].mean(axis=0))
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), st.integers(1, 50))
 def test_thinned_series_keep_their_extremes(values: list[float], most: int) -> None:
     y = np.asarray(values)

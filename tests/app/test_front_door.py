@@ -86,7 +86,7 @@ def resolved(path: Path, naming: Naming | None = None) -> Run:
         return resolve_config(draft_config(path, path.parent, naming).config, path.parent)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(
     samples=st.integers(200, 3000),
     rate=st.one_of(

@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from bwbayes.diagnosis.finding import Finding
 from bwbayes.diagnosis.validation import BandValidation
@@ -165,7 +165,6 @@ def test_digits_follow_the_standard_deviation(value: float, sd: float, expected:
     assert expected == digits(value, sd)
 
 
-@settings(deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-15, 1e9))
 def test_rounding_costs_at_most_a_twentieth_of_a_standard_deviation(
     value: float, sd: float

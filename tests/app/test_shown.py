@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 import bwbayes as bw
 from bwbayes.app.config.config import parse
@@ -94,7 +94,6 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=40)
 @given(VALUES, VALUES)
 def test_anything_is_shown_shortly(one: Any, another: Any) -> None:
     for thing in (Anything(one, another), Anything(Anything(one, another), [one] * 50)):

@@ -5,7 +5,7 @@ False alarms: none in 100 drives of the fitted kind, with noise and other sampli
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.extrapolation import Drive, beyond_training, unexcited
@@ -146,7 +146,6 @@ def test_a_drive_is_told_by_its_range_its_fastest_swing_and_its_reversals() -> N
     assert str(Drive.of(fitted(5 * TIME, 0.005))) == "0 to 79.98 V"
 
 
-@settings(max_examples=20, deadline=None)
 @given(phase=st.floats(0, 6.2), frequency=st.floats(0.3, 2.0), low=st.floats(-20, 20))
 def test_a_drive_with_reversals_elsewhere_is_told_from_the_same_one_again(
     phase: float, frequency: float, low: float

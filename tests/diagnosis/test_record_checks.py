@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.finding import Finding
@@ -147,7 +147,6 @@ def test_a_staircase_whose_readings_are_noise_free_repeats_no_sample(levels: int
     assert [] == findings("repeated samples", fine, readings)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shape=st.sampled_from(["decay", "triangle", "unipolar"]),
@@ -204,12 +203,12 @@ def without_memory(seed: int, loop: float = 0.0) -> Record:
 
 
 @pytest.mark.parametrize(
-    ("records", "named"), [(20, 19), pytest.param(100, 97, marks=pytest.mark.slow)]
+    ("records", "named"), [(10, 9), pytest.param(100, 97, marks=pytest.mark.slow)]
 )
 def test_where_no_loop_shows_it_is_said_and_where_one_does_it_is_not(
     records: int, named: int
 ) -> None:
-    """Of 100 records four are not named by chance once in 50 times, of 20 two once in 60.
+    """Of 100 records four are not named by chance once in 50 times, of 10 two once in 200.
 
     Loops are 1% of the range.
     """
@@ -233,7 +232,6 @@ def test_of_the_measured_record_only_its_start_is_remarked_on() -> None:
     assert () == inspect(later)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     start=st.sampled_from([0.0, -86_400.0, 0.125, 9e5]) | st.floats(-1e6, 1e6),
     rate=st.sampled_from([1.0, 173.0, 1e5]) | st.floats(1.0, 1e5),
@@ -253,7 +251,6 @@ def test_the_windows_of_a_fix_hold_the_samples_that_they_name(
     assert length - 1 <= left_out <= length + 2
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     number=st.integers(0, 2**31),
     edges=st.lists(st.floats(0.02, 0.98), min_size=1, max_size=2),
@@ -305,7 +302,6 @@ def test_an_amplifier_at_its_limits_is_no_transient(kind: str) -> None:
     assert not [r for r in records if findings_of("switch-on transient", r)]
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shape=st.sampled_from(["half", "quarter", "triangle", "cosine"]),

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.causes import cause
@@ -174,7 +174,6 @@ def test_no_spoilt_record_holds_and_its_cause_is_named(kind: str, records: int) 
     assert sum(causes) >= 0.9 * records
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     number=st.integers(0, 2**31),
     along=st.floats(0.1, 0.9),

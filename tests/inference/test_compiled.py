@@ -122,7 +122,7 @@ VOLTAGES = st.lists(
 @pytest.mark.parametrize("name", HYSTERESIS)
 @given(path=VOLTAGES, seed=st.integers(0, 2**32 - 1), from_rest=st.booleans())
 @example(path=[10.0, 0.0, 2e-309], seed=0, from_rest=True)  # a step whose inverse overflows
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 def test_engines_agree_on_any_path(
     name: str, path: list[float], seed: int, from_rest: bool
 ) -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.defaults import join_ranges, ranges_of, rounding_sd
@@ -47,7 +47,6 @@ def score(name: str, value: float, ranges: Ranges) -> float:
     return float(result.to_normal(np.array([value]), ends[0], ends[1])[0])
 
 
-@settings(deadline=None, max_examples=30)
 @given(every=st.integers(1, 20), amplitude=st.floats(10, 150), bias=st.floats(-50, 50))
 def test_record_and_its_every_kth_sample_have_nearly_the_same_priors(
     every: int, amplitude: float, bias: float
@@ -153,7 +152,6 @@ def test_a_default_prior_goes_with_the_units(name: str, exponent: float) -> None
         np.testing.assert_allclose(k**of_k * m**of_m, grown, rtol=0.01)
 
 
-@settings(deadline=None, max_examples=30)
 @given(digits=st.integers(0, 3), scale=st.floats(0.1, 10), seed=st.integers(0, 9))
 def test_readings_without_noise_have_that_of_rounding(digits: int, scale: float, seed: int) -> None:
     """Of q/√12 in multiples of q, of 2⁻²⁴ of the range in others; none is said of noisy readings.

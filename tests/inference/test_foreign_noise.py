@@ -14,7 +14,7 @@ from typing import NamedTuple, cast
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.errors import InputError
@@ -180,7 +180,6 @@ def dense(case: Case, theta: FloatArray, rows: IntArray) -> FloatArray:
     NUMBERS,
     st.lists(st.integers(0, 300), min_size=1, max_size=80, unique=True),
 )
-@settings(deadline=None, max_examples=30)
 def test_a_density_is_that_of_the_dense_covariance(
     case: Case, seed: int, numbers: FloatArray, readings: list[int]
 ) -> None:

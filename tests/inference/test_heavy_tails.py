@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError
@@ -38,7 +38,6 @@ def t_scale(inverse_df: float) -> float:
 
 
 @given(st.floats(1e-3, 1.0), st.floats(-3.0, 3.0), st.floats(0.0, 50.0))
-@settings(deadline=None)
 def test_a_reading_has_the_density_of_a_t_distribution(
     inverse_df: float, log_sd: float, away: float
 ) -> None:

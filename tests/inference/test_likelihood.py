@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
+from hypothesis import example, given, strategies as st
 from scipy import linalg
 
 from bwbayes.arrays import FloatArray
@@ -173,7 +173,6 @@ def test_from_rest_means_a_path_from_zero_volts() -> None:
     assert np.min(np.abs(wrong - at_rest.log_likelihood(theta))) > 1
 
 
-@settings(max_examples=30, deadline=None)
 @example(exponents=(2.0, 6.0, -4.0, -3.0))
 @given(
     exponents=st.tuples(st.floats(0, 15), st.floats(0, 18), st.floats(-15, -3), st.floats(-26, -3))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import Engine
@@ -20,7 +20,6 @@ LINEAR = {noise: Linear(free, noise) for free, noise in CASES}
 
 
 @pytest.mark.parametrize("noise", LINEAR)
-@settings(deadline=None, max_examples=25)
 @given(
     start=st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3), width=st.sampled_from([0.01, 1.0])
 )

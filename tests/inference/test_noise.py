@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray, IntArray
 from bwbayes.inference.noise import DiscrepancyNoise, SmoothNoise
@@ -80,7 +80,6 @@ def whitened(
     st.one_of(st.none(), QUALITIES),
     st.lists(st.integers(0, 300), min_size=1, max_size=60, unique=True),
 )
-@settings(deadline=None, max_examples=60)
 def test_whitening_is_that_of_a_dense_covariance(
     seed: int, time: float, quality: float | None, readings: list[int]
 ) -> None:

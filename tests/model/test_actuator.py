@@ -86,7 +86,7 @@ def test_agrees_with_a_slow_simulation(actuator: Actuator, exponent: float) -> N
 
 @every_kind
 @given(cuts=st.lists(st.integers(1, 149), max_size=6, unique=True))
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 def test_pieces_equal_the_whole(actuator: Actuator, cuts: list[int]) -> None:
     theta, voltage = batch_of(actuator, 8), random_walk(4)
     state: State | None = None

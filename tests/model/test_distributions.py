@@ -80,7 +80,7 @@ def test_scores_round_trip_in_both_tails(distribution: Distribution) -> None:
 
 
 @given(st.floats(-9, 9), st.floats(1e-3, 5), st.floats(-3, 3))
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_scores_round_trip_between_bounds_in_either_tail(
     low: float, width: float, score: float
 ) -> None:

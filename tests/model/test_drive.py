@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.model.inputs import (
@@ -96,7 +96,6 @@ def test_plateaus_belong_to_the_stretch_that_leads_to_them() -> None:
 @given(
     steps=st.lists(st.integers(-2, 2), max_size=60), longest=st.one_of(st.none(), st.integers(1, 9))
 )
-@settings(deadline=None)
 def test_stretches_partition_the_record(steps: list[int], longest: int | None) -> None:
     voltage = np.cumsum([0.0, *steps])
     stretches = list(monotone_stretches(voltage, longest))

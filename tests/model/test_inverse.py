@@ -126,7 +126,7 @@ paths = st.lists(
 
 
 @pytest.mark.parametrize("name", cases.ACTUATORS)
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(turns=paths, from_rest=st.booleans())
 @example(turns=[(1e-9, 12)], from_rest=False)  # no more than the rounding of where it starts
 def test_along_any_path(name: str, turns: list[tuple[float, int]], from_rest: bool) -> None:

@@ -49,7 +49,7 @@ def by_matrix_exponential(rate: FloatArray, hold: Hold, drive: FloatArray) -> Fl
     ratio=st.floats(0.0, 40.0),
     hold=st.sampled_from(HOLDS),
 )
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_any_oscillator_agrees_with_the_matrix_exponential(
     frequency: float, ratio: float, hold: Hold
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.control.exported import exported
@@ -236,7 +236,6 @@ def test_a_stage_does_what_its_equation_says(name: str, hold: Hold) -> None:
     np.testing.assert_allclose(passed(name, x, hold)[known], expected[known], rtol=0, atol=1e-4)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     st.lists(st.sampled_from(list(STAGES)), unique=True, max_size=4),
     st.sampled_from(["first", "zero"]),

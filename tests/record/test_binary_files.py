@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import assume, example, given, settings, strategies as st
+from hypothesis import assume, example, given, strategies as st
 
 from bwbayes.errors import InputError, InputWarning
 from bwbayes.record import Record, read_record, write_record
@@ -396,7 +396,6 @@ def test_a_matlab_object_is_named_with_how_to_save_it(tmp_path: Path) -> None:
 
 
 @quiet
-@settings(max_examples=60)
 @given(st.integers(4, 500), st.lists(st.integers(0, 255), max_size=6), st.booleans())
 @example(275, [0, 0, 0], False)  # a second time of 7e-310 s
 def test_a_damaged_netcdf_file_is_read_or_refused_in_a_line(

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import example, given, settings, strategies as st
+from hypothesis import example, given, strategies as st
 
 from bwbayes.errors import ColumnsError, InputError, InputWarning
 from bwbayes.record import Record, read_record
@@ -87,7 +87,6 @@ def test_times_of_day_go_on_after_midnight(folder: Path, start: int, form: str) 
     np.testing.assert_allclose(record.voltage, VOLTAGE)
 
 
-@settings(max_examples=25)
 @given(
     st.datetimes(datetime(2001, 1, 2), datetime(2059, 12, 29)),
     st.sampled_from(

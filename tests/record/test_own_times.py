@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 from nptdms import ChannelObject, TdmsWriter
 
 from bwbayes.errors import InputError, InputWarning
@@ -160,7 +160,6 @@ def check(record: Record, delay: float, ratio: float) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=25)
 @given(delay=st.floats(-0.5, 0.5), ratio=st.sampled_from([1.0, 0.2, 0.7, 2.0, 5.0]))
 def test_each_channel_has_the_times_beside_it(
     folder: Path, kind: str, delay: float, ratio: float

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bwbayes.arrays import FloatArray
@@ -50,7 +50,6 @@ def assert_same(expected: Record, got: Record) -> None:
         np.testing.assert_array_equal(expected.truth, got.truth)
 
 
-@settings(max_examples=25)
 @given(record=records, way=st.lists(st.sampled_from(SUFFIXES), min_size=1, max_size=6))
 def test_a_record_survives_any_way_through_the_formats(
     folder: Path, record: Record, way: list[str]
@@ -78,7 +77,6 @@ def in_unit(values: FloatArray, power: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "h5", "mat"])
-@settings(max_examples=25)
 @given(
     record=records,
     volt=st.sampled_from(sorted(VOLTS)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings, strategies as st
+from hypothesis import assume, example, given, strategies as st
 from openpyxl import Workbook
 
 from bwbayes.errors import InputError
@@ -47,7 +47,6 @@ def assert_holds(path: Path, table: Any, rows: Cells) -> None:
 
 
 @quiet
-@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(
@@ -156,7 +155,6 @@ FORMATS = {
 }
 
 
-@settings(max_examples=25)
 @given(
     st.sampled_from([*FORMATS]),
     st.sampled_from([1e-5, 2e-5, 1e-4, 4e-4, 5e-3, 0.25]),

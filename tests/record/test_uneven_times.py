@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings, strategies as st
+from hypothesis import assume, example, given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.errors import InputError, InputWarning
@@ -29,7 +29,6 @@ def uneven(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> R
     st.booleans(),
     st.integers(0, 2**32),
 )
-@settings(max_examples=60, deadline=None)
 def test_columns_are_what_they_were_at_the_times_of_the_grid(
     samples: int, exponent: float, start: float, jitter: float, drifts: bool, seed: int
 ) -> None:
@@ -99,7 +98,6 @@ def test_what_is_done_is_said() -> None:
     st.integers(0, 10**6),
 )
 @example(224, 1e-6, 0.17543864867674341, np.floor, 0)
-@settings(max_examples=60, deadline=None)
 def test_samples_are_uniform_whose_clock_ticks_too_slowly(
     samples: int, tick: float, ratio: float, rounded: np.ufunc, start: int
 ) -> None:
@@ -129,7 +127,6 @@ def test_samples_are_uniform_whose_clock_ticks_too_slowly(
 @example(127, 152_000.0, 3, "g", 0.0, True)  # the stated rate, not a rounder interval
 @example(100, 20_800.0, 3, "g", 0.0, True)  # 39 samples are 1.875 ms, a tie of three digits
 @example(100, 1 / 3, 3, "g", 0.2, True)  # late times are rounded to the second
-@settings(max_examples=60, deadline=None)
 def test_times_of_a_fixed_number_of_digits_are_uniform(
     samples: int, rate: float, digits: int, form: str, start: float, is_stated: bool
 ) -> None:
@@ -259,7 +256,6 @@ def test_copied_rows_leave_a_record_as_it_was(
 )
 @example(40, 300, 0.0, 0.05, 5)
 @example(1, 12.0, 0.0, 0.0, 0)
-@settings(max_examples=60, deadline=None)
 def test_a_gap_in_a_smooth_output_is_bridged_right_and_another_refused(
     missing: int, period: float, phase: float, noise: float, others: int
 ) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
+from hypothesis import example, given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.record import Record, read_record
@@ -26,7 +26,6 @@ def length(voltage: FloatArray) -> float:
     return float(np.sum(np.abs(np.diff(voltage))))
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     KINDS,
     SEEDS,
@@ -48,7 +47,6 @@ def test_a_clean_voltage_comes_back_bit_for_bit(
     assert not path.remark
 
 
-@settings(max_examples=20, deadline=None)
 @given(
     SEEDS,
     st.sampled_from([200.0, 1000.0, 4000.0]),
@@ -82,7 +80,6 @@ def test_measured_and_simulated_voltages_come_back() -> None:
     np.testing.assert_array_equal(estimate_path(voltage).voltage, voltage)
 
 
-@settings(max_examples=40, deadline=None)
 @given(KINDS, SEEDS, st.sampled_from([1000.0, 4000.0]), st.sampled_from([3e-4, 1e-3, 3e-3]))
 def test_of_a_noisy_voltage_the_real_path_is_left(
     kind: str, seed: int, rate: float, sd: float
@@ -96,7 +93,6 @@ def test_of_a_noisy_voltage_the_real_path_is_left(
     assert abs(length(path.voltage) - length(clean)) < max(0.005 * length(clean), 0.01 * excess)
 
 
-@settings(max_examples=20, deadline=None)
 @given(kind=st.sampled_from(["triangle", "staircase"]), seed=SEEDS)
 @example(kind="staircase", seed=10_000)  # whose first sample alone is at the first level
 def test_its_reversals_are_the_true_ones(kind: str, seed: int) -> None:
@@ -121,7 +117,6 @@ def large_turns(voltage: FloatArray, threshold: float) -> int:
     return count
 
 
-@settings(max_examples=20, deadline=None)
 @given(KINDS, SEEDS, st.floats(-1e3, 1e3).filter(lambda a: abs(a) > 1e-3), st.floats(-10, 10))
 def test_the_path_scales_with_the_voltage(
     kind: str, seed: int, factor: float, shift: float

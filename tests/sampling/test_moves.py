@@ -12,7 +12,7 @@ import emcee
 import numpy as np
 import pytest
 from emcee.moves import DEMove, Move
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import BoolArray, FloatArray, IntArray
 from bwbayes.sampling.moves import IndependenceMove, SnookerMove, WeightedMoves, sampling_moves
@@ -93,7 +93,6 @@ def test_twin_half_of_the_snooker_factor_is_found() -> None:
     assert worst_score(TARGETS["gaussian"], {"move": (halved, 1.0)}, steps=40) > ALARM
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(-30, 30), min_size=2, max_size=6))
 def test_a_step_to_one_of_several_places_and_its_way_back_are_in_balance(logs: list[float]) -> None:
     """With the other places given, w₀ P(0 → 1) = w₁ P(1 → 0), by a fine grid of chances."""

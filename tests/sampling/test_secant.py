@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.engine import resolve_engine
@@ -44,7 +44,6 @@ def places(posterior: Posterior, generator: np.random.Generator, count: int) -> 
     return posterior.prior.unconstrain(posterior.prior.draw(generator, count))
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10**6))
 def test_it_is_undone_and_tells_how_much_it_stretches(seed: int) -> None:
     posterior, generator = linear_actuator(1), np.random.default_rng(seed)

@@ -83,7 +83,7 @@ corners = st.lists(st.integers(-1000, 1000).map(lambda u: u / 10), min_size=2, m
 
 
 @every_operator
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(path=corners, seed=st.integers(0, 9), holds=st.lists(st.integers(1, 3), min_size=6))
 @example(path=[-15.4, 39.9], seed=8, holds=[1] * 6)  # d u and h nearly cancel
 def test_neither_the_pace_nor_the_batch_matters(
@@ -135,7 +135,7 @@ def test_the_initial_curve_rises(name: str) -> None:
 
 
 @every_operator
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 @given(ends=st.tuples(st.integers(-100, 100), st.integers(-100, 100)), seed=st.integers(0, 9))
 def test_a_settled_loop_loses_energy(name: str, ends: tuple[int, int], seed: int) -> None:
     """∮ u dw ≥ 0, by the trapezium rule on a loop that is gone through again and again."""

@@ -161,7 +161,7 @@ def test_densities_are_the_limit_of_many_relays(name: str, width: float) -> None
 
 
 @every_case
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(voltage=paths, inside=paths)
 def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: FloatArray) -> None:
     """A detour that stays between a record's end and its turn before leaves no trace."""
@@ -176,7 +176,7 @@ def test_a_closed_loop_is_wiped_out(case: Case, voltage: FloatArray, inside: Flo
 
 
 @every_case
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(first=paths, second=paths, low=voltages, high=voltages)
 def test_loops_between_the_same_voltages_are_congruent(
     case: Case, first: FloatArray, second: FloatArray, low: float, high: float
@@ -190,7 +190,7 @@ def test_loops_between_the_same_voltages_are_congruent(
 
 
 @pytest.mark.parametrize("name", INVARIANT)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(voltage=paths, travel=st.floats(0.1, 100))
 def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
     """From a turn at the largest voltage so far it is the first curve, twice as large."""
@@ -203,7 +203,7 @@ def test_masing(name: str, voltage: FloatArray, travel: float) -> None:
 
 
 @every_case
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(voltage=voltages, span=spans.filter(bool))
 def test_the_start_goes_from_the_ascending_to_the_descending_branch(
     case: Case, voltage: float, span: Span
