@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 # What a config of a reader may say, so that it takes seconds.
-QUICK = "\n[sampling]\ness = 200\nblock = 25\n"
+QUICK = "\n[sampling]\ness = 200\nblock = 25\nwalkers = 32\n"
 
 # What the small config of a campaign says beside, to be a reader's own.
 RECORD = '[record]\nfile = "my_record.csv"\ntrain = [[0.0, 2.0]]'

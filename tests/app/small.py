@@ -13,11 +13,13 @@ import click
 import numpy as np
 import pytest
 from filelock import FileLock
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from bwbayes.app.config.config import Config, parse
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.study.resolve import resolve_config
+from bwbayes.report.figures import picture_of
 
 TEXT = """\
 seed = 3
@@ -76,8 +78,10 @@ def typed(command: click.Command, *words: object) -> int:
 
 
 def without_pictures(patch: pytest.MonkeyPatch) -> None:
-    """Spare the time that pictures take, where they are not what is tested."""
+    """Spare the time that pictures take, where they are not what is tested: products' are blank."""
     patch.setattr("bwbayes.app.running.figure_worker._works", lambda _: {})
+    for module in ("bwbayes.report.outputs", "bwbayes.app.running.predictions"):
+        patch.setattr(f"{module}.picture_of", lambda *_: picture_of(Figure))
 
 
 def without_explanations(patch: pytest.MonkeyPatch) -> None:

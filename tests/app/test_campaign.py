@@ -194,7 +194,7 @@ def test_a_finished_campaign_fits_nothing_again(
     assert_same_end(whole, folder.path)
 
 
-@pytest.mark.usefixtures("_without_explanations")
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_a_run_whose_noise_was_chosen_goes_on(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(CONFIG.replace('noise = "white"', 'noise = "auto"'))
     specimens(tmp_path / "records", 1)
@@ -208,7 +208,7 @@ def test_a_run_whose_noise_was_chosen_goes_on(tmp_path: Path) -> None:
     assert before == (run / "chain").stat().st_mtime_ns
 
 
-@pytest.mark.usefixtures("_without_explanations")
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_path: Path) -> None:
     shutil.copytree(given, tmp_path / "given", ignore=shutil.ignore_patterns("twice.*"))
     folder = begun(tmp_path / "given", tmp_path / "batch")
@@ -231,7 +231,7 @@ def test_added_changed_and_repaired_records_are_fitted_alone(given: Path, tmp_pa
     assert means[1]["s000"] == means[1]["broken"]
 
 
-@pytest.mark.usefixtures("_without_explanations")
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_a_record_whose_validation_file_was_changed_is_fitted_again(tmp_path: Path) -> None:
     """Its bands are those of the file as it is; a campaign that is finished would not look."""
     (tmp_path / "small.toml").write_text(CONFIG + '[validation.next]\nfile = "next.csv"\n')
@@ -300,7 +300,7 @@ def test_python_has_table_population_and_the_next_specimen(
     assert campaign.plot().axes
 
 
-@pytest.mark.usefixtures("_without_explanations")
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_python_fits_records_by_name(tmp_path: Path) -> None:
     keys = tomllib.loads(CONFIG)
     keys |= keys.pop("model") | keys.pop("sampling")

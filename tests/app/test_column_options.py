@@ -21,6 +21,8 @@ from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, read_record, write_record
 from tests.app.conftest import Type
 
+pytestmark = pytest.mark.usefixtures("_without_pictures")
+
 QUANTITIES = ("time", "voltage", "displacement")
 # What people call columns; none of them can be taken for a displacement.
 NAMES = ["a", "b", "U2", "ch 3", "ch 4", "t", "T1", "time_s", "voltage_mV"]

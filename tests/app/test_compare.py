@@ -24,6 +24,8 @@ from tests.app import small
 from tests.app.conftest import Type
 from tests.app.steps import Steps
 
+pytestmark = pytest.mark.usefixtures("_without_pictures")
+
 CONFIG = """\
 seed = 3
 [record]

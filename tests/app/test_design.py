@@ -10,6 +10,8 @@ import bwbayes as bw
 from bwbayes.record import read_record
 from tests.app.conftest import Type
 
+pytestmark = pytest.mark.usefixtures("_without_pictures")
+
 SIGNAL = "[{}]\namplitude = {}\nfrequency = 1.0\nduration = 3.0\ndecay = {}\n"
 CANDIDATES = "".join(
     SIGNAL.format(*values)

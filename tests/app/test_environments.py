@@ -70,7 +70,7 @@ def test_what_nobody_reads_ends_as_a_broken_pipe_does(copy: RunFolder, command: 
 def test_a_run_behind_head_is_resumed(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(small.TEXT)
     (tmp_path / "unexplained.py").write_text(small.UNEXPLAINED)
-    command = f"{sys.executable} unexplained.py run small.toml --out run | head -n 1"
+    command = f"{sys.executable} unexplained.py run small.toml --out run --workers 1 | head -n 1"
     ended = subprocess.run(
         ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
     )

@@ -158,6 +158,7 @@ def test_saved_it_is_the_command_lines_run_bit_by_bit(
     assert repr(again) == repr(fit)
 
 
+@pytest.mark.usefixtures("_without_pictures")
 @pytest.mark.parametrize(
     ("words", "options"),
     [
@@ -262,6 +263,7 @@ def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     assert {__file__} == {warning.filename for warning in caught}
     assert not made.converged
     again = made.resume(steps=20_000, workers=1, progress=False)
+    assert again.problem.config.sampling.steps == 20_000
     assert again.draws.equals(bw.open_run(folder).draws)
     assert list(tmp_path.iterdir())
     del made, again

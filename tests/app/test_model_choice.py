@@ -333,7 +333,7 @@ def test_the_noise_of_several_records_is_chosen_too(tmp_path: Path) -> None:
     assert "offset[b]" not in chosen.names
 
 
-@pytest.mark.usefixtures("_without_explanations")
+@pytest.mark.usefixtures("_without_explanations", "_without_pictures")
 def test_a_check_takes_the_noise_that_a_run_would(tmp_path: Path) -> None:
     write_record(plays(), tmp_path / "record.h5")
     report = check(parse(NOT_SEARCHED, "config"), tmp_path, tmp_path / "out")

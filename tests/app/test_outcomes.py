@@ -21,7 +21,6 @@ import pytest
 import bwbayes as bw
 from bwbayes.app.commands.cli import cli
 from bwbayes.app.commands.shared import finish
-from bwbayes.app.config.config import load
 from bwbayes.app.running.folder import RunFolder
 from bwbayes.app.running.run import resume
 from bwbayes.arrays import FloatArray
@@ -32,6 +31,8 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.sampling.storage import ChainFile
 from tests.app import small
 from tests.app.conftest import Type
+
+pytestmark = pytest.mark.usefixtures("_without_pictures")
 
 
 @pytest.fixture(scope="module")
@@ -102,18 +103,6 @@ def test_whatever_builds_on_it_is_refused_with_its_status(
     assert (4, "") == (said.status, said.out)
     assert re.fullmatch(r"NOT CONVERGED: [^\n]*`bwbayes resume [^\n]*\n", said.err)
     assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.usefixtures("_without_pictures", "_without_explanations")
-def test_larger_budget_converges_to_what_it_would_have_been(
-    run: Path, cut_short: tuple[RunFolder, int], tmp_path: Path
-) -> None:
-    shutil.copytree(cut_short[0].path, tmp_path / "small")
-    made = RunFolder.open(tmp_path / "small")
-    result = resume(made, small.quiet(), workers=1, steps=20_000)
-    assert result.outcome.converged
-    assert 20_000 == load(made.config).sampling.steps
-    small.assert_same_end(run, made.path)
 
 
 def not_a_number(_: Posterior, theta: FloatArray) -> FloatArray:

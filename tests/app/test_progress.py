@@ -244,7 +244,7 @@ JOBS: dict[str, tuple[str, tuple[object, ...], dict[str, object], tuple[str, ...
     "track": (
         "control:track",
         (),
-        {"frequencies": (2.0, 5.0), "draws": 3, "rate": 100.0},
+        {"frequencies": (5.0, 10.0), "draws": 3, "rate": 100.0},
         ("feed-forward", "closed loops"),
     ),
 }

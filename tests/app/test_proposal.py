@@ -23,6 +23,8 @@ from bwbayes.record.waveforms import Decay, Sine, Waveform
 from tests.app import small
 from tests.app.conftest import Type
 
+pytestmark = pytest.mark.usefixtures("_without_pictures")
+
 OWN = "time_s,voltage_V,displacement_um"
 
 

@@ -21,6 +21,8 @@ from bwbayes.sampling.chain import draws
 from tests.app import small
 from tests.record.drives import drive
 
+pytestmark = pytest.mark.usefixtures("_without_pictures")
+
 TEXT = (
     '[record]\nfile = "noisy.h5"\n[validation.next]\nfile = "next.h5"\n[model]\nnoise = "white"\n'
 )

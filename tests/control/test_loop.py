@@ -221,7 +221,7 @@ def scaled(gains: Gains, factor: float) -> Gains:
     return replace(gains, steps=(first, second, third))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(speed=st.floats(0.01, 0.4), slope=st.floats(0.1, 10.0), delay=st.integers(0, 4))
 def test_margins_of_an_integrator_are_the_closed_form(
     speed: float, slope: float, delay: int
