@@ -263,7 +263,7 @@ def test_a_fit_that_ran_out_of_steps_goes_on_and_leaves_nothing(
     assert {__file__} == {warning.filename for warning in caught}
     assert not made.converged
     again = made.resume(steps=20_000, workers=1, progress=False)
-    assert again.problem.config.sampling.steps == 20_000
+    assert again.config.sampling.steps == 20_000
     assert again.draws.equals(bw.open_run(folder).draws)
     assert list(tmp_path.iterdir())
     del made, again

@@ -125,7 +125,9 @@ def judge(study: Study, source: np.random.Generator, *, again: bool = True) -> J
                 )
             )
     best = draws[int(np.argmax(posterior.log_density(posterior.prior.unconstrain(draws))))]
-    run = Run().with_cache(study=study, flat_draws=draws)
+    # Of its config, validation asks what a search for stages left; here is none.
+    config = parse('[record]\nfile = "record.h5"', "config")
+    run = Run().with_cache(study=study, config=config, flat_draws=draws)
     validation = validate_predictions(run, bands, {})
     if again:
         places = posterior.prior.unconstrain(best[np.newaxis])
