@@ -19,7 +19,6 @@ from bwbayes.diagnosis.innovations import innovations
 from bwbayes.diagnosis.loopfit import find_delay
 from bwbayes.diagnosis.residual_analysis import Explanation, ResidualAnalysis, Sighting
 from bwbayes.diagnosis.series_patterns import strongest_line
-from bwbayes.inference import map_estimate
 from bwbayes.inference.study import Stated
 from bwbayes.model.declaration import normal
 from bwbayes.model.registry import STAGES
@@ -140,7 +139,7 @@ class _Sign(Defect):
         readings, drive = record.readings, record.voltage[record.readings.rows]
         if float((drive - drive.mean()) @ (readings.values - readings.values.mean())) < 0:
             turned = scene.posterior.altered(displacement=-record.displacement)
-            yield Sighting(places=map_estimate.local_minima(turned, scene.generator))
+            yield Sighting(places=scene.local_minima(turned))
 
 
 class _Delay(Defect):
@@ -168,7 +167,7 @@ class _LongDelay(_Delay):
         kept[: max(rows, 0)] = kept[kept.size + min(rows, 0) :] = np.nan
         windows = (slice(0, kept.size),)
         moved = scene.posterior.altered(displacement=np.roll(kept, -rows), training=windows)
-        places = map_estimate.local_minima(moved, scene.generator)
+        places = scene.local_minima(moved)
         # The score of the delay, as its prior's sd is a quarter of the time between two reversals.
         yield Sighting(starts=[{"delay": 4 * late / scene.turn_time}], places=places)
 

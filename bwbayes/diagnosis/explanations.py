@@ -9,6 +9,7 @@ none ties with it whose fix keeps them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -61,9 +62,15 @@ def explain(
     discrepancy is smooth, all are first fitted with a rough one; those worth more than the limit
     are fitted with the smooth one as well, and each has the worth of its better fit. Other models
     are fitted to the beginning of a record that is too long. ``watch`` is called with the share
-    that is done. No fit begins when the time ``is_over``.
+    that is done. Fits end when the time ``is_over``, and what is there then is ranked.
     """
+
+    def hurry(_: float) -> None:
+        if is_over():
+            raise _OutOfTimeError
+
     best: dict[str, Explanation] = {}
+    scene = replace(scene, watch=hurry)
     if scene.posterior.single_record.is_followed(scene.fit.displacement):
         return ()
     looked_at, rough = scene, scene.with_rough_noise()
@@ -79,13 +86,13 @@ def explain(
                 break
             looked_at = scene.of_beginning()
             rough = rough if looked_at is scene else looked_at.with_rough_noise()
-        explanations = [] if rough is None else [*_in_time(kind(rough), is_over)]
+        explanations = [] if rough is None else [*_in_time(kind(rough))]
         lead = 0.0 if rough is None else rough.lead
         worth = frozenset(cause.kind for cause in explanations if cause.nats + lead > LIMIT)
         if rough is None:
-            explanations = [*_in_time(kind(looked_at), is_over)]
+            explanations = [*_in_time(kind(looked_at))]
         elif worth:
-            explanations += _in_time(kind(replace(looked_at, kinds=worth)), is_over)
+            explanations += _in_time(kind(replace(looked_at, kinds=worth)))
         for explanation in explanations:
             previous = best.get(explanation.kind, explanation)
             best[explanation.kind] = max(previous, explanation, key=lambda either: either.nats)
@@ -94,20 +101,20 @@ def explain(
     # Only parts of a long record were fitted: confirm the leading explanations on all of it.
     noises = [explanation for explanation in ranked if explanation.noise]
     for explanation in (*better_models(ranked), *likely_causes(noises)):
-        best[explanation.kind] = scene.confirmed(explanation)
+        with suppress(_OutOfTimeError):
+            best[explanation.kind] = scene.confirmed(explanation)
     watch(1.0)
     return _ranked(best.values())
 
 
-def _in_time(
-    explanations: Iterator[Explanation], is_over: Callable[[], bool]
-) -> Iterator[Explanation]:
+class _OutOfTimeError(Exception):
+    """The time for a fit is over."""
+
+
+def _in_time(explanations: Iterator[Explanation]) -> Iterator[Explanation]:
     """Yield explanations until the time is over."""
-    while not is_over():
-        explanation = next(explanations, None)
-        if explanation is None:
-            return
-        yield explanation
+    with suppress(_OutOfTimeError):
+        yield from explanations
 
 
 def _ranked(explanations: Iterable[Explanation]) -> tuple[Explanation, ...]:

@@ -19,7 +19,6 @@ from bwbayes.diagnosis.residual_analysis import (
     Sighting,
     lines,
 )
-from bwbayes.inference import map_estimate
 from bwbayes.inference.noise import DiscrepancyNoise
 from bwbayes.inference.outliers import LIMIT, MOST
 from bwbayes.inference.parameters import JointPrior
@@ -119,7 +118,7 @@ def operator(scene: ResidualAnalysis) -> Iterator[Explanation]:
                 continue
             posterior = scene.rebuilt(scene.study.with_model(spec))
             # One start finds the best mode of nearly all records, in half of the time of five.
-            places = map_estimate.local_minima(posterior, scene.generator, 1)
+            places = scene.local_minima(posterior, 1)
             fit = scene.extended(posterior, places)
             # Another history is only named: a next record's own is told by its lead-in alone, which
             # a spectrum of plays that is nearly right is too sure of.
@@ -173,7 +172,7 @@ def prior(scene: ResidualAnalysis) -> Iterator[Explanation]:
         posterior = replace(scene.posterior, prior=JointPrior(parameters, before.constraint))
         places = [
             posterior.prior.unconstrain(before.constrain(scene.places)[0]),
-            map_estimate.local_minima(posterior, scene.generator, 1),
+            scene.local_minima(posterior, 1),
         ]
         fit = scene.extended(posterior, np.concatenate(places))
         text = f"prior of {parameter.name}, {parameter.prior}, that excludes the record's value"

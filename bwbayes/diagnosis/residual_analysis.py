@@ -34,6 +34,7 @@ from bwbayes.model.inputs import rate, time_between_turns
 from bwbayes.model.spec import ModelSpec
 from bwbayes.record.io.grid import clock
 from bwbayes.shown import rounded
+from bwbayes.watching import Watch, unwatched
 
 # Number of readings used: an explanation takes some hundred passes over them, and the residual of a
 # model shows in fewer.
@@ -149,6 +150,8 @@ class ResidualAnalysis:
         Fit that explanations are compared with, if it is another one.
     kinds
         Kinds of other models that are fitted; all of them if None.
+    watch
+        Called again and again by fits of other models, which end where it raises an error.
     """
 
     fit: LocalFit
@@ -161,6 +164,7 @@ class ResidualAnalysis:
     alone: bool = True
     before: LocalFit | None = None
     kinds: frozenset[str] | None = None
+    watch: Watch = unwatched
 
     @classmethod
     def of(
@@ -219,9 +223,10 @@ class ResidualAnalysis:
         if beginning(self.posterior, SAMPLES) is self.posterior:
             return self
         short = beginning(self.whole, SAMPLES)
-        return ResidualAnalysis.of(
+        analysis = ResidualAnalysis.of(
             short, self.places, self.generator, self.study, begin=self.begin, alone=self.alone
         )
+        return replace(analysis, watch=self.watch)
 
     def with_rough_noise(self) -> ResidualAnalysis | None:
         """Return the analysis with a rough discrepancy instead of a smooth one; else None.
@@ -363,7 +368,11 @@ class ResidualAnalysis:
         The climb goes on while the model may become more probable than the fit by a nat: a smaller
         gain does not pay for any parameter.
         """
-        return climb(posterior, places, self.fit.log_density + 1.0)
+        return climb(posterior, places, self.fit.log_density + 1.0, self.watch)
+
+    def local_minima(self, posterior: Posterior, starts: int = map_estimate.STARTS) -> FloatArray:
+        """Find coordinates (places, free) near the modes of another model, as of that name."""
+        return map_estimate.local_minima(posterior, self.generator, starts, self.watch)
 
     def changed(
         self,
@@ -425,7 +434,7 @@ class ResidualAnalysis:
         if not is_short or spec is None or coordinates is None:
             return explanation
         other = self._of_whole(self.study.with_model(spec, explanation.stated))
-        fit, before = climb(other, coordinates), self._on_all
+        fit, before = climb(other, coordinates, watch=self.watch), self._on_all
         nats = fit.log_evidence - before.log_evidence - explanation.cost
         return replace(explanation, nats=nats, rmse=(before.rmse, fit.rmse))
 
@@ -433,7 +442,7 @@ class ResidualAnalysis:
     def _on_all(self) -> LocalFit:
         """The fit of all readings."""
         before = self.before or self.fit
-        return climb(self.whole, before.coordinates)
+        return climb(self.whole, before.coordinates, watch=self.watch)
 
     def explained(
         self, kind: str, text: str, fix: str, fit: LocalFit, cost: float = 0.0, **facts: Any

@@ -114,12 +114,15 @@ def _estimate(modes: list[Mode], spread: FloatArray) -> MAPEstimate:
 
 
 def local_minima(
-    posterior: Posterior, generator: np.random.Generator, starts: int = STARTS
+    posterior: Posterior,
+    generator: np.random.Generator,
+    starts: int = STARTS,
+    watch: Watch = unwatched,
 ) -> FloatArray:
     """Find coordinates (places, free) near every mode of a posterior: those of least squares.
 
     From so many starts: a few find the best of them, if not all. A long record is represented by
-    its beginning.
+    its beginning. ``watch`` is called with the share that is done.
 
     Raises
     ------
@@ -127,7 +130,7 @@ def local_minima(
         As :func:`fit`.
     """
     posterior = beginning(posterior, SAMPLES)
-    return np.stack(_places(posterior, generator, starts, tolerance=NEARBY)[0])
+    return np.stack(_places(posterior, generator, starts, watch, tolerance=NEARBY)[0])
 
 
 def mode_weights(posterior: Posterior, point: MAPEstimate) -> tuple[FloatArray, FloatArray]:

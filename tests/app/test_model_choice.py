@@ -29,7 +29,7 @@ from bwbayes.diagnosis.explanations import explain, likely_causes
 from bwbayes.diagnosis.laplace import climb
 from bwbayes.diagnosis.residual_analysis import Explanation
 from bwbayes.errors import InputWarning
-from bwbayes.inference import map_estimate as pointfit
+from bwbayes.inference import map_estimate as pointfit, mode_finding
 from bwbayes.inference.study import InitialConditions
 from bwbayes.prediction.prediction import predict_record
 from bwbayes.record import Record, write_record
@@ -191,7 +191,31 @@ def test_a_search_ends_when_its_time_is_over(tmp_path: Path) -> None:
     model = config.model.model_copy(update={"search": "0.001s"})
     chosen = search_stages(resolve_config(config.model_copy(update={"model": model}), tmp_path))
     assert chosen.explanations is None
-    assert chosen.steps[-1].startswith("the search for stages ended after 0.001 s")
+    ended = "the search for stages ended after 0.001 s, before it was complete"
+    assert chosen.steps[-1] == ended
+    assert chosen.run.config.records["record"].remarks == [ended]
+
+
+def test_fits_of_a_search_end_when_its_time_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within a fit, after one round more: with what explains the readings by then."""
+    study = resolve_config(config_of("quadratic", tmp_path), tmp_path).study
+    point = pointfit.fit(study.posterior, np.random.default_rng(1))
+    scene = explaining._scene(study, "record", point.optima)
+    rounds, climbed = list[int](), mode_finding.Target.round
+
+    def counted(*arguments: Any) -> Any:
+        rounds.append(len(rounds))
+        return climbed(*arguments)
+
+    monkeypatch.setattr(mode_finding.Target, "round", counted)
+    complete = {found.kind for found in explain(scene)}
+    for limit in (1, 6, 21):
+        rounds.clear()
+        ended = explain(scene, is_over=partial(rounds.__contains__, limit - 1))
+        assert {found.kind for found in ended} < complete
+        assert len(rounds) == limit
 
 
 def test_a_stage_that_errs_more_on_held_out_readings_is_not_added(

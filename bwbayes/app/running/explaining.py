@@ -198,7 +198,8 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
         explanations = explain(scene, step, lambda: clock() > seconds)
         is_over = clock() > seconds
         # The last one has just been weighed.
-        needless = [removal for removal in without(scene, [*notes][:-1]) if removal.nats >= 0]
+        before = [] if is_over else [*notes][:-1]
+        needless = [removal for removal in without(scene, before) if removal.nats >= 0]
         models = [cause for cause in explanations if cause.spec is not None]
         parts = likely_causes([cause for cause in models if not cause.misleads])
         if needless:
@@ -223,9 +224,11 @@ def _search(run: Run, clock: Callable[[], float], watch: WatchSteps) -> ChosenMo
     for refused in likely_causes(models):
         if refused.misleads:
             steps.append(f"not added: {refused.text} ({refused.worth})")
-    if is_over:
-        steps.append(f"the search for stages ended after {seconds:g} s, before it was complete")
     remarks, unexplained = [*notes.values()], None
+    if is_over:
+        ended = f"the search for stages ended after {seconds:g} s, before it was complete"
+        steps.append(ended)
+        remarks.append(ended)
     discrepancy = _relative_discrepancy(run.study.posterior, point)
     if len(notes) >= MAX_STAGES and discrepancy > MAX_DISCREPANCY:
         unexplained = float(f"{discrepancy:.2g}")
