@@ -69,6 +69,7 @@ def add_prior_creep(
     prior[np.ix_(added, added)] = np.linalg.inv(0.9**decades)
 
     begin = places.mean(axis=0)
+    begin[strengths] = 0.0  # the mean of the prior: without any creep its start is another one
     mode, hessian = begin.copy(), prior
     for _ in range(ROUNDS):
         linear = target.linearize(mode[np.newaxis])
@@ -84,7 +85,10 @@ def add_prior_creep(
     shift = (mode - begin)[others] - (drawn - mode[strengths]) @ follow.T
     places[np.ix_(crept, others)] += shift
     places[np.ix_(crept, strengths)] = drawn
-    return extended, extended.prior.constrain(places)[0]
+    longer = extended.prior.constrain(places)[0]
+    # Exactly none, so that nothing is unknown of its start either.
+    longer[np.ix_(~crept, [extended.names.index(name) for name in creep.names])] = 0.0
+    return extended, longer
 
 
 def _extended(posterior: Posterior, duration: float) -> tuple[Posterior, Creep]:

@@ -473,10 +473,11 @@ class Creep:
 
         √(cᵢ² + c²) with a published strength c. Were it cᵢ alone, a strength next to zero would
         stand for a known start: the posterior would have a narrow ridge there, and the start be
-        taken for a measurement of the strengths.
+        taken for a measurement of the strengths. A model without any creep has kept nothing.
         """
         strengths = np.stack([column[name] for name in self.names], axis=1)
-        return np.hypot(strengths, self.strength.arguments["mean"])
+        creeps = np.any(strengths != 0.0, axis=1, keepdims=True)
+        return creeps * np.hypot(strengths, self.strength.arguments["mean"])
 
     def drive(self, column: Values, drive: FloatArray, voltage: FloatArray) -> FloatArray:
         """Return what creeps, w (1 + κ |u| / U) (models, samples), um, as a new array."""
