@@ -121,7 +121,7 @@ def unevenness(likelihood: Likelihood, theta: FloatArray) -> float:
     By how much its second difference varies, of the mean: 1, and it is twice as curved somewhere
     as elsewhere, in the range of published strengths.
     """
-    strengths = np.linspace(-0.004, 0.004, 9)
+    strengths = np.linspace(-0.004, 0.004, 10)  # none is zero, which stands for no creep
     along = np.repeat(theta, strengths.size, axis=0)
     for name in CREEP.names:
         along = likelihood.table.replaced(along, name, strengths)
