@@ -16,9 +16,12 @@ from bwbayes.app.config.config import dump, load, parse
 from bwbayes.app.config.settings import RecordConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.folder import RunFolder
-from bwbayes.app.study.column_options import column_options_from, record_naming
+from bwbayes.app.study.column_options import open_like, record_naming
 from bwbayes.app.study.resolve import resolve_config
 from bwbayes.record import Record, read_record, write_record
+from bwbayes.record.io.columns import Naming
+from bwbayes.record.io.formats import read_named, read_source
+from bwbayes.record.io.series import Source
 from tests.app.conftest import Type
 
 pytestmark = pytest.mark.usefixtures("_without_pictures")
@@ -66,6 +69,12 @@ def readable(path: Path, **options: Any) -> Record:
         return read_record(path, need_displacement=False, **options)
 
 
+def read_like(path: Path, noted: dict[str, Any] | None, **reading: Any) -> Record:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", bw.InputWarning)
+        return read_named(*open_like(path, noted, reading), need_displacement=False)
+
+
 def read_as(source: RecordConfig, folder: Path) -> Record:
     """Read a config's record."""
     assert source.file is not None
@@ -86,7 +95,7 @@ def test_a_second_file_of_the_same_columns_is_read_as_the_first(
         kept = [i for i, q in enumerate(quantities) if q in ("time", "voltage") or not planned]
         second = folder / "second.csv"
         written(second, [names[i] for i in kept], [quantities[i] for i in kept], 3.0)
-        record = readable(second, **column_options_from(second, noted))
+        record = read_like(second, noted)
         whole = folder / "whole.csv"
         written(whole, names, quantities, 3.0)
         expected = readable(
@@ -116,8 +125,8 @@ def test_a_file_of_other_columns_is_read_by_itself(
         second = folder / "second.csv"
         written(second, ["time_s", "voltage_V", "displacement_um"], [*QUANTITIES], 3.0)
         record = read_as(source, folder)
-        assert {} == column_options_from(second, record_naming(source, record))
-        assert {} == column_options_from(second, None)
+        for noted in (record_naming(source, record), None):
+            assert open_like(second, noted)[1:] == (Naming(), None)
         assert record_naming(RecordConfig(file="first.csv"), record) is None
 
 
@@ -159,9 +168,9 @@ def test_voltage_and_displacement_in_files_of_their_own_become_a_run(
         (tmp_path / f"{name}.txt").rename(tmp_path / f"{name}2.txt")
     problem = Run(folder)
     np.testing.assert_allclose(problem.study.records["record"].voltage, voltage)
-    alike = column_options_from(tmp_path / "u2.txt", problem.config.records["record"].read_as)
-    plan = readable(tmp_path / "u2.txt", **alike)
-    measured = readable(tmp_path / "u2.txt", displacement_file=tmp_path / "x2.txt", **alike)
+    noted = problem.config.records["record"].read_as
+    plan = read_like(tmp_path / "u2.txt", noted)
+    measured = read_like(tmp_path / "u2.txt", noted, displacement_file=tmp_path / "x2.txt")
     assert (plan.readings, measured.readings) == (0, 300)
     assert (plan.interval, measured.interval) == (0.01, 0.01)
 
@@ -185,6 +194,24 @@ def renamed(copy: RunFolder, tmp_path: Path) -> Path:
     )
     write_record(other, tmp_path / "same.csv")
     return tmp_path / "next.csv"
+
+
+def test_predict_reads_a_second_file_once(
+    copy: RunFolder, renamed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = list[Path]()
+
+    def read(path: Path, table: int | str | None = None) -> Source:
+        opened.append(path)
+        return read_source(path, table)
+
+    for module in ("bwbayes.record.io.formats", "bwbayes.app.study.column_options"):
+        monkeypatch.setattr(f"{module}.read_source", read)
+    fit = bw.open_run(copy.path)
+    _ = fit.study  # reads the files of the run itself
+    opened.clear()
+    fit.predict(renamed)
+    assert [renamed] == opened
 
 
 def test_predict_validates_on_a_second_file_of_the_same_kind(

@@ -33,7 +33,7 @@ from bwbayes.app.running.predictions import Prediction, predict_another
 from bwbayes.app.running.progress import LastLine, StepProgress, batch
 from bwbayes.app.running.run import resume as resume_run
 from bwbayes.app.running.workers import one_thread
-from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.column_options import open_like
 from bwbayes.app.study.resolve import resolve_config, with_noise
 from bwbayes.arrays import FloatArray
 from bwbayes.diagnosis.validation import ValidationSummary
@@ -48,9 +48,9 @@ from bwbayes.population.population import (
     population,
     specimen_of,
 )
-from bwbayes.record import Record, read_record
+from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
-from bwbayes.record.io.formats import SUFFIXES
+from bwbayes.record.io.formats import SUFFIXES, read_named
 from bwbayes.report.figures import draw_styled
 from bwbayes.report.outputs import save, write_summary
 from bwbayes.report.report import (
@@ -268,8 +268,9 @@ class Campaign(Product):
         first = self.fit(self.population.names[0])
         study = first.study
         if not isinstance(record, Record):
-            options = column_options_from(record, next(iter(first.config.records.values())).read_as)
-            record = read_record(record, need_displacement=False, **options)
+            read_as = next(iter(first.config.records.values())).read_as
+            with first.quantities.spoken():
+                record = read_named(*open_like(record, read_as), need_displacement=False)
         source = study.generator("next specimen")
         draws = next_specimen(self.population, study.posterior, first.flat_draws, source)
         start, like = InitialConditions(from_rest, True, lead_in), next(iter(study.records))

@@ -21,7 +21,7 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import amplifier_limits
-from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.column_options import open_like
 from bwbayes.control.compensation import Compensation, compensate as compensated
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.loop import LoopNoise, Robustness, Stand
@@ -32,7 +32,6 @@ from bwbayes.errors import InputError, suggestion
 from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Hold, parse_hold
 from bwbayes.prediction.prediction import thin_draws
-from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_reference
 from bwbayes.watching import WatchSteps, unwatched
 
@@ -229,9 +228,8 @@ def _reference(
         if isinstance(requested, str) and not path.suffix and not path.exists():
             hint = suggestion(requested, SHAPES)
             raise InputError(f"reference: {requested!r} is neither a shape nor a file; {hint}")
-        options_of_record = column_options_from(path, read_as, reading)
-        options_of_record.pop("voltage_is", None)
-        values, interval = read_reference(path, Naming.stated(**options_of_record))
+        source, naming, _ = open_like(path, read_as, reading)
+        values, interval = read_reference(source, naming)
         return Reference(values, interval, path.stem, smoothed)
     try:
         values = np.asarray(requested, dtype=np.float64)

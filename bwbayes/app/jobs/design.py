@@ -21,14 +21,15 @@ from bwbayes.app.config.keys import one_line
 from bwbayes.app.config.settings import SignalConfig
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import fitted_voltages
-from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.column_options import open_like
 from bwbayes.app.study.records import sampled_waveform
 from bwbayes.arrays import ArrayLike, FloatArray
 from bwbayes.comparison.design import Design, DesignScore, RivalDesign, rank_by_rivals, rank_designs
 from bwbayes.diagnosis.extrapolation import PART
 from bwbayes.errors import InputError
 from bwbayes.model.inputs import Limits, fastest, time_between_turns, turning_points
-from bwbayes.record import Record, read_record
+from bwbayes.record import Record
+from bwbayes.record.io.formats import read_named
 from bwbayes.record.waveforms import (
     Carrier,
     Decay,
@@ -230,9 +231,7 @@ def _drive(
     """Return the voltage of a signal's name or of a record's file, at an interval."""
     if str(path) in signal_names():
         return signal(str(path)).sample(1 / interval)[1]
-    record = read_record(
-        path, need_displacement=False, **column_options_from(path, read_as, reading)
-    )
+    record = read_named(*open_like(path, read_as, reading), need_displacement=False)
     if np.isclose(record.interval, interval, rtol=1e-6):
         return record.voltage
     samples = np.arange(0.0, record.duration, interval) / record.interval

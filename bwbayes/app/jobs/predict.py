@@ -13,11 +13,10 @@ import numpy as np
 
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.running.predictions import Prediction, predict_after, predict_another
-from bwbayes.app.study.column_options import column_options_from
+from bwbayes.app.study.column_options import open_like
 from bwbayes.errors import InputError, path_text, suggestion
 from bwbayes.inference.study import InitialConditions, Validation
 from bwbayes.record import Record
-from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_named
 from bwbayes.record.waveforms import signal as named_signal
 from bwbayes.watching import WatchSteps, unwatched
@@ -133,12 +132,9 @@ def predict(
         )
     elif not isinstance(record, Record):
         name = name or path_text(Path(record).stem)
-        file = Path(record)
+        file, read_as = Path(record), fit.config.records[of].read_as
         reading = {"table": table, "displacement_file": displacement_file, **(reading or {})}
-        reading_options = column_options_from(file, fit.config.records[of].read_as, reading)
-        voltage_is = reading_options.pop("voltage_is", None)
-        naming = Naming.stated(**reading_options)
-        record = read_named(file, naming, voltage_is, need_displacement=False)
+        record = read_named(*open_like(file, read_as, reading), need_displacement=False)
         if record.displacement is None:
             hints.append(
                 f"{file}: has no displacement that is recognized, so the bands are not validated; "

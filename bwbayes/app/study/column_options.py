@@ -6,17 +6,17 @@ were read, and the names of all of them: a file that has no others is of the sam
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from bwbayes.app.config.settings import RecordConfig
-from bwbayes.errors import InputWarning
+from bwbayes.model.inputs import VoltageIs
 from bwbayes.quantities import Quantities
 from bwbayes.record import Record
 from bwbayes.record.io.columns import Naming
 from bwbayes.record.io.formats import read_source
+from bwbayes.record.io.series import Source
 
 # Options by which another file of the same columns is read, too.
 KEPT = ("units", "fs", "voltage_is", "input", "output", "linearity")
@@ -41,32 +41,28 @@ def record_naming(source: RecordConfig, record: Record) -> dict[str, Any] | None
     return {**stated, "columns": columns, "all_columns": record.read_as["all_columns"]}
 
 
-def column_options_from(
-    path: str | Path, noted: dict[str, Any] | None, reading: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return how a file is read, as keyword arguments of ``read_record``, by what was noted.
+def open_like(
+    path: str | Path, noted: Mapping[str, Any] | None, reading: Mapping[str, Any] | None = None
+) -> tuple[Source, Naming, VoltageIs | None]:
+    """Return a file's content, its naming and the kind of its voltage, by what was noted.
 
-    None of one that has other columns than the record had. It may lack some, as a planned voltage
-    lacks the displacement. The user's own ``reading``, of such arguments too, comes first: with
-    columns, units or a rate no note counts.
+    A file that has other columns than the record had is named by itself. It may lack some, as a
+    planned voltage lacks the displacement. The user's own ``reading``, keyword arguments of
+    ``read_record``, comes first: with columns, units or a rate no note counts.
 
-    Raises InputError: the file cannot be read.
+    Raises InputError: the file cannot be read, or the user's reading is wrong.
     """
-    as_stated = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
-    if noted is None:
-        return as_stated
+    options = {key: value for key, value in (reading or {}).items() if value not in (None, {})}
+    source, noted = read_source(Path(path), options.get("table")), noted or {}
     # The same quantities in whatever columns.
-    as_stated = {key: noted[key] for key in ("input", "output") if key in noted} | as_stated
-    if as_stated.keys() & {"columns", "units", "fs"}:
-        return as_stated
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # said where the record is read
-        content = read_source(Path(path), as_stated.get("table"))
-    names = {series.name for series in content.series}
-    if not names <= {*noted.get("all_columns", ())}:
-        return as_stated
-    columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
-    options = {key: noted[key] for key in noted if key in KEPT}
-    further = Naming(covariates=noted.get("covariates", ())).covariate_columns
-    options["covariates"] = {name: column for name, column in further.items() if column in names}
-    return options | as_stated | {"columns": columns}
+    options = {key: noted[key] for key in ("input", "output") if key in noted} | options
+    names = {series.name for series in source.series}
+    is_like = bool(noted) and names <= {*noted.get("all_columns", ())}
+    if is_like and not options.keys() & {"columns", "units", "fs"}:
+        columns = {q: name for q, name in noted.get("columns", {}).items() if name in names}
+        further = Naming(covariates=noted.get("covariates", ())).covariate_columns
+        covariates = {name: column for name, column in further.items() if column in names}
+        kept = {key: noted[key] for key in noted if key in KEPT}
+        options = {"covariates": covariates} | kept | options | {"columns": columns}
+    voltage_is = options.pop("voltage_is", None)
+    return source, Naming.stated(**options), voltage_is

@@ -146,20 +146,23 @@ def read_record(
 
 
 def read_named(
-    path: Path,
+    file: Path | Source,
     naming: Naming,
     voltage_is: VoltageIs | None = None,
     need_displacement: bool = True,
 ) -> Record:
     """Read and check a record by a naming, as :func:`read_record`, with errors of any quantities.
 
+    The ``file`` is a path, or the content of one.
+
     Raises InputError: for every problem, in one line.
     """
     if voltage_is is not None:
         require_voltage_is(voltage_is)
     needed = QUANTITIES if need_displacement else ("time", "voltage")
-    content = read_table(path, naming, needed)
-    record = Record(**record_fields(content, voltage_is, need_displacement))
+    table = read_table(file, naming, needed)
+    record = Record(**record_fields(table, voltage_is, need_displacement))
+    path = file.path if isinstance(file, Source) else file
     truth_path = _truth_path(path)
     if path.suffix.lower() not in _TEXT or not truth_path.exists():
         return record
@@ -174,7 +177,7 @@ def read_named(
     return replace(record, truth=truth.displacement)
 
 
-def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[FloatArray, float]:
+def read_reference(file: Path | Source, naming: Naming) -> tuple[FloatArray, float]:
     """Read a reference displacement: its samples, um, and their interval, s.
 
     The file has the columns of a record, `time_s` and `displacement_um` or with other SI prefixes,
@@ -182,18 +185,21 @@ def read_reference(path: str | Path, naming: Naming | None = None) -> tuple[Floa
 
     Raises InputError: for every problem, in one line, as of :func:`read_record`.
     """
-    return reference_fields(read_table(Path(path), naming or Naming(), ("time", "displacement")))
+    return reference_fields(read_table(file, naming, ("time", "displacement")))
 
 
-def read_table(path: Path, naming: Naming, needed: Collection[str] = QUANTITIES) -> ColumnTable:
+def read_table(
+    file: Path | Source, naming: Naming, needed: Collection[str] = QUANTITIES
+) -> ColumnTable:
     """Read the columns of a file that a record needs, with the naming that recognized them.
 
     Raises InputError: the file cannot be read, or a column that is needed is not known.
     """
+    source = file if isinstance(file, Source) else read_source(file, naming.table)
     if naming.displacement_file is None:
-        return select(read_source(path, naming.table), naming, needed)
-    files = {"voltage": path, "displacement": naming.displacement_file}
-    return select_pair({q: read_source(f, naming.table) for q, f in files.items()}, naming)
+        return select(source, naming, needed)
+    displacement = read_source(naming.displacement_file, naming.table)
+    return select_pair({"voltage": source, "displacement": displacement}, naming)
 
 
 def read_source(path: Path, table: int | str | None = None) -> Source:
