@@ -6,7 +6,7 @@ slope is zero, with β far below it is α: so the posterior has legs along d, α
 thousand times as long as wide and around a corner from the next. With slope and level in place of d
 and the offset, all other parameters are as free as the prior leaves them, and no leg has a corner.
 A :class:`SecantMap` takes slope and level from a model's displacement, which costs a simulation for
-each place.
+each place. Any levels do that follow the record's: those of a long record are a thinned one's.
 """
 
 from __future__ import annotations
@@ -19,12 +19,16 @@ import numpy as np
 
 from bwbayes.arrays import FloatArray
 from bwbayes.inference.parameters import JointPrior
+from bwbayes.inference.thinning import thin_posterior
 
 if TYPE_CHECKING:
     from bwbayes.inference.posterior import Posterior
 
 # Parameters that the displacement of every operator with a gain is linear in.
 LINEAR = "d", "offset"
+
+# To so many samples a long record is thinned.
+SAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -157,8 +161,14 @@ class SecantMap:
         ]
         return np.concatenate(parts)
 
+    @cached_property
+    def _thinned(self) -> Posterior:
+        """The posterior whose displacement tells slope and level."""
+        at_reference = self._prior.theta(self._center[np.newaxis])
+        return thin_posterior(self._known, at_reference, SAMPLES)
+
     def _displacement(self, free: FloatArray) -> FloatArray:
-        return self._known.displacement(self._prior.theta(free), np.zeros(len(free)))
+        return self._thinned.displacement(self._prior.theta(free), np.zeros(len(free)))
 
 
 def linear(posterior: Posterior) -> list[int]:

@@ -27,12 +27,12 @@ PLAN = SamplingPlan(
 
 
 @cache
-def linear_actuator(seed: int, alpha: float = 0.005) -> Posterior:
-    """Return the posterior of forty readings of an actuator with hardly any hysteresis."""
-    actuator = Actuator("none", "first", 0.05)
-    voltage, generator = decaying_sine(40, periods=2), np.random.default_rng(seed)
+def linear_actuator(seed: int, alpha: float = 0.005, readings: int = 40) -> Posterior:
+    """Return the posterior of few readings of an actuator with hardly any hysteresis."""
+    actuator = Actuator("none", "first", 2 / readings)
+    voltage, generator = decaying_sine(readings, periods=2), np.random.default_rng(seed)
     theta = np.array([[0.7, alpha, 0.027, 0.017, 1.0, 0.0, 0.0]])
-    displacement = actuator.displacement(theta, voltage)[0] + generator.normal(0, 0.2, 40)
+    displacement = actuator.displacement(theta, voltage)[0] + generator.normal(0, 0.2, readings)
     return replace(
         posterior_of(voltage, displacement, actuator, "white", {"exponent": 1.0}),
         engine=resolve_engine(),
@@ -44,9 +44,11 @@ def places(posterior: Posterior, generator: np.random.Generator, count: int) -> 
     return posterior.prior.unconstrain(posterior.prior.draw(generator, count))
 
 
-@given(st.integers(0, 10**6))
-def test_it_is_undone_and_tells_how_much_it_stretches(seed: int) -> None:
-    posterior, generator = linear_actuator(1), np.random.default_rng(seed)
+@given(st.integers(0, 10**6), st.sampled_from([40, 30_000]))
+def test_it_is_undone_and_tells_how_much_it_stretches(seed: int, readings: int) -> None:
+    """Of a long record, too, whose levels are those of a thinned one."""
+    posterior = linear_actuator(1, readings=readings)
+    generator = np.random.default_rng(seed)
     reference, *bent = places(posterior, generator, 4)
     mapped = SecantMap(reference, posterior)
     whitened, log_slope = mapped.forward(np.array(bent))
