@@ -37,6 +37,7 @@ from bwbayes.inference.posterior import Posterior
 from bwbayes.inference.study import InitialConditions, Study
 from bwbayes.model.inputs import Limits
 from bwbayes.prediction.initial_state import estimate_initial_states
+from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.record.record import Record
 from bwbayes.report.report import (
     Banner,
@@ -399,6 +400,8 @@ def rank_designs(
     amplifier: Limits,
     generator: np.random.Generator,
     watch: Watch = unwatched,
+    *,
+    instruments: Instruments = EXACT,
 ) -> list[DesignScore]:
     """Rank candidates by what they would teach, the best first.
 
@@ -409,8 +412,9 @@ def rank_designs(
 
         Σ' = (Σ⁻¹ + Iₐₐ − Iₐᵣ (1 + Iᵣᵣ)⁻¹ Iᵣₐ)⁻¹.
 
-    A target's sd goes from √(gᵀ Σ g) to √(gᵀ Σ' g), g its gradient; along a drive the mean over its
-    samples counts.
+    A target's sd goes from √(gᵀ Σ g + s²) to √(gᵀ Σ' g + s²), g its gradient; along a drive the
+    mean over its samples counts. s is what the scales of the instruments leave unsure of it: they
+    read the next record, too, so that no record tells of them.
 
     Parameters
     ----------
@@ -430,6 +434,8 @@ def rank_designs(
         Chooses draws, and draws the starts of the candidates' records.
     watch
         Called with the share that is done.
+    instruments
+        Those that read the fitted record, and will read the next one.
 
     Raises
     ------
@@ -471,7 +477,16 @@ def rank_designs(
     )
     factor = np.linalg.cholesky(covariance)
     gradients = [value_and_jacobian(targeted, point[np.newaxis], columns)[1][0] for point in chosen]
-    before = [_mean_sd(gradient, covariance) for gradient in gradients]
+    values = targeted(chosen)
+    if isinstance(target, str):
+        unit = prior.free[prior.free_names.index(target)].unit
+        relative = float(np.hypot(*instruments.relative_sds(unit)))
+    else:
+        # Where the sensor's zero is says nothing of the displacement.
+        relative = instruments.sensor_scale
+        values -= dataset.table.columns(prior.theta_at(chosen)[0])["offset"][:, np.newaxis]
+    unread = (relative * values) ** 2
+    before = [_mean_sd(*both, covariance) for both in zip(gradients, unread, strict=True)]
     scores, count = [], len(candidates)
     for number, (name, voltage) in enumerate(candidates.items()):
         refused = amplifier.refuses(voltage, dataset.actuator.interval)
@@ -482,7 +497,9 @@ def rank_designs(
         this = part(watch, number / count, (number + 1) / count)
         for batch in watched([*batches(len(chosen), 2 * len(scopes) * voltage.size)], this):
             informations = planned.linearize(chosen[batch], expected=True).fisher_information
-            for gradient, full_information in zip(gradients[batch], informations, strict=True):
+            for gradient, variance, full_information in zip(
+                gradients[batch], unread[batch], informations, strict=True
+            ):
                 information = _left_open(
                     full_information,
                     *(np.searchsorted(planned.physical, c) for c in (columns, new)),
@@ -490,7 +507,7 @@ def rank_designs(
                 # With Σ = L Lᵀ, which is never inverted: L (1 + Lᵀ I L)⁻¹ Lᵀ.
                 inner = np.eye(len(factor)) + factor.T @ information @ factor
                 after = factor @ scipy.linalg.solve(inner, factor.T, assume_a="pos")
-                remaining.append(_mean_sd(gradient, after))
+                remaining.append(_mean_sd(gradient, variance, after))
         shares = np.array(remaining) / before
         error = float(np.std(shares, ddof=1) / np.sqrt(shares.size)) if shares.size > 1 else np.inf
         scores.append(DesignScore(name, float(np.mean(shares)), error))
@@ -517,10 +534,13 @@ def _left_open(information: FloatArray, columns: IntArray, new: IntArray) -> Flo
     return remaining - across @ np.linalg.solve(start, across.T)
 
 
-def _mean_sd(gradient: FloatArray, covariance: FloatArray) -> float:
-    """Mean over columns g of √(gᵀ Σ g), for gradients (coordinates, targets)."""
+def _mean_sd(gradient: FloatArray, variance: FloatArray, covariance: FloatArray) -> float:
+    """Mean over columns g of √(gᵀ Σ g + s²), for gradients (coordinates, targets).
+
+    s² is the ``variance`` (targets,) that is added.
+    """
     variances = np.einsum("it,ij,jt->t", gradient, covariance, gradient)
-    return float(np.mean(np.sqrt(np.maximum(variances, 0))))
+    return float(np.mean(np.sqrt(np.maximum(variances, 0) + variance)))
 
 
 # Samples of a candidate that are looked at, and the part of it that only sets the state.

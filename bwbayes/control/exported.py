@@ -47,6 +47,7 @@ from bwbayes.model.actuator import Actuator
 from bwbayes.model.inputs import Limits
 from bwbayes.model.registry import HYSTERESIS
 from bwbayes.quantities import DEFAULT
+from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.report.outputs import refuse_existing, write_summary
 from bwbayes.report.report import Facts, Product, Report
 from bwbayes.shown import brief
@@ -307,8 +308,8 @@ class Exported(Product):
 
     ``model`` is the one model, a sample at a time; its inverse gives voltages within ``limits``, V,
     and changes them as fast; ``without_inverse`` says why it has none. ``sds`` are the standard
-    deviations of its parameters, by name, if they are known, and ``standing`` is how the validation
-    of its run came out.
+    deviations of its parameters, by name, if they are known, ``standing`` is how the validation of
+    its run came out, and ``instruments`` are those whose readings it was fitted to.
     """
 
     NAME: ClassVar[str] = "model"
@@ -320,6 +321,7 @@ class Exported(Product):
     sds: Mapping[str, float]
     without_inverse: str | None
     standing: ValidationSummary = field(default_factory=ValidationSummary)
+    instruments: Instruments = EXACT
 
     @property
     def shortfall(self) -> str:
@@ -373,6 +375,7 @@ class Exported(Product):
             **self.limits.numbers,
             "inverse": self.without_inverse is None,
             "without_inverse": self.without_inverse,
+            "instruments": self.instruments.facts,
             "parts": {
                 "hysteresis": self._called,
                 "nonlinearity": list(actuator.nonlinearity.terms) if actuator.nonlinearity else [],

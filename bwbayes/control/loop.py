@@ -23,7 +23,7 @@ for the circle criterion.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -103,8 +103,8 @@ class LoopPlan(NamedTuple):
 class TrackingErrors(NamedTuple):
     """How well: ``rms`` and ``largest`` error, um, and the share of samples at a limit.
 
-    All are (controllers, signals, draws). The error is that of the actuator itself, its discrepancy
-    included, not of the readings.
+    All are (controllers, signals, draws). The error is that of the actuator itself in true um, its
+    discrepancy included, not of the readings.
     """
 
     rms: FloatArray
@@ -169,12 +169,15 @@ def follow(
     stand: Stand,
     generator: np.random.Generator,
     watch: Watch = unwatched,
+    *,
+    true: Callable[[FloatArray], FloatArray] = np.positive,
 ) -> TrackingErrors:
     """Close the loop around every draw.
 
     The ``draws`` are the actuators, whose voltage is held between samples: a row for every
     controller, signal and draw, in this order. The ``generator`` is the source of discrepancy and
-    sensor noise; ``watch`` is called with the share that is done.
+    sensor noise; ``watch`` is called with the share that is done. ``true`` returns the
+    displacements that readings (..., draws), um, of the sensor of the fitted record stand for.
     """
     controllers, signals, samples = plan.ahead.shape
     shape = controllers, signals, len(noise.parameters)
@@ -194,7 +197,7 @@ def follow(
         drift, white = next(noises)
         moved = draws.displacement(state).reshape(shape) + drift
         if t >= plan.begins:
-            error = moved - plan.reference[:, t, np.newaxis]
+            error = true(moved) - plan.reference[:, t, np.newaxis]
             squares += error**2
             np.maximum(largest, np.abs(error), out=largest)
         reading = moved + white

@@ -10,7 +10,7 @@ All begin demagnetized at zero volts, and 0 um of a reference is where the actua
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -34,6 +34,7 @@ from bwbayes.control.sampled import SampledModel, require_inverse
 from bwbayes.diagnosis.validation import ValidationSummary
 from bwbayes.errors import InputError
 from bwbayes.model.actuator import Actuator
+from bwbayes.record.instruments import EXACT, Instruments
 from bwbayes.report.report import (
     Banner,
     Facts,
@@ -60,7 +61,7 @@ class Tracking(Product):
     (controllers, frequencies, signals, draws), in the order of ``CONTROLLERS``, ``frequencies``,
     Hz, and ``signals``. The references swing by ``amplitude`` about the ``middle``, um; their jumps
     take the time ``rise``, s. ``standing`` is how the validation of the run came out that gave the
-    draws, and ``name`` what it is called.
+    draws, ``name`` what it is called, and ``instruments`` those that it was fitted with.
     """
 
     NAME: ClassVar[str] = "track"
@@ -80,6 +81,7 @@ class Tracking(Product):
     limited: FloatArray
     standing: ValidationSummary = field(default_factory=ValidationSummary)
     name: str = ""
+    instruments: Instruments = EXACT
 
     @property
     def best(self) -> FloatArray:
@@ -260,6 +262,7 @@ class Tracking(Product):
                 ("DAC", f"steps of {stand.amplifier.step:.3g} V, {stand.amplifier.slew:.3g} V/s"),
                 ("ADC", f"steps of {stand.sensor.step:.3g} µm"),
                 ("0 µm", "where the demagnetized actuator stands at zero volts"),
+                *self.instruments.facts.items(),
             ]
         )
 
@@ -281,6 +284,7 @@ def track(
     frequencies: Sequence[float] | None = None,
     amplitude: float | None = None,
     all_theta: FloatArray | None = None,
+    true: Callable[[FloatArray], FloatArray] = np.positive,
     watch: WatchSteps = unwatched,
 ) -> Tracking:
     """Follow the paper's signals with four controllers.
@@ -290,8 +294,9 @@ def track(
     draws that the controller must be stable with, and whose mean is the model, by default the same.
     ``frequencies``, Hz, are by default 1, 2 and 5 of each decade from 0.1 Hz to where the mean
     model's dynamics leave 71% of a sine, or to a tenth of the samples; the ``amplitude``, um, is by
-    default 80% of what the mean model reaches. ``watch`` is called with the name of a step and the
-    share of it that is done.
+    default 80% of what the mean model reaches. ``true`` returns the displacements that readings
+    (..., draws), um, stand for, by default the same. ``watch`` is called with the name of a step
+    and the share of it that is done.
 
     Raises InputError: a model that has no step or no inverse, margins that cannot be had,
     frequencies that are too fast or too slow, or an amplitude that is out of reach.
@@ -333,7 +338,9 @@ def track(
     plans = plan_loops(models, references, ends, stand, partial(watch, "feed-forward"))
     loops = partial(watch, "closed loops")
     errors = [
-        follow(plan, gains, rows, noise, stand, generator, part(loops, *shares[at : at + 2]))
+        follow(
+            plan, gains, rows, noise, stand, generator, part(loops, *shares[at : at + 2]), true=true
+        )
         for at, plan in enumerate(plans)
     ]
     rms, largest, limited = (np.stack(values, axis=1) for values in zip(*errors, strict=True))

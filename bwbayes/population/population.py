@@ -26,7 +26,7 @@ sampling, J. Mach. Learn. Res. 25 (2024).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ from bwbayes.population.normal import (
     spreads,
 )
 from bwbayes.prediction.prediction import thin_draws
+from bwbayes.record.instruments import EXACT, Instruments, Scales
 from bwbayes.sampling.diagnostics import MAX_PARETO_K, smoothed_weights
 from bwbayes.shown import brief
 from bwbayes.watching import Watch, unwatched, watched
@@ -79,6 +80,8 @@ class Specimen:
         to a constant.
     prior_mean, prior_sd
         (parameters,) of each coordinate under the prior.
+    instruments
+        Those that read its record. All numbers above are those of the readings.
     """
 
     name: str
@@ -89,10 +92,12 @@ class Specimen:
     log_prior: FloatArray
     prior_mean: FloatArray
     prior_sd: FloatArray
+    instruments: Instruments = EXACT
 
     def save(self, path: Path) -> None:
         """Write it to an .npz file, whole or not at all."""
         arrays = {key: value for key, value in vars(self).items() if key != "name"}
+        arrays["instruments"] = astuple(self.instruments)
         draft = path.with_suffix(".partial")
         with draft.open("wb") as file:
             np.savez(file, **arrays)
@@ -104,13 +109,18 @@ class Specimen:
         with np.load(path) as file:
             arrays: dict[str, Any] = dict(file)
         arrays |= {key: tuple(arrays[key].tolist()) for key in ("names", "units")}
+        arrays["instruments"] = Instruments(*arrays["instruments"].tolist())
         return cls(name, **arrays)
 
 
 def specimen_of(
-    name: str, posterior: Posterior, draws: FloatArray, generator: np.random.Generator
+    name: str,
+    posterior: Posterior,
+    draws: FloatArray,
+    generator: np.random.Generator,
+    instruments: Instruments = EXACT,
 ) -> Specimen:
-    """Keep of a specimen's posterior what a population needs.
+    """Keep of a specimen's posterior, whose record these ``instruments`` read, what is needed.
 
     The generator chooses ``DRAWS`` of the draws (draws, free), which have their own units.
     """
@@ -140,6 +150,7 @@ def specimen_of(
         log_prior,
         np.mean(prior_coordinates, axis=0),
         np.std(prior_coordinates, axis=0),
+        instruments,
     )
 
 
@@ -245,6 +256,9 @@ class PopulationParameter:
         (DRAWS,) posterior draws, in the parameter's unit; of a logarithm, the spread is a number.
     new
         (DRAWS,) the parameter of a specimen that was not measured.
+    factor
+        (DRAWS,) by which the instruments' scales, which all specimens share, multiply the readings'
+        numbers: it is in all of the above.
     specimens
         Results of each specimen, by name.
     pareto_k
@@ -259,6 +273,7 @@ class PopulationParameter:
     mean: FloatArray
     spread: FloatArray
     new: FloatArray
+    factor: FloatArray
     specimens: Mapping[str, SpecimenEstimate]
     pareto_k: float
 
@@ -321,7 +336,7 @@ def population(
     Raises
     ------
     InputError
-        Fewer than ``FEWEST`` specimens, or no parameter that all have.
+        Fewer than ``FEWEST`` specimens, no parameter that all have, or unlike instruments.
     """
     count = len(specimens)
     if count < FEWEST:
@@ -329,10 +344,17 @@ def population(
     names = shared(specimens)
     if not names:
         raise InputError("population: the specimens have no parameter of the actuator in common")
+    instruments = specimens[0].instruments
+    if any(specimen.instruments != instruments for specimen in specimens):
+        raise InputError("population: records of other instruments; state the same of all")
+    scales = instruments.scales(DRAWS, generator.spawn(1)[0])
     tests = count * len(names)
     return Population(
         tuple(specimen.name for specimen in specimens),
-        {name: _population_of(specimens, name, generator, tests) for name in watched(names, watch)},
+        {
+            name: _population_of(specimens, name, generator, tests, scales)
+            for name in watched(names, watch)
+        },
     )
 
 
@@ -342,7 +364,8 @@ def next_specimen(
     """Return draws of a specimen not measured yet, (draws, free), in their own units.
 
     The actuator's parameters are those of the population, drawn independently of each other; noise
-    and what belongs to one record are as in a specimen that was measured.
+    and what belongs to one record are as in a specimen that was measured. All are as the same
+    instruments would read them.
 
     Parameters
     ----------
@@ -364,7 +387,8 @@ def next_specimen(
     specimens = draws[generator.choice(len(draws), count, replace=len(draws) < count)].copy()
     for column, parameter in enumerate(prior.free):
         if parameter.name in population.parameters:
-            specimens[:, column] = population.parameters[parameter.name].new
+            of_all = population.parameters[parameter.name]
+            specimens[:, column] = of_all.new / of_all.factor
     possible = specimens[np.isfinite(prior.log_density(specimens))]
     if len(possible) < 0.1 * count:
         raise InputError("population: hardly a draw of it is a model; look at outliers and priors")
@@ -372,9 +396,13 @@ def next_specimen(
 
 
 def _population_of(
-    specimens: Sequence[Specimen], name: str, generator: np.random.Generator, tests: int
+    specimens: Sequence[Specimen],
+    name: str,
+    generator: np.random.Generator,
+    tests: int,
+    scales: Scales,
 ) -> PopulationParameter:
-    """Find the population of one parameter."""
+    """Find the population of one parameter, in true um and V."""
     columns = [specimen.names.index(name) for specimen in specimens]
     pairs = list(zip(specimens, columns, strict=True))
     logarithmic = bool(specimens[0].logarithmic[columns[0]])
@@ -390,6 +418,12 @@ def _population_of(
     is_odd = scipy.special.expit(np.log(ODD) - np.log1p(-ODD) + odd - sound)
     is_odd = generator.uniform(size=is_odd.shape) < is_odd
     scale = np.exp if logarithmic else np.positive
+    unit = specimens[0].units[columns[0]]
+    factor = scales.factor(unit)
+
+    def true(y: FloatArray) -> FloatArray:
+        return y + np.log(factor[: y.size]) if logarithmic else y * factor[: y.size]
+
     among = {}
     for i, (specimen, (y, log_prior)) in enumerate(zip(specimens, draws, strict=True)):
         if is_normal[i]:
@@ -400,8 +434,8 @@ def _population_of(
             by_population, _ = _weights(y, log_prior, mean[::4], spread[::4])
             weights = np.mean(by_population / np.sum(by_population, axis=0), axis=1)
             shrunk = generator.choice(y, DRAWS, p=weights / np.sum(weights))
-        lower, median, upper = scale(np.quantile(shrunk, [0.025, 0.5, 0.975])).tolist()
-        own_lower, own_median, own_upper = scale(np.quantile(y, [0.025, 0.5, 0.975])).tolist()
+        lower, median, upper = scale(np.quantile(true(shrunk), [0.025, 0.5, 0.975])).tolist()
+        own_lower, own_median, own_upper = scale(np.quantile(true(y), [0.025, 0.5, 0.975])).tolist()
         among[specimen.name] = SpecimenEstimate(
             lower=lower,
             median=median,
@@ -414,9 +448,9 @@ def _population_of(
             pareto_k=float(shapes[i]),
             normal=bool(is_normal[i]),
         )
-    new = scale(mean + spread * generator.standard_normal(DRAWS))
-    unit = specimens[0].units[columns[0]]
-    return PopulationParameter(name, unit, logarithmic, scale(mean), spread, new, among, k)
+    new = scale(true(mean + spread * generator.standard_normal(DRAWS)))
+    mean, spread = scale(true(mean)), spread if logarithmic else spread * factor
+    return PopulationParameter(name, unit, logarithmic, mean, spread, new, factor, among, k)
 
 
 def _inside(

@@ -129,12 +129,9 @@ def uncertainty_budgets(
             shares[quantity.unexplained] += max(variance - explained, 0.0) / max(explained, 1e-300)
         variances = {source: share * explained for source, share in shares.items()}
         mean = float(np.mean(quantity.values))
-        for source, relative, powers in (
-            (SENSOR, instruments.sensor_scale, Scales(np.array([np.e]), np.ones(1))),
-            (AMPLIFIER, instruments.amplifier_gain, Scales(np.ones(1), np.array([np.e]))),
-        ):
-            power = float(np.log(powers.factor(quantity.unit)[0]))
-            variances[source] = (power * relative * mean) ** 2
+        relative_sds = instruments.relative_sds(quantity.unit)
+        for source, relative in zip((SENSOR, AMPLIFIER), relative_sds, strict=True):
+            variances[source] = (relative * mean) ** 2
         for source, added in quantity.added.items():
             variances[source] = variances.get(source, 0.0) + added
         total = sum(variances.values())

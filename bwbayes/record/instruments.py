@@ -95,6 +95,16 @@ class Instruments:
         scores = scipy.special.ndtri(np.stack([rng.permutation(parts) for _ in range(2)]))
         return Scales(1 + self.sensor_scale * scores[0], 1 + self.amplifier_gain * scores[1])
 
+    def relative_sds(self, unit: str) -> tuple[float, float]:
+        """Return the relative sds of a number in a unit, such as ``um/V``, by sensor and amplifier.
+
+        The ``n`` of a unit is 1.
+        """
+        one, e = np.ones(1), np.full(1, np.e)
+        powers = (float(np.log(Scales(*both).factor(unit)[0])) for both in ((e, one), (one, e)))
+        sensor, amplifier = powers
+        return abs(sensor) * self.sensor_scale, abs(amplifier) * self.amplifier_gain
+
     def linearity_sd(self, extent: float) -> float:
         """Return the sd, um, of the sensor's curve over a range of displacements, um."""
         return self.linearity * extent / math.sqrt(3)

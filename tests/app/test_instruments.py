@@ -91,6 +91,27 @@ def test_bands_loops_and_commands_are_wider_but_for_the_sensor_band(
     assert scale < promised[1].rms.mean() < scale + 1.2 * promised[0].rms.mean()
 
 
+def test_closed_loop_export_and_design_count_the_scales(both: tuple[bw.Run, bw.Run]) -> None:
+    exact, unsure = (fit.track(frequencies=(5.0,), draws=50) for fit in both)
+    np.testing.assert_array_equal(exact.limited, unsure.limited)  # the controller sees readings
+    sine = exact.signals.index("sine")
+    errors = [tracking.rms[3, 0, sine].mean() for tracking in (exact, unsure)]
+    scale = exact.amplitude * 0.02 * np.sqrt(2 / np.pi) / np.sqrt(2)
+    assert scale < errors[1] < scale + 1.2 * errors[0]
+    models = [fit.export() for fit in both]
+    assert models[1].sds["d"] == pytest.approx(both[1].summary.loc["d", "sd"], rel=0.01)
+    means, again = ({n: float(v[0]) for n, v in m.model.column.items()} for m in models)
+    assert means == again
+    assert "sensor scale known to 2 % (one standard uncertainty)" in models[1].c_code()
+    left = [fit.design("d").best.sd_ratio for fit in both]
+    before, after = (fit.summary.loc["d", "sd"] for fit in both)
+    expected = np.sqrt((left[0] * before) ** 2 + after**2 - before**2) / after
+    assert left[1] == pytest.approx(expected, rel=1e-3)
+    steady = 20 * np.sin(np.linspace(0, 20, 200))
+    left = [fit.design(steady).best.sd_ratio for fit in both]
+    assert left[0] < left[1] < 1
+
+
 def test_run_keeps_its_instruments_and_files_of_its_columns_have_them(
     both: tuple[bw.Run, bw.Run], tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ from bwbayes.population.population import (
     shared,
     specimen_of,
 )
+from bwbayes.record.instruments import Instruments
 from tests.inference.problems import short_posterior
 from tests.measured import keep
 
@@ -53,6 +54,26 @@ def normal_specimen(
         np.zeros(1),
         np.ones(1),
     )
+
+
+def test_scales_that_specimens_share_widen_middle_and_next_but_not_the_relative_spread() -> None:
+    rng = np.random.default_rng(1)
+    exact = [normal_specimen(f"s{i}", m, 0.01, rng) for i, m in enumerate((0.98, 1, 1.02, 1.01))]
+    exact = [replace(one, logarithmic=np.array([True])) for one in exact]
+    unsure = [replace(one, instruments=Instruments(0.05, 0.0)) for one in exact]
+    before, after = (
+        population(specimens, np.random.default_rng(2)).parameters[NAME]
+        for specimens in (exact, unsure)
+    )
+    np.testing.assert_array_equal(before.spread, after.spread)
+    for name in ("mean", "new"):
+        logs = [np.log(getattr(spread, name)) for spread in (before, after)]
+        assert np.std(logs[1]) == pytest.approx(np.hypot(np.std(logs[0]), 0.05), rel=0.05)
+    widths = [np.log(s.specimens["s0"].upper / s.specimens["s0"].lower) for s in (before, after)]
+    assert widths[1] == pytest.approx(np.hypot(widths[0], 3.92 * 0.05), rel=0.05)
+    np.testing.assert_allclose(after.new / after.factor, before.new, rtol=1e-12)
+    with pytest.raises(InputError, match="other instruments"):
+        population([*exact[:3], unsure[3]], rng)
 
 
 def drawn(

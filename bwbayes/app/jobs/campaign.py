@@ -554,7 +554,10 @@ def fit_record(file: Path, campaign: CampaignFolder) -> tuple[Path, str, str]:
                 write_summary(fit.folder.summary, fit.numbers)
             if fit.converged:
                 source = fit.study.generator("specimen")
-                specimen = specimen_of(file.stem, fit.study.posterior, fit.flat_draws, source)
+                instruments = fit.study.record.instruments
+                specimen = specimen_of(
+                    file.stem, fit.study.posterior, fit.flat_draws, source, instruments
+                )
                 specimen.save(run / SPECIMEN)
             (run / ENDED).write_text(ended(digests, run), encoding="utf-8")
             return file, "" if fit.converged else "not converged", ""

@@ -22,6 +22,7 @@ import numpy as np
 from bwbayes.app.fit.fitted import Run
 from bwbayes.app.jobs.fit_methods import amplifier_limits
 from bwbayes.app.study.column_options import open_like
+from bwbayes.arrays import FloatArray
 from bwbayes.control.compensation import Compensation, compensate as compensated
 from bwbayes.control.exported import Exported, exported
 from bwbayes.control.loop import LoopNoise, Robustness, Stand
@@ -259,7 +260,8 @@ def export(
 ) -> Exported:
     """Write the model for a controller: JSON, and C with its inverse.
 
-    It is the posterior's mean. The C file needs math.h alone and does a sample a call; its head
+    It is the posterior's mean, in um and V as the sensors read them; the SDs in the JSON count what
+    their scales are worth. The C file needs math.h alone and does a sample a call; its head
     says which sample, and what a value does that is not a number. 0 um is where the demagnetized
     actuator stands at zero volts.
 
@@ -307,16 +309,24 @@ def export(
         bwbayes export results/ring_bender --rate 1000
     """
     study, posterior = fit.study, fit.study.posterior
-    dataset, theta = posterior.datasets[0], posterior.prior.theta(fit.flat_draws)
-    theta = dataset.table.actuator(posterior.table.of(theta, dataset.name))
+    dataset = posterior.datasets[0]
+
+    def of_actuator(draws: FloatArray) -> FloatArray:
+        theta = posterior.table.of(posterior.prior.theta(draws), dataset.name)
+        return dataset.table.actuator(theta)
+
+    read = fit.flat_draws
     actuator = at_rate(dataset.actuator, rate, parse_hold(hold))
-    sds = dict(zip(actuator.parameters, theta.std(axis=0).tolist(), strict=True))
+    true_sds = of_actuator(study.true_draws(read)).std(axis=0)
+    sds = dict(zip(actuator.parameters, true_sds.tolist(), strict=True))
     name = fit.config.name or study.record.origin
     limits = amplifier_limits(
         study, voltage, slew, current, capacitance, beyond_training=beyond_training
     )
     model = replace(
-        exported(name, actuator, theta.mean(axis=0), limits, sds), standing=fit.standing
+        exported(name, actuator, of_actuator(read).mean(axis=0), limits, sds),
+        standing=fit.standing,
+        instruments=study.record.instruments,
     )
     if folder is not None:
         model.save(folder, overwrite=overwrite, watch=partial(watch, "files"))
@@ -405,6 +415,13 @@ def track(
     theta = posterior.table.of(posterior.prior.theta(free), dataset.name)
     alone = posterior.for_record(dataset.name)
     parameters = alone.noise_of_new(theta[:draws])
+    instruments, count = study.record.instruments, len(parameters)
+    rng = study.generator("instruments")
+    displacements = instruments.displacements(count, alone.single_record.extent, rng)
+
+    def true(read: FloatArray) -> FloatArray:
+        return displacements(slice(None), read.reshape(-1, count).T).T.reshape(read.shape)
+
     tracking = tracked(
         at_rate(dataset.actuator, rate, "zero"),
         dataset.table.actuator(theta[:draws]),
@@ -415,7 +432,8 @@ def track(
         frequencies=frequencies or None,
         amplitude=amplitude,
         all_theta=dataset.table.actuator(theta),
+        true=true,
         watch=watch,
     )
     name = fit.config.name or study.record.origin
-    return replace(tracking, standing=fit.standing, name=name)
+    return replace(tracking, standing=fit.standing, name=name, instruments=instruments)

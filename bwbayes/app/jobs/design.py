@@ -143,7 +143,10 @@ def design(
             quantity, drive = _drive(target, measured.interval, read_as, reading), str(target)
         else:
             quantity, drive = np.asarray(target, dtype=np.float64), "a voltage"
-        scores = rank_designs(posterior, flat, signals, quantity, amplifier, rng, ranking)
+        scores = rank_designs(
+            posterior, flat, signals, quantity, amplifier, rng, ranking,
+            instruments=measured.instruments,
+        )  # fmt: skip
     if scores[0].refused:
         raise InputError(
             f"design: the amplifier can make none of the candidates; {scores[0].name} "
