@@ -200,6 +200,7 @@ VERBS = (
     Verb("bwbayes.app.jobs.control:track", flags={"frequencies": "frequency"}),
     Verb("bwbayes.app.jobs.certificate:budget"),
     Verb("bwbayes.app.jobs.certificate:certificate"),
+    Verb("bwbayes.app.jobs.calibrate:calibrate"),  # its command is below: it takes a config, too
 )
 
 PAIR = "--voltage FILE and --displacement FILE"

@@ -127,6 +127,11 @@ class Calibration:
         return tuple(reasons)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The same, as a warning says it."""
+        return tuple(f"calibration failed: {reason}" for reason in self.failures)
+
+    @property
     def passed(self) -> bool:
         """Whether nothing speaks against the posteriors."""
         return not self.failures

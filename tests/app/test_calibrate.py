@@ -237,6 +237,11 @@ def test_run_that_fails_its_calibration_says_so_and_ends_with_status_four(
     assert "CALIBRATION FAILED: 1 of 1 replicates did not converge" in said.err
     page = (copy.path / "report.html").read_text(encoding="utf-8")
     assert "Calibration: CALIBRATION FAILED" in page
+    fit = bw.open_run(copy.path)
+    with pytest.warns(bw.InputWarning, match="calibration failed: 1 of 1 replicates did not"):
+        again = fit.calibrate(progress=False)  # as it was made
+    assert fit.calibration is not None
+    assert (again.passed, again.replicates) == (fit.calibration["passed"], 1)
 
 
 @pytest.mark.parametrize(

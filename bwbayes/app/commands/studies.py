@@ -71,7 +71,7 @@ def calibrate(
         for line in fit.standing.messages:
             click.echo(line, err=True)
         with resumable(f"`bwbayes calibrate {config}`"):
-            calibration = calibrate_run(fit, console, overwrite=overwrite, **options)
+            calibration = calibrate_run(fit, overwrite=overwrite, progress=not quiet, **options)
     else:
         if config is None:
             folder = CalibrationFolder.open(Path(str(resumed)))

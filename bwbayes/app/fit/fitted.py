@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from bwbayes.app.config.config import Config
     from bwbayes.app.fit.plots import Plots
+    from bwbayes.app.jobs.calibrate import calibrate as calibrate_fit
     from bwbayes.app.jobs.certificate import budget as budget_fit, certificate as certificate_fit
     from bwbayes.app.jobs.control import (
         compensate as compensate_fit,
@@ -630,6 +631,7 @@ class Run(Shown):
         track = fit_method(track_fit)
         budget = fit_method(budget_fit)
         certificate = fit_method(certificate_fit)
+        calibrate = fit_method(calibrate_fit)
 
     def compare(self, *others: Run, **options: Any) -> Comparison:
         """Compare this fit with others of the same readings, to tell which model to take.

@@ -26,6 +26,7 @@ from rich.console import Console
 
 from bwbayes.app.config.config import Config, dump
 from bwbayes.app.fit.fitted import Run
+from bwbayes.app.jobs.fit_methods import console_of
 from bwbayes.app.running.fingerprint import versions
 from bwbayes.app.running.folder import CalibrationFolder, RunFolder
 from bwbayes.app.running.progress import StepProgress, batch
@@ -129,20 +130,54 @@ def resume(
 
 def calibrate(
     fit: Run,
-    console: Console,
     *,
     replicates: int | None = None,
     overwrite: bool = False,
     workers: int | None = None,
     executor: str | Executor | None = None,
+    progress: bool = True,
 ) -> Calibration:
-    """Calibrate the posterior of a run that has converged, and keep that in its folder.
+    """Calibrate a run's posterior, to tell whether its intervals are right for its record.
 
     Each replicate is made with a draw of the posterior, along the run's voltage, and fitted
-    together with the run's readings. All else is as in :func:`resume`, by default of 200
-    replicates; ``overwrite`` begins anew. Report and summary of the run are written again.
+    together with the run's readings. It is kept in the run's folder, and called again it goes on.
+    Report and summary of the run, where it has these files, are written again.
+
+    Parameters
+    ----------
+    fit
+        The fit to use.
+    replicates
+        How many; default: 200, or as begun.
+    overwrite
+        Replace an existing calibration.
+    workers
+        Replicates side by side; default: all cores. The result does not depend on it.
+    executor
+        local (default), threads, processes, dask, or dask://HOST:PORT. In Python as in
+        :func:`bwbayes.fit`.
+    progress
+        Show how far it is.
+
+    Raises
+    ------
+    NotConvergedError
+        The sampling has not converged.
+    InputError
+        The folder has the replicates of another run, or another process is writing it.
+
+    Warns
+    -----
+    InputWarning
+        Why the calibration has failed.
+
+    Examples
+    --------
+    ``fit.calibrate(replicates=200).passed`` is what this says::
+
+        bwbayes calibrate results/my
     """
-    fit.require_converged()
+    console = console_of(progress)
     posterior, folder = fit.study.posterior, fit.folder.calibration
     flat = draws(posterior, fit.chain).reshape(-1, len(posterior.names))
     flat = thin_draws(flat, fit.study.generator("truths"))
@@ -158,8 +193,9 @@ def calibrate(
         calibration = _finish(
             fit.with_cache(folder=folder), common, fit.state, console, replicates, workers, executor
         )
-    with StepProgress(console, "writing the run's report ...") as watch:
-        redraw(fit.folder, watch)
+    if fit.folder.summary.exists():
+        with StepProgress(console, "writing the run's report ...") as watch:
+            redraw(fit.folder, watch)
     return calibration
 
 
